@@ -1,0 +1,1 @@
+"""The mathematics in UFL: kinematics, energies, time discretisation. Needs UFL and the standard library only."""

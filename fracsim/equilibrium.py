@@ -1,0 +1,290 @@
+"""Residual and tangent of one time step: internal and viscous forces from compiled forms, inertia from a kept vector.
+
+    r(u) = f_int(u) + M (c_a (u - u_a) + a c_v (u - u_v)) + f_visc(u) - f_ext
+    K(u) = d f_int / d u + (c_a + a c_v) M + ...
+
+M is lumped by vertex quadrature (an option keeps it consistent): a vector added to the diagonal, not a term of the form,
+which would be integrated anew in every tangent.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from .domain import Domain
+from .forms.balance import elastic_energy, internal_work, pressure_work, traction_work, viscous_work
+from .forms.schemes import Scheme
+from .kernels import compile_form
+from .loads import Forces, Motion
+from .material import MaterialFields, _coefficient
+from .parallel import total
+from .rotation import RotationField
+from .study import Study
+
+Values = npt.NDArray[np.float64]
+
+
+class Equilibrium:
+    """The discrete equations of a study on its mesh.
+
+    Attributes:
+        u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
+        chi: degradation field, or None where the scene has no fracture.
+        mass: (owned nodes * d,) lumped mass of each dof, kg.
+        unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
+        external: (owned dofs,) dead loads, N.
+    """
+
+    def __init__(self, domain: Domain, study: Study, material: MaterialFields, scheme: Scheme) -> None:
+        self.domain, self.material, self.scheme = domain, material, scheme
+        self.u = fem.Function(domain.space, name="displacement")
+        self.chi = self._degradation(study)
+        self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
+        self.damping = study.damping
+        self.motion = Motion(domain, study.boundary)
+        density = _coefficient(domain, material.density)
+        self.forces = Forces(domain, study, density)
+        self._owned = domain.node_count * domain.dim
+        self._held = self.motion.dofs[: self.motion.owned]
+        self._compile(study, density)
+        self._make_vectors()
+        self._references: tuple[Values, Values] = (self.u.x.array[: self._owned],) * 2
+
+    # --- set-up ---
+
+    def _degradation(self, study: Study) -> fem.Function | None:
+        if study.fracture is None:
+            return None
+        chi = fem.Function(self.domain.cell_scalar, name="chi")
+        chi.x.array[:] = 1.0
+        return chi
+
+    def _compile(self, study: Study, density: Any) -> None:
+        domain, energy = self.domain, self.material.energy
+        w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
+        chi = self._stiffness_factor()
+        rotation = self.rotation.field if self.rotation is not None else None
+        residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
+        self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
+        residual = residual + self._viscous(w, dx, chi) + self._pressure(w)
+        self._residual = compile_form(residual)
+        self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
+        self._dead = self._dead_loads(w, dx)
+        vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
+        ones = fem.Constant(domain.mesh, np.ones(domain.dim))
+        self._mass_form = compile_form(density * ufl.inner(ones, w) * vertex)
+
+    def _stiffness_factor(self) -> Any:
+        """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
+        if self.chi is None:
+            return 1.0
+        if self.scheme.inertia:
+            return self.chi
+        return RESIDUAL_STIFFNESS + (1 - RESIDUAL_STIFFNESS) * self.chi
+
+    def _viscous(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form | int:
+        """Stiffness-proportional damping; the start of the step and c_v become coefficients."""
+        self.u_n = self.u_v = None
+        self._viscous_form = None
+        if self.damping is None or self.damping.stiffness == 0:
+            return 0
+        space = self.domain.space
+        self.u_n, self.u_v = fem.Function(space), fem.Function(space)
+        self._c_v = fem.Constant(self.domain.mesh, 0.0)
+        rate = self._c_v * (self.u - self.u_v)
+        form = viscous_work(self.material.energy, rate, self.u_n, w, dx, b=self.damping.stiffness, chi=chi)
+        self._viscous_form = compile_form(form)
+        return form
+
+    def _pressure(self, w: Any) -> ufl.Form | int:
+        normal, linear = ufl.FacetNormal(self.domain.mesh), self.material.energy.linear
+        terms = [pressure_work(p, self.u, w, normal, ds, linear=linear) for p, ds in self.forces.pressures]
+        self._pressure_form = compile_form(-sum(terms)) if terms else None
+        return -sum(terms) if terms else 0
+
+    def _dead_loads(self, w: Any, dx: ufl.Measure) -> fem.Form | None:
+        terms = [traction_work(t, w, ds) for t, ds in self.forces.tractions]
+        if self.forces.body is not None:
+            terms.append(ufl.inner(self.forces.body, w) * dx)
+        return compile_form(sum(terms)) if terms else None
+
+    def _make_vectors(self) -> None:
+        self.tangent = fem_petsc.create_matrix(self._tangent)
+        self.tangent.setOption(PETSc.Mat.Option.SPD, False)
+        self.residual = fem_petsc.create_vector(self._residual)
+        self._work = fem_petsc.create_vector(self._residual)
+        self.mass = self._assembled(self._mass_form)
+        self._mass_diagonal = self.tangent.createVecLeft()
+        self.external = np.zeros(self._owned)
+        self.unbalanced = np.zeros(self._owned)
+        self._prescribed = fem.Function(self.domain.space)
+        self.bcs = [self._condition()] if self.domain.comm.allreduce(len(self.motion.dofs)) else []
+
+    def _condition(self) -> fem.DirichletBC:
+        # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the full space.
+        dofs = self.motion.dofs
+        return fem.dirichletbc(self._prescribed, [dofs, dofs], self.domain.space.sub(0))
+
+    def _assembled(self, form: fem.Form) -> Values:
+        """(owned dofs,) copy of an assembled linear form."""
+        with self._work.localForm() as local:
+            local.set(0.0)
+        fem_petsc.assemble_vector(self._work, form)
+        self._work.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        return self._work.array_r.copy()
+
+    # --- a step ---
+
+    def begin(self, t: float, dt: float, start: Values, v: Values, a: Values) -> None:
+        """Set the end time, the loads and the scheme's references; `start`, v, a are the owned state at t - dt."""
+        self.dt = dt
+        self.c_a, self.c_v = self.scheme.rates(dt)
+        self._references = self.scheme.references(dt, start, v, a)
+        self._prescribed.x.array[self.motion.dofs] = self.motion.at(t)
+        self.set_loads(t)
+        if self.u_n is not None:
+            self.u_n.x.array[: self._owned] = start
+            self.u_v.x.array[: self._owned] = self._references[1]
+            self.u_n.x.scatter_forward(), self.u_v.x.scatter_forward()
+            self._c_v.value = self.c_v
+
+    def set_loads(self, t: float) -> None:
+        """Dead loads at time t, assembled only where they changed."""
+        if self.forces.set_time(t) and self._dead is not None:
+            self.external = self._assembled(self._dead)
+
+    def rates(self) -> tuple[Values, Values]:
+        """(v, a) of the owned dofs at the current u."""
+        u = self.u.x.array[: self._owned]
+        u_a, u_v = self._references
+        return self.c_v * (u - u_v), self.c_a * (u - u_a)
+
+    @property
+    def _inertia(self) -> tuple[float, float]:
+        """Factors of M in front of (u - u_a) and (u - u_v)."""
+        drag = self.damping.mass if self.damping is not None else 0.0
+        return self.c_a, drag * self.c_v
+
+    def load_displacement(self, x: PETSc.Vec, *, hold: bool = True) -> None:
+        """Bring an iterate into u, ghosts included; `hold`: with prescribed dofs at their values."""
+        self.u.x.array[: self._owned] = x.array_r
+        if hold:
+            self.u.x.array[self._held] = self._prescribed.x.array[self._held]
+        self.u.x.scatter_forward()
+        if self.rotation is not None:
+            self.rotation.update()
+
+    def assemble_residual(self, snes: Any, x: PETSc.Vec, b: PETSc.Vec) -> None:
+        """r(u) into b, zero on rows of prescribed dofs, which hold their values in every iterate.
+
+        Rows u - u_prescribed instead would mix metres with newtons in one norm, and leave prescribed dofs as inexact as
+        the Krylov solve.
+        """
+        self.load_displacement(x)
+        self._assemble_internal(b)
+        b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        self._add_inertia(b)
+        np.copyto(self.unbalanced, b.array_r)
+        b.array_w[self._held] = 0.0
+
+    def assemble_extension(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
+        """r + K (u_prescribed - u) at an x whose prescribed dofs are not at their values yet.
+
+        The linear way to carry a jump of the boundary into the body before Newton starts; cells at the boundary would
+        otherwise take all of it and may turn inside out.
+        """
+        self.load_displacement(x, hold=False)
+        self._assemble_internal(b)
+        fem_petsc.apply_lifting(b, [self._tangent], [self.bcs], x0=[self.u.x.petsc_vec], alpha=-1.0)
+        b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        self._add_inertia(b)
+        b.array_w[self._held] = 0.0
+
+    def _assemble_internal(self, b: PETSc.Vec) -> None:
+        with b.localForm() as local:
+            local.set(0.0)
+        fem_petsc.assemble_vector(b, self._residual)
+
+    def largest_gap(self, u: Values) -> float:
+        """Farthest that a prescribed dof of the owned values `u` is from its value, in mean edge lengths."""
+        if not self.bcs:
+            return 0.0
+        gap = np.max(np.abs(u[self._held] - self._prescribed.x.array[self._held]), initial=0.0)
+        return float(self.domain.comm.allreduce(gap, op=MPI.MAX)) / self.domain.mean_edge
+
+    def _add_inertia(self, b: PETSc.Vec) -> None:
+        c_mass, c_drag = self._inertia
+        rows = b.array_w
+        rows -= self.external
+        u, (u_a, u_v) = self.u.x.array[: self._owned], self._references
+        if c_mass:
+            rows += self.mass * (c_mass * (u - u_a))
+        if c_drag:
+            rows += self.mass * (c_drag * (u - u_v))
+
+    def assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
+        """K(u) into A, rows and columns of prescribed dofs replaced by the identity's."""
+        A.zeroEntries()
+        fem_petsc.assemble_matrix_mat(A, self._tangent, bcs=self.bcs)
+        A.assemble()
+        c_mass, c_drag = self._inertia
+        if c_mass or c_drag:
+            self._mass_diagonal.array_w[:] = (c_mass + c_drag) * self.mass
+            A.setDiagonal(self._mass_diagonal, PETSc.InsertMode.ADD)
+
+    # --- figures ---
+
+    def elastic_energy(self) -> float:
+        """This rank's share of int chi psi dX, J."""
+        return float(fem.assemble_scalar(self._energy))
+
+    def kinetic_energy(self, v: Values) -> float:
+        """This rank's share of 1/2 v . M v, J."""
+        return 0.5 * float(self.mass @ (v * v))
+
+    def viscous_force(self) -> Values | None:
+        """(owned dofs,) damping forces at the current step, N; None where there is no damping."""
+        if self.damping is None:
+            return None
+        force = self.damping.mass * self.mass * self.rates()[0]
+        return force + self._assembled(self._viscous_form) if self._viscous_form is not None else force
+
+    def applied_force(self) -> Values:
+        """(owned dofs,) dead loads and pressures on the current shape, N."""
+        if self._pressure_form is None:
+            return self.external
+        return self.external - self._assembled(self._pressure_form)
+
+    def force_scale(self) -> tuple[float, float]:
+        """(size, round-off) of the forces in the residual, N, as root sums of squares over all dofs.
+
+        Size: reactions, inertia and dead loads, which the residual is the balance of. Round-off: eps times the
+        stiffness Y h^(d-2) of a node times the extent of the body, for every dof.
+        """
+        c_mass, _ = self._inertia
+        inertia = c_mass * self.mass * (self.u.x.array[: self._owned] - self._references[0]) if c_mass else 0.0
+        reactions = self.unbalanced[self._held]
+        squares = [np.sum(np.square(part)) for part in (inertia, self.external, reactions)]
+        loads = np.sqrt(total(self.domain.comm, np.array(squares)))
+        return float(loads.max()), self._round_off
+
+    @cached_property
+    def _round_off(self) -> float:
+        young = float(np.max(self.material.young, initial=0.0))
+        dofs = self.domain.space.dofmap.index_map.size_global * self.domain.dim
+        stiffest = self.domain.comm.allreduce(young, op=MPI.MAX)
+        return float(np.finfo(float).eps * stiffest * self.domain.mean_edge ** (self.domain.dim - 2) * self.domain.size * np.sqrt(dofs))
+
+
+# Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large enough
+# that the tangent stays regular (condition number 1e16 would not).
+RESIDUAL_STIFFNESS = 1e-8

@@ -1,0 +1,36 @@
+"""Failures that a user can mend: one message, one exit code, no traceback."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Exit(IntEnum):
+    """Exit codes of every command."""
+
+    DONE = 0
+    BAD_INPUT = 2
+    NOT_CONVERGED = 3
+    STOPPED = 4
+
+
+class FracsimError(Exception):
+    """The message says what is wrong, where, what is allowed and what to do. Raised on all ranks alike."""
+
+    exit_code = Exit.BAD_INPUT
+
+
+class InputError(FracsimError):
+    """A study, a mesh or a command line that cannot be run."""
+
+
+class NotConverged(FracsimError):
+    """The smallest allowed step failed; the message has the reason, the last good time and the checkpoint."""
+
+    exit_code = Exit.NOT_CONVERGED
+
+
+class Stopped(FracsimError):
+    """A signal or the wall-time limit ended the run, with a checkpoint."""
+
+    exit_code = Exit.STOPPED

@@ -1,0 +1,190 @@
+"""One nonlinear solve: PETSc SNES with line search, CG and algebraic multigrid, options from the study."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from .domain import Domain
+from .equilibrium import Equilibrium
+from .errors import InputError
+
+Options = dict[str, bool | int | float | str]
+
+DEFAULTS: Options = {
+    "snes_type": "newtonls",
+    "snes_linesearch_type": "bt",
+    "snes_max_it": 25,
+    "snes_rtol": 1e-6,
+    "snes_stol": 0.0,
+    "ksp_type": "cg",
+    "ksp_rtol": 1e-5,
+    "ksp_max_it": 500,
+    "pc_type": "gamg",
+    "pc_gamg_reuse_interpolation": True,
+    "mg_levels_ksp_type": "chebyshev",
+    "mg_levels_ksp_max_it": 2,
+    "mg_levels_pc_type": "jacobi",
+}
+
+# A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
+LARGE_GAP = 0.01
+
+_prefixes = itertools.count()
+_SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
+_KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a solve ended."""
+
+    converged: bool
+    newton: int
+    krylov: int
+    reason: str  # a sentence where it did not converge
+
+
+class Solver:
+    """SNES on an `Equilibrium`, set up once and kept for the whole run."""
+
+    def __init__(self, equations: Equilibrium, options: Options) -> None:
+        self.equations = equations
+        snes = PETSc.SNES().create(equations.domain.comm)
+        snes.setFunction(equations.assemble_residual, equations.residual)
+        snes.setJacobian(equations.assemble_tangent, equations.tangent, equations.tangent)
+        chosen = DEFAULTS | _symmetry_defaults(equations) | options
+        if _uses_rigid_modes(chosen):
+            equations.tangent.setNearNullSpace(rigid_body_modes(equations.domain))
+        set_options(snes, chosen)
+        snes.setConvergenceTest(self._converged)
+        self.snes = snes
+        self._x, self._correction = equations.residual.duplicate(), equations.residual.duplicate()
+        self._rtol = float(chosen["snes_rtol"])
+        self._single = chosen["snes_type"] == "ksponly"
+        self._krylov_type = snes.ksp.getType()
+
+    def solve(self, guess: npt.NDArray[np.float64]) -> Outcome:
+        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution."""
+        outcome = self._attempt(guess)
+        if not outcome.converged and self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
+            # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
+            self.snes.ksp.setType("gmres")
+            outcome = self._attempt(guess)
+            self.snes.ksp.setType(self._krylov_type)
+        return outcome
+
+    def _attempt(self, guess: npt.NDArray[np.float64]) -> Outcome:
+        self._x.array_w[:] = guess
+        extended = self._extend() if self.equations.largest_gap(guess) > LARGE_GAP else 0
+        self.snes.solve(None, self._x)
+        snes, reason = self.snes, self.snes.reason
+        if reason > 0 and self._single:
+            self.equations.assemble_residual(snes, self._x, self.equations.residual)
+        else:
+            self.equations.load_displacement(self._x)
+        krylov = snes.getLinearSolveIterations() + extended
+        return Outcome(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
+
+    def _extend(self) -> int:
+        """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
+        equations, ksp = self.equations, self.snes.ksp
+        b = equations.residual
+        equations.assemble_extension(self._x, b)
+        equations.assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
+        ksp.setOperators(equations.tangent)
+        ksp.solve(b, self._correction)
+        self._x.axpy(-1.0, self._correction)
+        return int(ksp.its)
+
+    def _sentence(self) -> str:
+        why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
+        if self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            why += " (" + _KSP.get(self.snes.ksp.reason, "?").lower().removeprefix("diverged_").replace("_", " ") + ")"
+        return f"Newton's method stopped after {self.snes.its} iterations: {why}"
+
+    def _converged(self, snes: PETSc.SNES, its: int, norms: tuple[float, float, float]) -> int:
+        """|r| <= rtol max(|r_0|, |forces|) or below round-off: forces are what r is the difference of.
+
+        PETSc's own test against |r_0| alone asks for more and more digits as the first guess gets better.
+        """
+        reason = PETSc.SNES.ConvergedReason
+        norm = norms[2]
+        if not np.isfinite(norm):
+            return int(reason.DIVERGED_FNORM_NAN)
+        if its == 0:
+            self._first = norm
+        scale, floor = self.equations.force_scale()
+        if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
+            return int(reason.CONVERGED_FNORM_RELATIVE)
+        return int(reason.ITERATING)
+
+    def rebuild_preconditioner(self) -> None:
+        """Forget the coarse spaces: the body has come apart since they were made."""
+        self.snes.ksp.pc.reset()
+
+    def destroy(self) -> None:
+        """Give PETSc's memory back (collective)."""
+        self.snes.destroy()
+        self._x.destroy()
+
+
+def _symmetry_defaults(equations: Equilibrium) -> Options:
+    # the tangent of a following pressure is not symmetric
+    return {"ksp_type": "gmres"} if equations.forces.pressures and not equations.material.energy.linear else {}
+
+
+def _uses_rigid_modes(options: Options) -> bool:
+    return options["pc_type"] in ("gamg", "ml", "hypre")
+
+
+def set_options(snes: PETSc.SNES, options: Options) -> None:
+    """Give options to one SNES under a prefix of its own, and take them out of the database again.
+
+    InputError names an option that PETSc does not know or whose value it refuses.
+    """
+    prefix = f"fracsim{next(_prefixes)}_"
+    snes.setOptionsPrefix(prefix)
+    database = PETSc.Options()
+    for key, value in options.items():
+        database[prefix + key] = _text(value)
+    try:
+        snes.setFromOptions()
+        snes.ksp.setFromOptions()
+    except PETSc.Error as error:
+        raise InputError(f"[solver] PETSc refuses these options: {_petsc_message(error)}") from None
+
+
+def _text(value: bool | int | float | str) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _petsc_message(error: PETSc.Error) -> str:
+    return f"error {error.ierr}"
+
+
+def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
+    """Translations and linearised rotations about the centre, orthonormal: 3 in 2D, 6 in 3D."""
+    d, nodes = domain.dim, domain.nodes[: domain.node_count]
+    X = nodes - (domain.lower + domain.upper) / 2
+    modes = [np.tile(axis, (len(X), 1)) for axis in np.eye(d)]
+    for i, j in ((0, 1), (0, 2), (1, 2))[: 1 if d == 2 else 3]:
+        rotation = np.zeros_like(X)
+        rotation[:, i], rotation[:, j] = -X[:, j], X[:, i]
+        modes.append(rotation)
+    vectors = []
+    for mode in modes:
+        vector = PETSc.Vec().createMPI((X.size, None), bsize=d, comm=domain.comm)
+        vector.array_w[:] = mode.reshape(-1)
+        for earlier in vectors:
+            vector.axpy(-vector.dot(earlier), earlier)
+        vector.normalize()
+        vectors.append(vector)
+    return PETSc.NullSpace().create(vectors=vectors, comm=domain.comm)
+
+

@@ -1,0 +1,299 @@
+"""The study file: its tables, their defaults, units and limits (SI throughout). No DOLFINx here."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = Annotated[list[Finite], Field(min_length=2, max_length=3)]
+Component = Finite | Literal["free"]
+Motion = Annotated[list[Component], Field(min_length=2, max_length=3)]
+
+
+class Table(BaseModel):
+    """A table of the study file: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class TimeTable[Value](Table):
+    """Values at times in s, linear in between and constant outside."""
+
+    time: Annotated[list[Finite], Field(min_length=1)]
+    value: list[Value]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> TimeTable[Value]:
+        if len(self.time) != len(self.value):
+            raise ValueError(f"{len(self.time)} times but {len(self.value)} values; give one value for each time")
+        if any(b <= a for a, b in zip(self.time, self.time[1:], strict=False)):
+            raise ValueError("times must increase")
+        return self
+
+
+def _shape(value: Any) -> str:
+    """Tag of a value that may be constant or tabulated."""
+    return "table" if isinstance(value, dict | TimeTable) else "constant"
+
+
+type InTime[Value] = Annotated[
+    Annotated[Value, Tag("constant")] | Annotated[TimeTable[Value], Tag("table")], Discriminator(_shape)
+]
+
+
+class Mesh(BaseModel):
+    """`builder` with its own parameters, or `file` with named groups, or a closed `surface` filled at size `h`."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    builder: str | None = None
+    file: Path | None = None
+    surface: Path | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Mesh:
+        given = [key for key in ("builder", "file", "surface") if getattr(self, key) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none of them"
+            raise ValueError(f"give exactly one of builder, file, surface; found {found}")
+        return self
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything besides the source: the builder's parameters, or h of a surface."""
+        return dict(self.model_extra or {})
+
+
+class Elastic(Table):
+    """What may differ between the named regions of a mesh."""
+
+    young: Positive  # Pa
+    poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+    density: Positive  # kg/m^3
+
+
+class Region(Table):
+    """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
+
+    young: Positive | None = None
+    poisson: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
+    density: Positive | None = None
+    strength: Positive | None = None  # Pa
+
+
+class Material(Elastic):
+    """[material]; tables inside it are regions."""
+
+    energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
+    plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
+    regions: dict[str, Region] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tables_are_regions(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "regions" in data:
+            return data
+        regions = {key: value for key, value in data.items() if isinstance(value, dict)}
+        rest = {key: value for key, value in data.items() if key not in regions}
+        return rest | ({"regions": regions} if regions else {})
+
+    @model_validator(mode="after")
+    def _plane_stress_needs_a_form(self) -> Material:
+        if self.plane == "stress" and self.energy not in ("linear", "stvk"):
+            raise ValueError(f'plane = "stress" is offered by the energies linear and stvk, not by {self.energy}')
+        return self
+
+
+class Damping(Table):
+    """Rayleigh damping a M + b K."""
+
+    mass: NonNegative = 0.0  # a, 1/s
+    stiffness: NonNegative = 0.0  # b, s
+
+
+class Fracture(Table):
+    """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
+
+    strength: Annotated[float, Field(gt=0)]  # Pa; inf never breaks
+    approach: Literal["chi"] = "chi"
+    radius: NonNegative = 0.0  # m, of the non-local average; 0: local
+    kernel: Literal["linear", "constant", "gaussian"] = "linear"
+    tie_break: Annotated[float, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+
+
+class Box(Table):
+    """Nodes inside a box (m)."""
+
+    box: Annotated[list[Vector], Field(min_length=2, max_length=2)]
+
+
+class Plane(Table):
+    """Nodes on a plane, within `within` (m; default 1e-6 of the body's size)."""
+
+    point: Vector
+    normal: Vector
+    within: Positive | None = None
+
+
+def _selector(value: Any) -> str:
+    """Tag of a place: a group's name, a box or a plane."""
+    if isinstance(value, str):
+        return "group"
+    return "box" if isinstance(value, Box) or (isinstance(value, dict) and "box" in value) else "plane"
+
+
+Where = Annotated[
+    Annotated[str, Tag("group")] | Annotated[Box, Tag("box")] | Annotated[Plane, Tag("plane")], Discriminator(_selector)
+]
+
+
+class Boundary(Table):
+    """[[boundary]]: one condition on a group of facets, a box or a plane. Give exactly one of the six."""
+
+    on: Where
+    fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # components held at zero
+    displacement: InTime[Motion] | None = None  # m; "free" leaves a component alone
+    velocity: InTime[Motion] | None = None  # m/s
+    traction: InTime[Vector] | None = None  # Pa of the reference area
+    pressure: InTime[Finite] | None = None  # Pa, pushes where > 0, follows the surface
+
+    @model_validator(mode="after")
+    def _one_condition(self) -> Boundary:
+        if len(given := self._given()) != 1:
+            kinds = ", ".join(CONDITIONS)
+            raise ValueError(f"give exactly one of {kinds}; found {' and '.join(given) or 'none'}")
+        return self
+
+    def _given(self) -> list[str]:
+        return [key for key in CONDITIONS if getattr(self, key) is not None]
+
+    @property
+    def kind(self) -> str:
+        """Which of the conditions it is."""
+        return self._given()[0]
+
+
+CONDITIONS = ("fix", "displacement", "velocity", "traction", "pressure")
+MOTIONS = ("fix", "displacement", "velocity")
+
+
+class Load(Table):
+    """[load]: forces on the whole body."""
+
+    gravity: Vector | None = None  # m/s^2
+    body_force: InTime[Vector] | None = None  # N/m^3
+
+
+class Initial(Table):
+    """[initial]: velocity at the start, v = velocity + spin x (X - centre of mass)."""
+
+    velocity: Vector | None = None  # m/s
+    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None  # rad/s; one number in 2D
+
+
+class Time(Table):
+    """[time]: scheme and steps."""
+
+    scheme: Literal["backward-euler", "newmark", "quasi-static"] = "backward-euler"
+    step: Positive  # s
+    end: Positive  # s
+    adapt: bool = True  # halve a step that fails, grow back after easy ones
+    smallest: Positive | None = None  # s; default step / 1024
+    beta: Annotated[float, Field(gt=0, le=0.5)] = 0.25  # Newmark
+    gamma: Annotated[float, Field(ge=0.5, le=1)] = 0.5  # Newmark
+
+    @model_validator(mode="after")
+    def _order(self) -> Time:
+        if self.step > self.end:
+            raise ValueError(f"step = {self.step:g} s is longer than the run: end = {self.end:g} s")
+        if self.smallest is not None and self.smallest > self.step:
+            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.step:g} s")
+        if self.scheme == "newmark" and 4 * self.beta < self.gamma + 0.5 - 1e-12:
+            raise ValueError("newmark is stable for every step where beta >= (gamma + 1/2) / 4; raise beta")
+        return self
+
+
+class Probe(Table):
+    """[[probe]]: what history.csv records at a point (nearest node) or over a group."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9-]*$")]
+    point: Vector | None = None  # m, reference configuration
+    on: Where | None = None
+    record: Literal["displacement", "reaction"] | None = None  # default: reaction over a group, displacement at a point
+
+    @model_validator(mode="after")
+    def _place(self) -> Probe:
+        if (self.point is None) == (self.on is None):
+            raise ValueError("give either point or on")
+        if self.point is not None and self.record == "reaction":
+            raise ValueError("a reaction is summed over a group or selection: give on instead of point")
+        return self
+
+    @property
+    def quantity(self) -> str:
+        """What is recorded."""
+        return self.record or ("displacement" if self.point is not None else "reaction")
+
+
+FIELDS = ("velocity", "damage", "chi", "piece", "stress", "von_mises", "energy_density", "region")
+FRACTURE_FIELDS = ("damage", "chi", "piece")
+
+
+class Output(Table):
+    """[output]: what is written, and how often."""
+
+    every: Annotated[int, Field(ge=1)] | None = None  # steps
+    interval: Positive | None = None  # s
+    fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
+    picture: bool = True  # a PNG of the last frame
+    checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
+
+    @model_validator(mode="after")
+    def _one_clock(self) -> Output:
+        if self.every is not None and self.interval is not None:
+            raise ValueError("give every (in steps) or interval (in s), not both")
+        return self
+
+
+class Study(Table):
+    """A whole study. A table that is absent costs nothing."""
+
+    title: str
+    mesh: Mesh
+    material: Material
+    time: Time
+    fracture: Fracture | None = None
+    damping: Damping | None = None
+    boundary: list[Boundary] = []
+    load: Load | None = None
+    initial: Initial | None = None
+    solver: dict[str, bool | int | float | str] = {}  # PETSc options, given as they are
+    probe: list[Probe] = []
+    output: Output = Output()
+
+    @field_validator("probe")
+    @classmethod
+    def _distinct(cls, probes: list[Probe]) -> list[Probe]:
+        names = [probe.name for probe in probes]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two probes have the name {twice[0]}")
+        return probes
+
+    @model_validator(mode="after")
+    def _fields_exist(self) -> Study:
+        wanted = [name for name in self.output.fields or [] if name in FRACTURE_FIELDS]
+        if wanted and self.fracture is None:
+            raise ValueError(f'output.fields has "{wanted[0]}", which needs a [fracture] table')
+        return self
+
+    @model_validator(mode="after")
+    def _rest_has_no_velocity(self) -> Study:
+        if self.time.scheme == "quasi-static" and self.initial is not None:
+            raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
+        return self

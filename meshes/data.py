@@ -1,0 +1,39 @@
+"""What every mesh builder and mesh reader returns: plain arrays, before any partition."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Points = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be built or used; the message says what is wrong, where, and what to do."""
+
+
+@dataclass(frozen=True)
+class MeshData:
+    """A simplex mesh in arrays, with named groups.
+
+    Attributes:
+        points: (n, d) node coordinates in metres, d = 2 or 3.
+        cells: (m, d + 1) node indices of triangles (d = 2) or tetrahedra (d = 3), positively oriented.
+        facet_groups: name -> (k, d) node indices of boundary edges (d = 2) or triangles (d = 3).
+            A facet may be in more than one group.
+        regions: name -> (k,) cell indices. Empty: the body is of one material.
+        notes: what was mended while reading, one sentence each, to be told to the user.
+    """
+
+    points: Points
+    cells: Indices
+    facet_groups: dict[str, Indices] = field(default_factory=dict)
+    regions: dict[str, Indices] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def dim(self) -> int:
+        return int(self.points.shape[1])

@@ -1,0 +1,105 @@
+"""Facets, measures and orientation of simplices, as array code for triangles (d = 2) and tetrahedra (d = 3) alike."""
+
+from __future__ import annotations
+
+from math import factorial
+
+import numpy as np
+import numpy.typing as npt
+
+from .data import Indices, Points
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+def signed_measures(points: Points, cells: Indices) -> Floats:
+    """Signed area [m^2] or volume [m^3] of each cell, positive where its nodes are positively ordered: (m,).
+
+    det(x_1 - x_0, ..., x_d - x_0) / d!
+    """
+    dim = points.shape[1]
+    corners = points[cells]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / factorial(dim)
+
+
+def oriented(points: Points, cells: Indices) -> tuple[Indices, int]:
+    """The cells with positive measure, the last two nodes swapped where it was negative; and how many were."""
+    inverted = signed_measures(points, cells) < 0
+    cells = cells.copy()
+    cells[inverted, -2:] = cells[inverted, :-3:-1]
+    return cells, int(inverted.sum())
+
+
+def facets_of(cells: Indices) -> Indices:
+    """The facets of each cell, ordered so that their normals point out of positive cells: (m, d + 1, d).
+
+    Facet i lies opposite node i.
+    """
+    nodes = cells.shape[1]
+    rows = []
+    for opposite in range(nodes):
+        kept = [node for node in range(nodes) if node != opposite]
+        # Dropping node i keeps the outward order for even i in 3D and in 2D; for odd i two nodes change places.
+        if opposite % 2 == 1:
+            kept[0], kept[1] = kept[1], kept[0]
+        rows.append(cells[:, kept])
+    return np.stack(rows, axis=1)
+
+
+def edges_of(cells: Indices) -> Indices:
+    """Every edge of the mesh once, lower node first: (k, 2)."""
+    first, second = np.triu_indices(cells.shape[1], k=1)
+    pairs = np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1), axis=1)
+    return distinct_rows(pairs)[0]
+
+
+def distinct_rows(rows: Indices) -> tuple[Indices, Indices, Indices]:
+    """Distinct rows (k, w), the number of times each occurs (k,), and for each given row the place of its like (n,).
+
+    Rows are compared as they stand: sort each row first where the order of its nodes does not matter.
+    """
+    if len(rows) == 0:
+        return rows, np.zeros(0, np.int64), np.zeros(0, np.int64)
+    order = np.lexsort(rows.T[::-1])
+    ranked = rows[order]
+    starts = np.flatnonzero(np.concatenate([[True], np.any(ranked[1:] != ranked[:-1], axis=1)]))
+    counts = np.diff(np.append(starts, len(rows)))
+    inverse = np.empty(len(rows), np.int64)
+    inverse[order] = np.repeat(np.arange(len(starts)), counts)
+    return ranked[starts], counts, inverse
+
+
+def boundary_facets(cells: Indices) -> Indices:
+    """The facets that belong to one cell only, their normals pointing outwards: (k, d)."""
+    facets = facets_of(cells).reshape(-1, cells.shape[1] - 1)
+    _, counts, inverse = distinct_rows(np.sort(facets, axis=1))
+    return facets[counts[inverse] == 1]
+
+
+def facets_where(facets: Indices, nodes: Mask) -> Indices:
+    """The facets all of whose nodes are marked."""
+    return facets[nodes[facets].all(axis=1)]
+
+
+def facets_except(facets: Indices, *others: Indices) -> Indices:
+    """The facets that are in none of the others, whatever the order of their nodes."""
+    rows = np.sort(np.concatenate([facets, *others]), axis=1)
+    _, _, inverse = distinct_rows(rows)
+    return facets[~np.isin(inverse[: len(facets)], inverse[len(facets) :])]
+
+
+def facet_measures(points: Points, facets: Indices) -> Floats:
+    """Length [m] of each edge (d = 2) or area [m^2] of each triangle (d = 3): (k,)."""
+    corners = points[facets]
+    spans = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("kid,kjd->kij", spans, spans)
+    return np.sqrt(np.linalg.det(gram)) / factorial(points.shape[1] - 1)
+
+
+def plane_groups(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:
+    """Facet groups on planes: name -> (axis, coordinate [m]). Nodes count as on it within 1e-9 of the body's size."""
+    tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
+    return {
+        name: facets_where(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()
+    }
