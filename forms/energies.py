@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol
 import ufl
 from ufl.core.expr import Expr
 
-from .kinematics import green_strain, identity, small_strain
+from .kinematics import embed, green_strain, identity, small_strain
 
 Scalar = Any  # a float, or a UFL coefficient that stands for a field
 
@@ -37,6 +37,7 @@ class Energy(Protocol):
     needs_rotation: ClassVar[bool]  # psi takes the polar rotation of F, lagged per iterate
     linear: ClassVar[bool]  # the stress is linear in u: reference and current configuration are not told apart
     plane_stress: ClassVar[bool]  # has the reduced 2D form
+    reduced: bool  # lmbda is lambda* of plane stress
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
 
@@ -49,6 +50,7 @@ class _PlaneStrain:
 
     mu: Scalar
     lmbda: Scalar
+    reduced: bool = False
     needs_rotation: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     plane_stress: ClassVar[bool] = False
@@ -98,7 +100,6 @@ class StVK(_PlaneStrain):
     """
 
     plane_stress: ClassVar[bool] = True
-    reduced: bool = False  # lmbda is lambda* of plane stress
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
@@ -155,3 +156,16 @@ def cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr
 def elastic_stress(energy: Energy, strain: Expr) -> Expr:
     """2 mu strain + lambda tr(strain) I in Pa: Hooke's law, to which every energy tends at small strain."""
     return 2 * energy.mu * strain + energy.lmbda * ufl.tr(strain) * identity(strain)
+
+
+def full_cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
+    """3 x 3 Cauchy stress in Pa of a 2D or 3D body; in 2D with the out-of-plane stress of plane strain or plane stress."""
+    if F.ufl_shape[0] == 3 or energy.reduced:
+        return embed(cauchy_stress(energy, F, rotation), 0.0)
+    return cauchy_stress(energy, embed(F, 1.0), embed(rotation, 1.0) if rotation is not None else None)
+
+
+def von_mises(stress: Expr) -> Expr:
+    """sqrt(3/2 s:s), s the deviator of a 3 x 3 stress, Pa."""
+    deviator = ufl.dev(stress)
+    return ufl.sqrt(1.5 * ufl.inner(deviator, deviator))

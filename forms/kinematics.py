@@ -33,3 +33,11 @@ def green_strain(F: Expr) -> Expr:
 def symmetric_components(tensor: Expr) -> Expr:
     """Independent components of a symmetric tensor as a vector: 3 in 2D (xx, yy, xy), 6 in 3D."""
     return ufl.as_vector([tensor[i, j] for i, j in SYMMETRIC_COMPONENTS[tensor.ufl_shape[0]]])
+
+
+def embed(tensor: Expr, out_of_plane: float) -> Expr:
+    """A 2 x 2 tensor as the in-plane block of a 3 x 3 one; 3 x 3 tensors pass."""
+    if tensor.ufl_shape[0] == 3:
+        return tensor
+    (a, b), (c, d) = ((tensor[i, j] for j in range(2)) for i in range(2))
+    return ufl.as_tensor([[a, b, 0], [c, d, 0], [0, 0, out_of_plane]])

@@ -30,6 +30,7 @@ class Domain:
         facets: group name -> local facet indices.
         region_names: names of the regions, in the order of `region`.
         region: (cells,) index into region_names of each owned cell, -1 outside every region.
+        source: the mesh as it was built or read, on rank 0 only (for output and checkpoints, which keep its order).
         lower, upper: corners of the bounding box, m.
     """
 
@@ -39,6 +40,7 @@ class Domain:
     region: npt.NDArray[np.int32]
     lower: npt.NDArray[np.float64]
     upper: npt.NDArray[np.float64]
+    source: MeshData | None = None
 
     @property
     def comm(self) -> MPI.Comm:
@@ -120,7 +122,7 @@ class Domain:
         """Local nodes (owned and ghost) of a facet group, a box or a plane; InputError where there are none."""
         nodes = self._group_nodes(where, key) if isinstance(where, str) else self._selected(where, key)
         if total(self.comm, len(nodes))[0] == 0:
-            raise InputError(f"{key}: {describe(where)} selects no node; the body lies in {self._extent()}")
+            raise InputError(f"{key}: {describe(where)} selects no node; the body lies in {self.extent()}")
         return nodes
 
     def facets_of(self, where: str | Box | Plane, key: str) -> Ints:
@@ -130,7 +132,7 @@ class Domain:
         else:
             facets = self._facets_within(self._selected(where, key))
         if total(self.comm, len(facets))[0] == 0:
-            raise InputError(f"{key}: {describe(where)} selects no boundary facet; the body lies in {self._extent()}")
+            raise InputError(f"{key}: {describe(where)} selects no boundary facet; the body lies in {self.extent()}")
         return facets
 
     def group(self, name: str, key: str) -> Ints:
@@ -161,7 +163,8 @@ class Domain:
     def _exterior(self) -> Ints:
         return dolfinx.mesh.exterior_facet_indices(self.mesh.topology)
 
-    def _extent(self) -> str:
+    def extent(self) -> str:
+        """The bounding box in words, m."""
         return f"{format_point(self.lower)} to {format_point(self.upper)}"
 
 
@@ -218,7 +221,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
     facets = {name: _group_facets(mesh, data.facet_groups[name] if data is not None else None) for name in groups}
     owned = mesh.topology.index_map(dim).size_local
     local = region[mesh.topology.original_cell_index[:owned]] if region_names else np.full(owned, -1, np.int32)
-    return Domain(mesh, facets, region_names, local, lower, upper)
+    return Domain(mesh, facets, region_names, local, lower, upper, data)
 
 
 def _region_index(data: MeshData) -> npt.NDArray[np.int32] | None:

@@ -40,6 +40,7 @@ class Equilibrium:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
         chi: degradation field, or None where the scene has no fracture.
         mass: (owned nodes * d,) lumped mass of each dof, kg.
+        held: owned dofs whose motion is prescribed.
         unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
         external: (owned dofs,) dead loads, N.
     """
@@ -54,7 +55,7 @@ class Equilibrium:
         density = _coefficient(domain, material.density)
         self.forces = Forces(domain, study, density)
         self._owned = domain.node_count * domain.dim
-        self._held = self.motion.dofs[: self.motion.owned]
+        self.held = self.motion.dofs[: self.motion.owned]
         self._compile(study, density)
         self._make_vectors()
         self._references: tuple[Values, Values] = (self.u.x.array[: self._owned],) * 2
@@ -74,6 +75,7 @@ class Equilibrium:
         chi = self._stiffness_factor()
         rotation = self.rotation.field if self.rotation is not None else None
         residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
+        self._internal_form = compile_form(residual)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
         residual = residual + self._viscous(w, dx, chi) + self._pressure(w)
         self._residual = compile_form(residual)
@@ -176,12 +178,10 @@ class Equilibrium:
 
     def load_displacement(self, x: PETSc.Vec, *, hold: bool = True) -> None:
         """Bring an iterate into u, ghosts included; `hold`: with prescribed dofs at their values."""
-        self.u.x.array[: self._owned] = x.array_r
+        u = x.array_r.copy()
         if hold:
-            self.u.x.array[self._held] = self._prescribed.x.array[self._held]
-        self.u.x.scatter_forward()
-        if self.rotation is not None:
-            self.rotation.update()
+            u[self.held] = self._prescribed.x.array[self.held]
+        self.displace(u)
 
     def assemble_residual(self, snes: Any, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r(u) into b, zero on rows of prescribed dofs, which hold their values in every iterate.
@@ -194,7 +194,7 @@ class Equilibrium:
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         self._add_inertia(b)
         np.copyto(self.unbalanced, b.array_r)
-        b.array_w[self._held] = 0.0
+        b.array_w[self.held] = 0.0
 
     def assemble_extension(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r + K (u_prescribed - u) at an x whose prescribed dofs are not at their values yet.
@@ -207,7 +207,7 @@ class Equilibrium:
         fem_petsc.apply_lifting(b, [self._tangent], [self.bcs], x0=[self.u.x.petsc_vec], alpha=-1.0)
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         self._add_inertia(b)
-        b.array_w[self._held] = 0.0
+        b.array_w[self.held] = 0.0
 
     def _assemble_internal(self, b: PETSc.Vec) -> None:
         with b.localForm() as local:
@@ -218,7 +218,7 @@ class Equilibrium:
         """Farthest that a prescribed dof of the owned values `u` is from its value, in mean edge lengths."""
         if not self.bcs:
             return 0.0
-        gap = np.max(np.abs(u[self._held] - self._prescribed.x.array[self._held]), initial=0.0)
+        gap = np.max(np.abs(u[self.held] - self._prescribed.x.array[self.held]), initial=0.0)
         return float(self.domain.comm.allreduce(gap, op=MPI.MAX)) / self.domain.mean_edge
 
     def _add_inertia(self, b: PETSc.Vec) -> None:
@@ -241,6 +241,13 @@ class Equilibrium:
             self._mass_diagonal.array_w[:] = (c_mass + c_drag) * self.mass
             A.setDiagonal(self._mass_diagonal, PETSc.InsertMode.ADD)
 
+    def displace(self, u: Values) -> None:
+        """Put the owned values of a displacement into u, ghosts included."""
+        self.u.x.array[: self._owned] = u
+        self.u.x.scatter_forward()
+        if self.rotation is not None:
+            self.rotation.update()
+
     # --- figures ---
 
     def elastic_energy(self) -> float:
@@ -258,6 +265,10 @@ class Equilibrium:
         force = self.damping.mass * self.mass * self.rates()[0]
         return force + self._assembled(self._viscous_form) if self._viscous_form is not None else force
 
+    def internal_force(self) -> Values:
+        """(owned dofs,) forces of the stress at the current u, without damping or pressure, N."""
+        return self._assembled(self._internal_form)
+
     def applied_force(self) -> Values:
         """(owned dofs,) dead loads and pressures on the current shape, N."""
         if self._pressure_form is None:
@@ -272,7 +283,7 @@ class Equilibrium:
         """
         c_mass, _ = self._inertia
         inertia = c_mass * self.mass * (self.u.x.array[: self._owned] - self._references[0]) if c_mass else 0.0
-        reactions = self.unbalanced[self._held]
+        reactions = self.unbalanced[self.held]
         squares = [np.sum(np.square(part)) for part in (inertia, self.external, reactions)]
         loads = np.sqrt(total(self.domain.comm, np.array(squares)))
         return float(loads.max()), self._round_off

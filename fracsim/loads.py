@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from .domain import Domain, Ints
-from .errors import InputError
-from .study import MOTIONS, Boundary, Study, TimeTable
-
-Values = npt.NDArray[np.float64]
-AXES = "xyz"
-
-
-def in_time(value: Any, key: str, size: int) -> Callable[[float], Values]:
-    """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
-    table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
-    times = np.asarray(table.time)
-    rows = np.array([[np.nan if v == "free" else float(v) for v in np.atleast_1d(row)] for row in table.value])
-    if rows.shape[1] != size:
-        raise InputError(f"{key} has {rows.shape[1]} components; the mesh has {size} dimensions")
-    return lambda t: np.array([np.interp(t, times, column) for column in rows.T])
-
-
-def integral_in_time(value: Any, key: str, size: int) -> Callable[[float], Values]:
-    """The integral from t = 0 of a constant or a table: exact, by trapezia between the corners of the table."""
-    rate = in_time(value, key, size)
-    corners = np.array(value.time) if isinstance(value, TimeTable) else np.empty(0)
-
-    def integrated(t: float) -> Values:
-        inner = corners[(corners > 0) & (corners < t)]
-        knots = np.concatenate([[0.0], inner, [t]])
-        rates = np.array([rate(knot) for knot in knots])
-        return np.sum(np.diff(knots)[:, None] * (rates[1:] + rates[:-1]) / 2, axis=0)
-
-    return integrated
+from .laws import Law, Values, in_time, motion_law
+from .study import MOTIONS, Boundary, Study
 
 
 class Motion:
@@ -52,7 +23,7 @@ class Motion:
 
     def __init__(self, domain: Domain, boundaries: list[Boundary]) -> None:
         size = domain.dim
-        self._laws: list[Callable[[float], Values]] = []
+        self._laws: list[Law] = []
         entry = np.full((len(domain.nodes), size), -1, np.int64)  # row of the value table that holds each component
         for index, boundary in enumerate(boundaries):
             if boundary.kind not in MOTIONS:
@@ -74,25 +45,11 @@ class Motion:
         return np.concatenate([law(t) for law in self._laws])[self._entry]
 
 
-def motion_law(boundary: Boundary, size: int, key: str) -> tuple[Callable[[float], Values], npt.NDArray[np.bool_]]:
-    """Displacement over time of a boundary entry, and which components it holds."""
-    if boundary.fix is not None:
-        held = np.array([axis in boundary.fix for axis in AXES[:size]])
-        if beyond := set(boundary.fix) - set(AXES[:size]):
-            raise InputError(f'{key}.fix = "{boundary.fix}": a {size}D mesh has no {min(beyond)}')
-        return lambda t: np.zeros(size), held
-    if boundary.displacement is not None:
-        law = in_time(boundary.displacement, f"{key}.displacement", size)
-    else:
-        law = integral_in_time(boundary.velocity, f"{key}.velocity", size)
-    return law, ~np.isnan(law(0.0))
-
-
 class Forces:
     """Dead loads and following pressures as UFL terms with constants that `set_time` moves."""
 
     def __init__(self, domain: Domain, study: Study, density: Any) -> None:
-        self._moving: list[tuple[fem.Constant, Callable[[float], Values]]] = []
+        self._moving: list[tuple[fem.Constant, Law]] = []
         self._domain = domain
         self.body = self._body_force(study, density)
         self.tractions = self._surface(study, "traction", domain.dim)
@@ -107,7 +64,7 @@ class Forces:
             constant.value[...] = value
         return changed
 
-    def _constant(self, law: Callable[[float], Values], size: int) -> fem.Constant:
+    def _constant(self, law: Law, size: int) -> fem.Constant:
         constant = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.nan)
         self._moving.append((constant, law))
         return constant

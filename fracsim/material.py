@@ -34,7 +34,7 @@ def material_fields(domain: Domain, material: Material) -> MaterialFields:
     options = {}
     if domain.dim == 2 and material.plane == "stress":
         lmbda = plane_stress_lambda(mu, lmbda)
-        options = {"reduced": True} if material.energy == "stvk" else {}
+        options = {"reduced": True}
     kind = ENERGIES[material.energy]
     return MaterialFields(kind(_coefficient(domain, mu), _coefficient(domain, lmbda), **options), density, young)
 

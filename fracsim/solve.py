@@ -85,7 +85,7 @@ class Solver:
         self.snes.solve(None, self._x)
         snes, reason = self.snes, self.snes.reason
         if reason > 0 and self._single:
-            self.equations.assemble_residual(snes, self._x, self.equations.residual)
+            self.evaluate_residual()
         else:
             self.equations.load_displacement(self._x)
         krylov = snes.getLinearSolveIterations() + extended
@@ -123,6 +123,10 @@ class Solver:
         if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
             return int(reason.CONVERGED_FNORM_RELATIVE)
         return int(reason.ITERATING)
+
+    def evaluate_residual(self) -> None:
+        """Forces at the solution, for the reactions."""
+        self.equations.assemble_residual(self.snes, self._x, self.equations.residual)
 
     def rebuild_preconditioner(self) -> None:
         """Forget the coarse spaces: the body has come apart since they were made."""

@@ -31,7 +31,7 @@ def validate(data: dict[str, Any], name: str) -> Study:
     try:
         study = Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{name}: {_explain(error.errors()[0], data)}") from None
+        raise InputError(f"{name}: {explain(error.errors()[0])}") from None
     return study
 
 
@@ -100,7 +100,8 @@ def _index(place: list[Any], part: str, override: str) -> int:
 # --- messages -------------------------------------------------------------------------------------------------------
 
 
-def _explain(error: Any, data: dict[str, Any]) -> str:
+def explain(error: Any) -> str:
+    """One sentence for one of pydantic's errors: the key, the value, what is allowed."""
     location = [part for part in error["loc"] if part not in _BRANCHES]
     where = ".".join(map(str, location))
     if error["type"] == "extra_forbidden":

@@ -41,8 +41,12 @@ def session() -> Iterator[Any]:
             gmsh.model.remove()
 
 
-def meshed(draw: Callable[[Any], None], dim: int, sizing: Sizing) -> tuple[Points, Indices]:
+def meshed(
+    draw: Callable[[Any], None], dim: int, sizing: Sizing, move: Callable[[Points], Points] | None = None
+) -> tuple[Points, Indices]:
     """Points (n, d) and positive cells (m, d + 1) of what `draw` puts into gmsh's OpenCASCADE model.
+
+    `move` maps the nodes of the surface mesh (k, 3) to other places before the volume is filled.
 
     Raises:
         MeshError: gmsh failed; the message has its reason.
@@ -52,25 +56,35 @@ def meshed(draw: Callable[[Any], None], dim: int, sizing: Sizing) -> tuple[Point
         gmsh.model.occ.synchronize()
         sizing.apply(gmsh)
         gmsh.model.mesh.generate(2)
+        if move:
+            _move_nodes(gmsh, move)
         if dim == 3:
             fill_volumes(gmsh, sizing)
         return cells_in(gmsh, dim)
 
 
+def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    for tag, point in zip(tags, move(coordinates.reshape(-1, 3)), strict=True):
+        gmsh.model.mesh.setNode(tag, point, [])
+
+
 def fill_volumes(gmsh: Any, sizing: Sizing) -> None:
     """Tetrahedra in the volumes of a model whose surfaces are meshed.
 
-    By HXT (several times as fast as gmsh's Delaunay, and better in the worst cell); by Delaunay where that fails.
+    By HXT (several times as fast as gmsh's Delaunay), by Delaunay where that fails; then cells of a radius ratio
+    below 0.3 are mended, of which HXT leaves a few.
     """
     sizing.apply(gmsh, INNER)
     for algorithm in (HXT, DELAUNAY):
         gmsh.option.setNumber("Mesh.Algorithm3D", algorithm)
         try:
             gmsh.model.mesh.generate(3)
-            return
+            break
         except Exception:
             if algorithm == DELAUNAY:
                 raise
+    gmsh.model.mesh.optimize("", True)
 
 
 def cells_in(gmsh: Any, dim: int) -> tuple[Points, Indices]:

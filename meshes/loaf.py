@@ -12,7 +12,7 @@ from .data import MeshData, Points
 from .gmsh_session import meshed
 from .parameters import affordable, is_number, positive, require
 from .sizing import Sizing, cells_for
-from .topology import boundary_facets, facets_except, facets_where, oriented, plane_groups
+from .topology import boundary_facets, facets_except, facets_where, plane_groups
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Loaf:
             and 2 * self.rounding < min(length, width)
             and self.rounding + self.bottom_rounding < height,
             f"loaf: rounding = {self.rounding!r} and bottom_rounding = {self.bottom_rounding!r} do not fit a block of "
-            f"{length:.3g} x {width:.3g} x {height:.3g} m (the size before doming); bottom_rounding may not be the larger.",
+            f"{length:.3g} x {width:.3g} x {height:.3g} m (the size before doming), bottom_rounding being the lesser.",
         )
         require(
             2 * self.grip < length,
@@ -77,12 +77,11 @@ class Loaf:
     def cells_estimate(self) -> int:
         length, width, height = self._block
         lost = (4 - pi) * self.rounding**2 * (height + length + width) / (length * width * height)
-        return cells_for(Sizing(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost))
+        baked = (1 + self.flare / 2) * (1 + self.dome * 4 / 5 * 2 / 3)  # means of the factors on width and height
+        return cells_for(Sizing(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost) * baked)
 
     def build(self) -> MeshData:
-        points, cells = meshed(self._draw, 3, Sizing(self.h))
-        points = self._baked(points)
-        cells, _ = oriented(points, cells)
+        points, cells = meshed(self._draw, 3, Sizing(self.h), self._baked)
         boundary = boundary_facets(cells)
         bottom = plane_groups(points, boundary, {"bottom": (2, 0.0)})
         reach = self.size[0] / 2 - self.grip * (1 - 1e-9)
@@ -109,7 +108,7 @@ class Loaf:
         occ.fillet([block], edges, [self.bottom_rounding if low else self.rounding for low in lower])
 
     def _baked(self, points: Points) -> Points:
-        """The block's points raised and widened, then scaled so that they fill the bounds exactly."""
+        """The block's surface points raised and widened, then scaled so that they fill the bounds exactly."""
         length, width, height = self._block
         x, y, z = points.T
         rise = self.dome * (1 - (2 * x / length) ** 4) * (1 - (2 * y / width) ** 2)

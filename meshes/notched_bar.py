@@ -141,7 +141,7 @@ class NotchedBar:
         require(mouth < self.length, f"notched-bar: the notch is {mouth:.3g} m wide, length = {self.length!r} m only.")
         require(
             not self.span or mouth + self.patch < self.span < self.length - self.patch,
-            f"notched-bar: span = {self.span!r} leaves no room for supports of width patch = {self.patch!r} between the "
+            f"notched-bar: span = {self.span!r} leaves no room for supports of patch = {self.patch!r} between the "
             f"notch ({mouth:.3g} m wide) and the ends (length = {self.length!r}); span = 0 leaves the supports out.",
         )
 

@@ -44,7 +44,7 @@ class Profile:
 
 
 def mesh_profile(profile: Profile, thickness: float, sizing: Sizing) -> tuple[Points, Indices]:
-    """Points and positive cells of the profile in x-y (thickness 0), or of the solid: x, thickness along y, height z."""
+    """Points and positive cells of the profile in x-y (thickness 0), or of the solid with its thickness along y."""
     dim = 3 if thickness > 0 else 2
     points, cells = meshed(lambda gmsh: profile.draw(gmsh, thickness), dim, sizing)
     if dim == 3:

@@ -1,0 +1,142 @@
+"""`fracsim check`: everything that can be known of a study without solving, and what its scene will build.
+
+Names, dimensions and places are compared with what the builder says of itself, or with the mesh file. No DOLFINx: the answer
+comes in a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import InputError
+from .laws import in_time, motion_law, of_size
+from .mesh_source import build_mesh, find_builder
+from .study import MOTIONS, Box, Plane, Study
+from .support import bodies_of
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """What is known of a mesh before it is built."""
+
+    dim: int
+    groups: tuple[str, ...]
+    regions: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    size: str  # how many cells, in words
+
+
+def check_study(study: Study) -> list[str]:
+    """Lines that tell what the scene will build. InputError where the study cannot run."""
+    anatomy = mesh_anatomy(study)
+    _check_groups(study, anatomy)
+    _check_dimensions(study, anatomy.dim)
+    return list(_description(study, anatomy))
+
+
+def mesh_anatomy(study: Study) -> Anatomy:
+    """From the builder's own words; a mesh from file is read, a surface is left to the run."""
+    builder = find_builder(study.mesh)
+    if builder is not None:
+        lower, upper = builder.bounds()
+        size = f"about {builder.cells_estimate():,} cells"
+        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size)
+    if study.mesh.surface is not None:
+        infinite = (np.inf,) * 3
+        return Anatomy(3, ("surface",), (), tuple(-x for x in infinite), infinite, "cells counted when it is filled")
+    mesh = build_mesh(study.mesh)
+    count = bodies_of(mesh)[0]
+    size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
+    lower, upper = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), tuple(lower), tuple(upper), size)
+
+
+def _check_groups(study: Study, anatomy: Anatomy) -> None:
+    places = [(f"boundary.{i}.on", entry.on) for i, entry in enumerate(study.boundary)]
+    places += [(f"probe.{i}.on", probe.on) for i, probe in enumerate(study.probe) if probe.on is not None]
+    for key, where in places:
+        if isinstance(where, str):
+            if where not in anatomy.groups:
+                known = ", ".join(sorted(anatomy.groups)) or "none"
+                raise InputError(f'{key} = "{where}": the mesh has no such facet group; it has: {known}')
+        else:
+            _check_place(key, where, anatomy)
+    for name in study.material.regions:
+        if name not in anatomy.regions:
+            known = ", ".join(anatomy.regions) or "none"
+            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {known}")
+
+
+def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
+    """Whether a box or plane meets the body's bounding box at all."""
+    if isinstance(where, Box):
+        low, high = (of_size(corner, anatomy.dim, f"{key}.box") for corner in where.box)
+        misses = np.any(low > anatomy.upper) or np.any(high < anatomy.lower)
+    else:
+        normal, point = (of_size(v, anatomy.dim, f"{key}.{n}") for v, n in ((where.normal, "normal"), (where.point, "point")))
+        if not np.any(normal):
+            raise InputError(f"{key}.normal = {where.normal}: a normal must not be zero")
+        ends = np.sort(np.array([normal * (np.array(anatomy.lower) - point), normal * (np.array(anatomy.upper) - point)]), axis=0)
+        slack = (where.within or 0.0) * np.linalg.norm(normal) + 1e-9 * np.abs(ends[np.isfinite(ends)]).sum()
+        misses = ends[0].sum() > slack or ends[1].sum() < -slack
+    if misses:
+        raise InputError(f"{key} selects no node: the body lies in {anatomy.lower} to {anatomy.upper}")
+
+
+def _check_dimensions(study: Study, dim: int) -> None:
+    for i, entry in enumerate(study.boundary):
+        key = f"boundary.{i}"
+        if entry.kind in MOTIONS:
+            motion_law(entry, dim, key)
+        else:
+            in_time(getattr(entry, entry.kind), f"{key}.{entry.kind}", dim if entry.kind == "traction" else 1)
+    if study.load is not None:
+        for name in ("gravity", "body_force"):
+            if (value := getattr(study.load, name)) is not None:
+                in_time(value, f"load.{name}", dim)
+    if study.initial is not None and study.initial.velocity is not None:
+        of_size(study.initial.velocity, dim, "initial.velocity")
+    if study.initial is not None and study.initial.spin is not None:
+        of_size(study.initial.spin, 1 if dim == 2 else 3, "initial.spin")
+    for i, probe in enumerate(study.probe):
+        if probe.point is not None:
+            of_size(probe.point, dim, f"probe.{i}.point")
+    if dim == 3 and study.material.plane == "stress":
+        raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
+
+
+def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
+    source = study.mesh.builder or study.mesh.file or study.mesh.surface
+    yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
+    plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
+    regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
+    yield f"material    {study.material.energy}{plane}{regions}"
+    yield f"fracture    {_fracture(study)}"
+    yield f"damping     {_damping(study)}"
+    kinds = [entry.kind for entry in study.boundary]
+    yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
+    yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
+    steps = study.time.end / study.time.step
+    halving = "halved where a step fails" if study.time.adapt else "fixed"
+    yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
+    options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
+    yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
+    yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _fracture(study: Study) -> str:
+    if study.fracture is None:
+        return "off: no damage field, no graph, no average"
+    fracture = study.fracture
+    average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
+    return f"degraded energy ({fracture.approach}), strength {fracture.strength:g} Pa, {average}"
+
+
+def _damping(study: Study) -> str:
+    if study.damping is None:
+        return "off"
+    return f"Rayleigh, {study.damping.mass:g} M + {study.damping.stiffness:g} K"

@@ -1,0 +1,181 @@
+"""The command line. Light to import: each command imports what it needs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from .errors import Exit, FracsimError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of one that comes along")]
+Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
+_NONE: list[str] = []
+
+
+@app.command()
+def run(
+    study: StudyPath,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME)")] = None,
+    set_: Set = _NONE,
+    restart: Annotated[bool, typer.Option("--restart", help="go on from the checkpoint in the output folder")] = False,
+    wall_limit: Annotated[float | None, typer.Option(help="seconds after which to stop with a checkpoint")] = None,
+) -> None:
+    """Run a study. Works under mpirun."""
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    path = find_study(study)
+    loaded = _load(comm, path, set_)
+    from .run import run_study
+
+    folder = out or Path("out") / path.stem
+    summary = run_study(comm, loaded, folder, restart=restart, wall_limit=wall_limit)
+    if comm.rank == 0:
+        print(
+            f"{summary['title']}: {summary['steps']} steps to t = {summary['time']:g} s in {summary['wall']:.1f} s on "
+            f"{summary['ranks']} rank{'s'[: summary['ranks'] > 1]}; {summary['broken_edges']} broken edges, "
+            f"{summary['pieces']} piece{'s'[: summary['pieces'] != 1]}. Results in {folder}"
+        )
+
+
+@app.command()
+def check(study: StudyPath, set_: Set = _NONE) -> None:
+    """Validate everything that can be known without solving; print what the scene will build."""
+    if not _is_root():
+        return
+    from .check import check_study
+    from .study_file import load_study
+
+    path = find_study(study)
+    loaded = load_study(path, set_)
+    print(loaded.title)
+    for line in check_study(loaded):
+        print("  " + line)
+
+
+@app.command()
+def mesh(
+    study: StudyPath,
+    out: Annotated[Path, typer.Option("-o", "--out", help="mesh file: .vtu, .xdmf, .msh, ...")],
+    set_: Set = _NONE,
+) -> None:
+    """Build and save the mesh of a study, print its quality."""
+    if not _is_root():
+        return
+    from .mesh_source import build_mesh
+    from .meshes.quality import mesh_quality
+    from .meshes.write import write_mesh
+    from .study_file import load_study
+
+    data = build_mesh(load_study(find_study(study), set_).mesh)
+    for note in data.notes:
+        print(f"note: {note}")
+    for name, value in mesh_quality(data).items():
+        print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {value}")
+    write_mesh(data, out)
+    print(f"saved in {out}")
+
+
+@app.command()
+def render(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
+    png: Annotated[Path | None, typer.Option("-o", "--out", help="picture (default OUT/last.png)")] = None,
+) -> None:
+    """Draw the last frame of a run, off-screen."""
+    if not _is_root():
+        return
+    from .picture import render_last
+
+    print(f"saved {render_last(out, png)}")
+
+
+@app.command(name="list")
+def list_() -> None:
+    """Show the studies, builders, energies and schemes that exist."""
+    if not _is_root():
+        return
+    from .catalogue import catalogue
+
+    for heading, entries in catalogue().items():
+        print(heading)
+        for name, words in entries.items():
+            print(f"  {name:18} {words}")
+
+
+def find_study(name: str) -> Path:
+    """A path as it is, or the name of a study in the package."""
+    path = Path(name)
+    if path.exists():
+        return path
+    from .studies import folder
+
+    packaged = folder() / (name if name.endswith(".toml") else f"{name}.toml")
+    return packaged if packaged.exists() and path.parent == Path() else path
+
+
+def _load(comm: Any, path: Path, overrides: list[str]) -> Any:
+    """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
+    from .parallel import from_root
+    from .study_file import load_study
+
+    return from_root(comm, lambda: load_study(path, overrides))
+
+
+def _is_root() -> bool:
+    """Rank 0, without starting MPI."""
+    return all(os.environ.get(name, "0") == "0" for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK"))
+
+
+def main() -> NoReturn:
+    """Entry point: one message and an exit code for what a user can mend, on any number of ranks."""
+    if not _is_root() and "--help" in sys.argv:
+        sys.exit(0)
+    sys.exit(_guarded(lambda: app(standalone_mode=False)))
+
+
+def _guarded(work: Callable[[], Any]) -> int:
+    import click
+
+    try:
+        code = work()
+        return code if isinstance(code, int) else Exit.DONE
+    except FracsimError as error:
+        _say(str(error))
+        return int(error.exit_code)
+    except click.ClickException as error:
+        _say(f"{error.format_message()}; see fracsim --help")
+        return int(Exit.BAD_INPUT)
+    except click.exceptions.Exit as error:
+        return error.exit_code
+    except Exception:
+        _abort()
+        raise
+
+
+def _say(message: str) -> None:
+    if _is_root():
+        print(f"fracsim: {message}", file=sys.stderr, flush=True)
+
+
+def _abort() -> None:
+    """A fault of the program on one rank: show it and end all ranks, which would otherwise wait for it for ever."""
+    if "mpi4py.MPI" not in sys.modules:
+        return
+    from mpi4py import MPI
+
+    if MPI.COMM_WORLD.size > 1:
+        import traceback
+
+        traceback.print_exc()
+        sys.stderr.flush()
+        MPI.COMM_WORLD.Abort(1)
+
+
+__all__ = ["app", "find_study", "main"]

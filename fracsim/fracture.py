@@ -1,0 +1,165 @@
+"""The pass after a step: which edges break, and what that leaves of the energy of their cells (METHOD sections 3, 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .domain import Domain
+from .edge_stress import carried_by, edge_vectors, normal_stress
+from .equilibrium import Equilibrium
+from .forms.energies import cauchy_stress
+from .forms.kinematics import deformation_gradient, symmetric_components
+from .graph import EdgeGraph, local_edges
+from .kernels import CellExpression
+from .material import PerCell, per_cell
+from .study import Fracture, Material
+
+Values = npt.NDArray[np.float64]
+Cells = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PassResult:
+    """What one pass did, summed over the ranks but for `released`."""
+
+    broken: int  # edges that broke in this pass
+    released: float  # elastic energy that went with them on this rank, J
+
+
+class FracturePass:
+    """Breaks edges where the averaged normal stress reaches the strength, and lowers chi.
+
+    Attributes:
+        graph: edges and their damage.
+        strength: (Pa) one number, or (cells,) where regions differ; the edge's own perturbation comes on top.
+    """
+
+    def __init__(self, equations: Equilibrium, fracture: Fracture, material: Material) -> None:
+        domain = equations.domain
+        self.domain, self.equations = domain, equations
+        self.graph = EdgeGraph(domain)
+        self.strength = _strength(domain, fracture, material)
+        self._weakest = float(np.min(self.strength, initial=np.inf)) * (1 - fracture.tie_break)
+        self._tie_break = fracture.tie_break
+        self._linear = equations.material.energy.linear
+        rotation = equations.rotation.field if equations.rotation is not None else None
+        F, energy = deformation_gradient(equations.u), equations.material.energy
+        cauchy = symmetric_components(cauchy_stress(energy, F, rotation))
+        self._stress = CellExpression(domain.comm, domain.mesh, cauchy, domain.cell_count)
+        self._density = CellExpression(domain.comm, domain.mesh, energy.psi(F, rotation), domain.cell_count)
+        self._average = _average(domain, fracture)
+
+    def __call__(self) -> PassResult:
+        """One pass on the current displacement (collective)."""
+        stress = self._stress()
+        np.nan_to_num(stress, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        averaged = self._averaged(stress)
+        flags = np.zeros(len(self.graph.broken), bool)
+        flags[self._overloaded(averaged)] = True
+        broken = self.graph.break_edges(flags)
+        return PassResult(broken, self._degrade(stress))
+
+    def stress(self) -> Values:
+        """(cells, 3 or 6) Cauchy stress of the undegraded energy, Pa."""
+        return self._stress()
+
+    def _averaged(self, stress: Values) -> Values:
+        """What intact edges carry, averaged over the neighbourhood; split cells carry nothing and enter no average."""
+        graph = self.graph
+        damaged = np.flatnonzero(graph.damaged)
+        carried, active = stress, None
+        if self.domain.comm.allreduce(len(damaged)):
+            active = ~graph.split
+            carried = stress.copy()
+            whole = damaged[active[damaged]]
+            carried[whole] = carried_by(stress[whole], self._corners(whole), self._intact(whole))
+            carried[~active] = 0.0
+        return self._average(carried, active) if self._average is not None else carried
+
+    def _overloaded(self, averaged: Values) -> npt.NDArray[np.int32]:
+        """Local edges whose normal stress in some owned cell reaches the strength.
+
+        No normal stress exceeds the Frobenius norm of its tensor, so most cells are passed over after one product.
+        """
+        pairs = averaged.shape[1]
+        normal = self.domain.dim
+        square = np.einsum("ni,ni->n", averaged[:, :normal], averaged[:, :normal])
+        square += 2 * np.einsum("ni,ni->n", averaged[:, normal:pairs], averaged[:, normal:pairs])
+        cells = np.flatnonzero(square >= self._weakest**2)
+        if not len(cells):
+            return np.empty(0, np.int32)
+        edges = self.graph.cell_edges[cells]
+        along = normal_stress(averaged[cells], edge_vectors(self._corners(cells)))
+        strength = self.strength[cells, None] if isinstance(self.strength, np.ndarray) else self.strength
+        limit = strength * (1 + self._tie_break * self._noise(edges)) if self._tie_break else strength
+        return edges[(along >= limit) & ~self.graph.broken[edges]]
+
+    def _noise(self, edges: npt.NDArray[np.int32]) -> Values:
+        """Numbers in [-1, 1) hashed from the edges' reference mid-points."""
+        unique, inverse = np.unique(edges, return_inverse=True)
+        ends = self.domain.nodes[self.graph.edge_nodes[unique]]
+        return hashed(ends[:, 0] + ends[:, 1])[inverse.reshape(edges.shape)]
+
+    def _degrade(self, stress: Values) -> float:
+        """Lower chi of damaged cells (M22 eq. 28); returns the elastic energy released on this rank."""
+        chi: Any = self.equations.chi
+        values = chi.x.array
+        cells = np.flatnonzero(self.graph.damaged & (values[: self.domain.cell_count] > 0))
+        if not len(cells):
+            return 0.0
+        load = np.abs(normal_stress(stress[cells], edge_vectors(self._corners(cells))))
+        whole, kept = load.sum(axis=1), np.where(self._intact(cells), load, 0.0).sum(axis=1)
+        share = np.divide(kept, whole, out=np.ones_like(kept), where=whole > 0)
+        share[self.graph.split[cells]] = 0.0
+        lost = np.maximum(values[cells] - share, 0.0)
+        changed = lost > 0
+        cells, lost = cells[changed], lost[changed]
+        values[cells] -= lost
+        values[cells[self.graph.split[cells]]] = 0.0
+        density = self._density(cells.astype(np.int32))[:, 0]
+        return float(np.sum(self.domain.volumes[cells] * lost * density))
+
+    def _intact(self, cells: Cells) -> npt.NDArray[np.bool_]:
+        """(n, k) whether each local edge of the cells is intact."""
+        bits = np.arange(len(local_edges(self.domain.dim)))
+        return (self.graph.pattern[cells, None] >> bits) & 1 == 0
+
+    def _corners(self, cells: Cells) -> Values:
+        """(n, d + 1, d) corners in the configuration that the energy's stress belongs to, m."""
+        nodes = self.graph.cell_nodes[cells]
+        corners = self.domain.nodes[nodes]
+        if self._linear:
+            return corners
+        return corners + self.equations.u.x.array.reshape(-1, self.domain.dim)[nodes]
+
+
+def _strength(domain: Domain, fracture: Fracture, material: Material) -> PerCell:
+    return per_cell(domain, fracture, "strength", material.regions)
+
+
+def _average(domain: Domain, fracture: Fracture) -> Any:
+    if fracture.radius == 0:
+        return None
+    from .average import NonlocalAverage
+
+    return NonlocalAverage(domain, fracture.radius, fracture.kernel)
+
+
+def hashed(points: Values) -> Values:
+    """Numbers in [-1, 1), one a point, that depend on the bits of its coordinates only (splitmix64's finaliser)."""
+    bits = np.ascontiguousarray(points + 0.0, float).view(np.uint64)  # + 0.0: -0 and 0 are one place
+    state = np.zeros(len(points), np.uint64)
+    for column in bits.T:
+        state = _mix(state ^ column)
+    return (state >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0
+
+
+def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    x = x + np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))

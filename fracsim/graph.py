@@ -1,0 +1,134 @@
+"""The graph of a mesh: nodes joined by the edges of simplices, some of them broken.
+
+A cell's broken edges are one small integer, its *pattern*: bit k is set where local edge k is broken, 64 patterns for a
+tetrahedron and 8 for a triangle. What a pattern means is worked out once for all of them and looked up with arrays.
+"""
+
+from __future__ import annotations
+
+from functools import cache, cached_property
+
+import basix
+import numpy as np
+import numpy.typing as npt
+from dolfinx import la
+
+from .domain import Domain, Ints
+from .parallel import total
+
+CELL = {2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}
+
+
+@cache
+def local_edges(dim: int) -> npt.NDArray[np.int64]:
+    """(edges per cell, 2) local nodes of each local edge, in DOLFINx's order."""
+    return np.array(basix.topology(CELL[dim])[1])
+
+
+@cache
+def node_groups(dim: int) -> npt.NDArray[np.int8]:
+    """(patterns, d + 1): for each pattern, the lowest local node that each local node is joined to by intact edges."""
+    edges = local_edges(dim)
+    patterns = np.arange(1 << len(edges))
+    intact = (patterns[:, None] >> np.arange(len(edges))) & 1 == 0
+    label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(patterns), 1))
+    for _ in range(dim):  # a path through d + 1 nodes has at most d edges
+        for edge, (i, j) in enumerate(edges):
+            lower = np.minimum(label[:, i], label[:, j])
+            label[:, i] = np.where(intact[:, edge], lower, label[:, i])
+            label[:, j] = np.where(intact[:, edge], lower, label[:, j])
+    return label
+
+
+@cache
+def is_split(dim: int) -> npt.NDArray[np.bool_]:
+    """(patterns,): whether the intact edges no longer connect all nodes of the cell."""
+    return np.any(node_groups(dim) != 0, axis=1)
+
+
+class EdgeGraph:
+    """Damage of the edges of a distributed mesh, and the patterns of its cells.
+
+    Attributes:
+        cell_edges: (cells, k) local edge index of each cell's local edges, k = 3 or 6.
+        cell_nodes: (cells, d + 1) local node index.
+        broken: (edges,) bool for owned and ghost edges, the same on every rank that has the edge.
+        pattern: (cells,) uint8, bit k set where local edge k is broken.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        topology = domain.mesh.topology
+        topology.create_entities(1)
+        topology.create_connectivity(domain.dim, 1)
+        edges = local_edges(domain.dim)
+        self.domain = domain
+        self.index_map = topology.index_map(1)
+        self.edge_count = int(self.index_map.size_local)
+        connectivity = topology.connectivity(domain.dim, 1).array
+        self.cell_edges: Ints = connectivity[: domain.cell_count * len(edges)].reshape(-1, len(edges))
+        self.cell_nodes = domain.cell_nodes
+        self.broken = np.zeros(self.edge_count + self.index_map.num_ghosts, bool)
+        self.pattern = np.zeros(domain.cell_count, np.uint8)
+        self._shared = la.vector(self.index_map, 1, np.int32)
+
+    @cached_property
+    def edge_nodes(self) -> Ints:
+        """(edges, 2) local nodes of owned and ghost edges."""
+        result = np.full((len(self.broken), 2), -1, np.int32)
+        result[self.cell_edges] = self.cell_nodes[:, local_edges(self.domain.dim)]
+        return result
+
+    def on_any_rank(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags raised on any rank that has the edge (collective)."""
+        if self.domain.comm.size == 1:
+            return flags
+        self._shared.array[:] = flags
+        self._shared.scatter_reverse(la.InsertMode.add)
+        self._shared.scatter_forward()
+        return self._shared.array > 0
+
+    def break_edges(self, flags: npt.NDArray[np.bool_]) -> int:
+        """Break the intact edges flagged on any rank; returns how many broke in all (collective)."""
+        new = self.on_any_rank(flags) & ~self.broken
+        count = int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
+        if count:
+            self.broken |= new
+            touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
+            bits = 1 << np.arange(self.cell_edges.shape[1])
+            self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
+        return count
+
+    @property
+    def broken_count(self) -> int:
+        """Broken edges that this rank owns."""
+        return int(np.count_nonzero(self.broken[: self.edge_count]))
+
+    @property
+    def damaged(self) -> npt.NDArray[np.bool_]:
+        """(cells,) whether any edge is broken."""
+        return self.pattern != 0
+
+    @property
+    def split(self) -> npt.NDArray[np.bool_]:
+        """(cells,) whether the cell has come apart."""
+        return is_split(self.domain.dim)[self.pattern]
+
+    def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
+        return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
+
+    def broken_keys(self) -> npt.NDArray[np.int64] | None:
+        """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""
+        own = self.edge_keys(np.flatnonzero(self.broken[: self.edge_count]))
+        parts = self.domain.comm.gather(own)
+        if parts is None:
+            return None
+        keys = np.concatenate(parts)
+        return keys[np.lexsort(keys.T[::-1])]
+
+    def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the local edges whose keys are among those given."""
+        own = self.edge_keys(np.arange(len(self.broken)))
+        factor = int(max(keys.max(initial=0), own.max(initial=0))) + 1
+        return np.isin(own @ np.array([factor, 1]), keys @ np.array([factor, 1]))
+

@@ -1,0 +1,265 @@
+"""A run: everything is built and checked first, then the output folder is made, then time moves."""
+
+from __future__ import annotations
+
+import json
+import platform
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from . import __version__
+from .checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
+from .domain import Domain, distribute
+from .equilibrium import Equilibrium
+from .errors import NotConverged, Stopped
+from .fields_file import FieldsFile
+from .forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
+from .frames import Frames
+from .history import History, Probes
+from .interrupt import Interrupt
+from .material import material_fields
+from .mesh_source import build_mesh
+from .parallel import on_root, total
+from .pieces import Pieces, find_pieces
+from .progress import Progress
+from .solve import Solver
+from .state import State
+from .stepping import Report, Stepper
+from .study import Output, Study, Time
+from .study_file import study_text
+from .support import bodies_of, check_supports
+
+
+@dataclass
+class Scene:
+    """A study bound to its mesh: what a run moves."""
+
+    study: Study
+    domain: Domain
+    equations: Equilibrium
+    solver: Solver
+    stepper: Stepper
+    fracture: Any  # FracturePass | None
+    probes: Probes
+
+
+def build_scene(comm: MPI.Comm, study: Study) -> Scene:
+    """Mesh, equations, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
+    domain = distribute(comm, on_root(comm, lambda: build_mesh(study.mesh)))
+    scheme = make_scheme(study.time)
+    equations = Equilibrium(domain, study, material_fields(domain, study.material), scheme)
+    if not scheme.inertia:
+        check_supports(domain, equations.motion)
+    fracture = None
+    if study.fracture is not None:
+        from .fracture import FracturePass
+
+        fracture = FracturePass(equations, study.fracture, study.material)
+    solver = Solver(equations, study.solver)
+    stepper = Stepper(equations, solver, study.time, fracture)
+    return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
+
+
+def make_scheme(timing: Time) -> Scheme:
+    """The time scheme of a study."""
+    if timing.scheme == "newmark":
+        return Newmark(timing.beta, timing.gamma)
+    return BackwardEuler() if timing.scheme == "backward-euler" else QuasiStatic()
+
+
+class Run:
+    """Steps a scene to its end and writes the output folder."""
+
+    def __init__(self, scene: Scene, folder: Path, *, restart: bool = False, wall_limit: float | None = None) -> None:
+        self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
+        self._began = time.perf_counter()
+        self._interrupt = Interrupt(self.comm, wall_limit)
+        self.state = scene.stepper.start(scene.study.initial)
+        if restart:
+            read_checkpoint(folder, scene.domain, self.state, scene.equations, self._graph)
+        self._prepare(restart)
+        self._damage = self._count_damage()
+        self.output_seconds = 0.0
+        self._setup_seconds = 0.0
+
+    @property
+    def _graph(self) -> Any:
+        return self.scene.fracture.graph if self.scene.fracture is not None else None
+
+    # --- set-up ---
+
+    def _prepare(self, restart: bool) -> None:
+        study, step = self.scene.study, self.state.step if restart else None
+        on_root(self.comm, lambda: make_folder(self.folder, self._resolved(), restart))
+        root = self.comm.rank == 0
+        self.history = History(self.folder / "history.csv" if root else None, self.scene.probes.names, step)
+        names = study.output.fields if study.output.fields is not None else default_fields(study)
+        self.frames = Frames(self.scene.equations, names, self.scene.fracture)
+        source = self.scene.domain.source
+        self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
+        self._clock = OutputClock(study.output, study.time)
+        self._bodies = int(self.comm.bcast(bodies_of(source)[0] if source is not None else None))
+
+    def _resolved(self) -> str:
+        return study_text(self.scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
+
+    # --- the loop ---
+
+    def __call__(self) -> dict[str, Any]:
+        """Run to the end; returns what summary.json says. Raises NotConverged or Stopped after a checkpoint."""
+        self._setup_seconds = time.perf_counter() - self._began
+        outcome = "failed"
+        progress = Progress(self.comm, self.scene.study)
+        try:
+            with self._interrupt, progress:
+                self._loop(progress)
+            outcome = "done"
+        except (NotConverged, Stopped) as error:
+            outcome = "not converged" if isinstance(error, NotConverged) else "stopped"
+            raise type(error)(f"{error}. Checkpoint: {self._checkpoint()}; go on with --restart") from None
+        finally:
+            summary = self._summary(outcome)
+            self.history.close()
+            if self.comm.rank == 0:
+                (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        return summary
+
+    def _loop(self, progress: Progress) -> None:
+        state, end = self.state, self.scene.study.time.end
+        if state.step == 0:
+            self._write_frame()
+        last = time.monotonic()
+        every = self.scene.study.output.checkpoint
+        while state.t < end * (1 - 1e-12):
+            report = self.scene.stepper.advance(state)
+            if report.broken:
+                self._damage = self._count_damage()
+            self.history.append(state, report, self._figures(), self.scene.probes())
+            done = state.t >= end * (1 - 1e-12)
+            if done or self._clock.due(state):
+                self._write_frame()
+            progress.update(state, report, self._figures())
+            if every is not None and self.comm.bcast(time.monotonic() - last > every):
+                self._checkpoint()
+                last = time.monotonic()
+            if not done and (reason := self._interrupt.reason()):
+                self._write_frame()
+                raise Stopped(f"stopped by {reason} at t = {state.t:g} s after {state.step} steps")
+
+    def _write_frame(self) -> None:
+        began = time.perf_counter()
+        fields = self.frames(self.state, self._damage[2])
+        if self.fields is not None and self.state.t not in self.fields.times:
+            self.fields.write(self.state.t, fields)
+        self._clock.wrote(self.state)
+        self.output_seconds += time.perf_counter() - began
+
+    def _checkpoint(self) -> Path:
+        began = time.perf_counter()
+        path = write_checkpoint(self.folder, self.scene.domain, self.state, self.scene.equations, self._graph)
+        self.output_seconds += time.perf_counter() - began
+        return path
+
+    # --- figures ---
+
+    def _count_damage(self) -> tuple[int, int, Pieces | None]:
+        """(broken edges, split cells, pieces) over all ranks."""
+        graph = self._graph
+        if graph is None:
+            return 0, 0, None
+        broken, split = total(self.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
+        return int(broken), int(split), find_pieces(graph)
+
+    def _figures(self) -> tuple[int, int, int]:
+        broken, split, pieces = self._damage
+        return broken, split, pieces.count if pieces is not None else self._bodies
+
+    def _summary(self, outcome: str) -> dict[str, Any]:
+        state, stepper, domain = self.state, self.scene.stepper, self.scene.domain
+        broken, split, pieces = self._figures()
+        sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
+        memory = total(self.comm, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)[0]
+        seconds = {"setup": self._setup_seconds, **stepper.phases, "output": self.output_seconds}
+        return {
+            "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
+            "nodes": int(sizes[0]), "cells": int(sizes[1]), "broken_edges": broken, "split_cells": split, "pieces": pieces,
+            "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
+            "seconds": {key: round(value, 4) for key, value in seconds.items()},
+            "wall": round(time.perf_counter() - self._began, 3), "peak_memory_MiB": round(float(memory), 1),
+            "ranks": self.comm.size, "versions": versions(self.comm),
+        }  # fmt: skip
+
+
+class OutputClock:
+    """When a frame is due: every so many steps, or so many seconds of simulated time. Default: 50 frames a run."""
+
+    def __init__(self, output: Output, timing: Time) -> None:
+        self._every = output.every
+        self._interval = output.interval or timing.end / 50
+        self._last = 0.0
+
+    def due(self, state: State) -> bool:
+        if self._every is not None:
+            return state.step % self._every == 0
+        return state.t >= self._last + self._interval * (1 - 1e-9)
+
+    def wrote(self, state: State) -> None:
+        # the grid of intervals, not the time of the frame: late frames must not push the others back
+        self._last = np.floor(state.t / self._interval * (1 + 1e-9)) * self._interval
+
+
+def default_fields(study: Study) -> list[str]:
+    """Fields of a study that names none."""
+    return ["damage", "von_mises"] if study.fracture is not None else ["von_mises"]
+
+
+OWN_FILES = ("study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json", "last.png")
+
+
+def make_folder(folder: Path, study: str, restart: bool) -> None:
+    """Make the output folder and write study.toml; an earlier run's files go, unless it is continued (rank 0)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not restart:
+        for name in OWN_FILES:
+            (folder / name).unlink(missing_ok=True)
+        checkpoint_path(folder).unlink(missing_ok=True)
+    (folder / "study.toml").write_text(study)
+
+
+def versions(comm: MPI.Comm) -> dict[str, str]:
+    """What ran: programs, versions, ranks."""
+    return {
+        "fracsim": __version__,
+        "dolfinx": dolfinx.__version__,
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "python": platform.python_version(),
+        "ranks": str(comm.size),
+    }
+
+
+def run_study(
+    comm: MPI.Comm, study: Study, folder: Path, *, restart: bool = False, wall_limit: float | None = None
+) -> dict[str, Any]:
+    """Build, run, draw the last frame; returns the summary (collective)."""
+    scene = build_scene(comm, study)
+    summary = Run(scene, folder, restart=restart, wall_limit=wall_limit)()
+    if study.output.picture:
+        on_root(comm, lambda: _draw(folder))
+    return summary
+
+
+def _draw(folder: Path) -> None:
+    from .picture import render_last
+
+    render_last(folder)
+
+
+__all__ = ["Report", "Run", "Scene", "build_scene", "run_study"]

@@ -1,0 +1,190 @@
+"""Advancing in time: attempt a step, halve it where the solve fails, grow it back after easy ones."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .equilibrium import Equilibrium
+from .errors import NotConverged
+from .laws import of_size
+from .parallel import total
+from .solve import Outcome, Solver
+from .state import State
+from .study import Initial, Time
+
+Values = npt.NDArray[np.float64]
+
+EASY_STEPS = 4  # steps in a row without trouble before a halved step is doubled again
+
+
+@dataclass(frozen=True)
+class Report:
+    """A step that was taken: what history.csv says of it (sums over ranks)."""
+
+    dt: float
+    outcome: Outcome
+    broken: int
+    kinetic: float
+    elastic: float
+    seconds: float
+
+
+class Stepper:
+    """Moves a `State` forward by one step of the study's scheme, with the fracture pass at its end."""
+
+    def __init__(self, equations: Equilibrium, solver: Solver, timing: Time, fracture: Any = None) -> None:
+        self.equations, self.solver, self.timing, self.fracture = equations, solver, timing, fracture
+        self.smallest = timing.smallest or timing.step / 1024
+        self.comm = equations.domain.comm
+        self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
+        self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
+
+    def start(self, initial: Initial | None) -> State:
+        """The state at t = 0: at rest, or with the initial velocity, and in a dynamic study M a = f."""
+        equations = self.equations
+        n = len(equations.mass)
+        state = State(np.zeros(n), np.zeros(n), np.zeros(n), dt=self.timing.step)
+        if initial is not None:
+            state.v = initial_velocity(equations, initial)
+        self._hold(state)
+        return state
+
+    def _hold(self, state: State) -> None:
+        """Loads, reactions and accelerations that belong to the state's displacement."""
+        equations = self.equations
+        equations.begin(state.t, self.timing.step, state.u, state.v, state.a)
+        equations.displace(state.u)
+        unbalanced = equations.internal_force() - equations.applied_force()
+        free = np.ones(len(unbalanced), bool)
+        free[equations.held] = False
+        if equations.scheme.inertia and self.timing.scheme == "newmark":
+            state.a = np.where(free, -unbalanced / equations.mass, 0.0)
+        state.forces = equations.applied_force() + np.where(free, 0.0, unbalanced)
+
+    def advance(self, state: State) -> Report:
+        """Take one step, as large as state.dt allows. Raises NotConverged at the smallest step."""
+        began = time.perf_counter()
+        while True:
+            dt = self._fit(state)
+            outcome = self._attempt(state, dt)
+            if outcome.converged:
+                break
+            self._halve(state, dt, outcome)
+        return self._accept(state, dt, outcome, began)
+
+    def _fit(self, state: State) -> float:
+        """The step to take: no further than the end, and no sliver left over before it."""
+        left = self.timing.end - state.t
+        return left if left < state.dt * (1 + 1e-9) else state.dt
+
+    def _attempt(self, state: State, dt: float) -> Outcome:
+        began = time.perf_counter()
+        equations = self.equations
+        equations.begin(state.t + dt, dt, state.u, state.v, state.a)
+        outcome = self.solver.solve(self._guess(state, dt))
+        self.phases["solve"] += time.perf_counter() - began
+        return outcome
+
+    def _guess(self, state: State, dt: float) -> Values:
+        """Where the body would go by itself; in a quasi-static study the last increment once more."""
+        if self.equations.scheme.inertia:
+            return state.u + dt * state.v
+        if self._before is None:
+            return state.u
+        return state.u + (state.u - self._before) * (dt / self._last_dt)
+
+    def _halve(self, state: State, dt: float, outcome: Outcome) -> None:
+        if self._before is not None and not self.equations.scheme.inertia:
+            self._before = None  # the extrapolated guess may be what failed: try again from where the body is
+            return
+        state.easy = 0
+        if not self.timing.adapt or dt / 2 < self.smallest:
+            floor = "time.adapt is off" if not self.timing.adapt else f"the smallest step is {self.smallest:g} s"
+            raise NotConverged(
+                f"no solution at t = {state.t + dt:g} s with a step of {dt:g} s ({floor}). {outcome.reason}. "
+                f"Last good time: {state.t:g} s"
+            )
+        state.dt = dt / 2
+
+    def _accept(self, state: State, dt: float, outcome: Outcome, began: float) -> Report:
+        equations = self.equations
+        old = state.u
+        state.u = equations.u.x.array[: len(old)].copy()
+        state.v, state.a = equations.rates()
+        self._before, self._last_dt = old, dt
+        state.t, state.step = state.t + dt, state.step + 1
+        work, viscous = self._work(state, state.u - old)
+        broken, released = self._break(state)
+        kinetic, elastic = self._energies(state)
+        sums = total(equations.domain.comm, np.array([work, viscous + released, kinetic, elastic]))
+        state.work += float(sums[0])
+        state.dissipated += float(sums[1])
+        self._grow(state)
+        return Report(dt, outcome, broken, float(sums[2]), float(sums[3]), time.perf_counter() - began)
+
+    def _work(self, state: State, increment: Values) -> tuple[float, float]:
+        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in it."""
+        equations = self.equations
+        forces = equations.applied_force().copy()
+        held = equations.held
+        forces[held] += equations.unbalanced[held]
+        drag = equations.viscous_force()
+        work = 0.5 * float((state.forces + forces) @ increment)
+        viscous = 0.0
+        if drag is not None:
+            viscous = 0.5 * float((drag + (state.drag if state.drag is not None else 0.0)) @ increment)
+        state.forces, state.drag = forces, drag
+        return work, viscous
+
+    def _break(self, state: State) -> tuple[int, float]:
+        if self.fracture is None:
+            return 0, 0.0
+        began = time.perf_counter()
+        result = self.fracture()
+        if result.broken:
+            self._release(state)
+        self.phases["fracture"] += time.perf_counter() - began
+        return result.broken, result.released
+
+    def _release(self, state: State) -> None:
+        """Reactions after the edges broke: the next step's work starts from them."""
+        equations, held = self.equations, self.equations.held
+        state.forces[held] -= equations.unbalanced[held]
+        self.solver.evaluate_residual()
+        state.forces[held] += equations.unbalanced[held]
+        self.solver.rebuild_preconditioner()
+
+    def _energies(self, state: State) -> tuple[float, float]:
+        began = time.perf_counter()
+        kinetic = self.equations.kinetic_energy(state.v) if self.equations.scheme.inertia else 0.0
+        elastic = self.equations.elastic_energy()
+        self.phases["energies"] += time.perf_counter() - began
+        return kinetic, elastic
+
+    def _grow(self, state: State) -> None:
+        state.easy += 1
+        if state.dt < self.timing.step and state.easy >= EASY_STEPS:
+            state.dt = min(2 * state.dt, self.timing.step)
+            state.easy = 0
+
+
+def initial_velocity(equations: Equilibrium, initial: Initial) -> Values:
+    """(owned dofs,) v = velocity + spin x (X - centre of mass), m/s."""
+    domain = equations.domain
+    d = domain.dim
+    X = domain.nodes[: domain.node_count]
+    v = np.zeros_like(X)
+    if initial.velocity is not None:
+        v += of_size(initial.velocity, d, "initial.velocity")
+    if initial.spin is not None:
+        spin = of_size(initial.spin, 1 if d == 2 else 3, "initial.spin")
+        mass = equations.mass.reshape(-1, d)[:, :1]
+        sums = total(domain.comm, np.concatenate([(mass * X).sum(axis=0), mass.sum(axis=0)]))
+        arm = X - sums[:d] / sums[d]
+        v += np.cross(spin, arm) if d == 3 else spin * np.column_stack([-arm[:, 1], arm[:, 0]])
+    return v.reshape(-1)

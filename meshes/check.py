@@ -1,0 +1,283 @@
+"""What is wrong with a mesh is found before anything is solved: mended and noted, or named and refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .data import Indices, MeshData, MeshError, Points
+from .topology import Floats, distinct_rows, edges_of, facets_of, oriented, signed_measures
+
+SHOWN = 5  # examples in a message
+
+
+def check_mesh(mesh: MeshData) -> MeshData:
+    """The mesh, fit to be solved on, with a note for everything that was mended or that the user should know.
+
+    Mended: nodes that no cell uses are removed (groups and regions follow); inverted cells are turned.
+    Noted: nodes at the same place that are not joined, separate bodies, parts that hang together by an edge or node
+    only, group facets inside the body, cells in several regions.
+
+    Raises:
+        MeshError: no cells, wrong array shapes, cells or groups that name nodes that do not exist, coordinates that
+            are no numbers, flat cells, a cell given twice, a facet of more than two cells, cells that lie over
+            one another, a group facet that is no facet of a cell.
+    """
+    _check_arrays(mesh)
+    _check_coordinates(mesh)
+    mesh = _without_orphans(mesh)
+    mesh = _groups_once(_turned(mesh))
+    _check_flat(mesh)
+    _check_cells_once(mesh)
+    table = _FacetTable(mesh.cells)
+    _check_facets(mesh, table)
+    notes = [*_check_groups(mesh, table), *_coincident(mesh), *_bodies(mesh, table), *_regions(mesh)]
+    return replace(mesh, notes=mesh.notes + tuple(notes))
+
+
+class _FacetTable:
+    """The facets of all cells, sorted once for every check that needs them.
+
+    Attributes:
+        facets: (m (d + 1), d), cell by cell, normals outwards.
+        counts: number of cells at each distinct facet.
+        place: the distinct facet of each of `facets`.
+    """
+
+    def __init__(self, cells: Indices) -> None:
+        self.facets = facets_of(cells).reshape(-1, cells.shape[1] - 1)
+        self._distinct, self.counts, self.place = distinct_rows(np.sort(self.facets, axis=1))
+
+    def cells_at(self, groups: list[Indices]) -> list[Indices]:
+        """Number of cells at each facet of each group; 0 where it is no facet of the mesh."""
+        sizes = np.cumsum([len(self._distinct), *map(len, groups)])
+        _, _, place = distinct_rows(np.sort(np.concatenate([self._distinct, *groups]), axis=1))
+        counts = np.zeros(place.max() + 1, np.int64)
+        counts[place[: sizes[0]]] = self.counts
+        return np.split(counts[place[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
+
+    def pairs(self, nodes: int) -> Indices:
+        """Cells that share a facet: (k, 2)."""
+        order = np.argsort(self.place, kind="stable")
+        shared = np.flatnonzero(np.diff(self.place[order]) == 0)
+        return np.stack([order[shared], order[shared + 1]], axis=1) // nodes
+
+
+# --- refused --------------------------------------------------------------------------------------------------------
+
+
+def _check_arrays(mesh: MeshData) -> None:
+    """Shapes and node numbers."""
+    if mesh.points.ndim != 2 or mesh.points.shape[1] not in (2, 3):
+        raise MeshError(f"The mesh's points have the shape {mesh.points.shape}; (n, 2) or (n, 3) is needed.")
+    dim = mesh.dim
+    if mesh.cells.ndim != 2 or mesh.cells.shape[1] != dim + 1 or len(mesh.cells) == 0:
+        raise MeshError(f"The mesh's cells have the shape {mesh.cells.shape}; (m, {dim + 1}) with m > 0 is needed.")
+    _check_numbers(mesh.cells, len(mesh.points), "cell")
+    for name, facets in mesh.facet_groups.items():
+        if facets.ndim != 2 or facets.shape[1] != dim:
+            raise MeshError(f"The facets of group '{name}' have the shape {facets.shape}; (k, {dim}) is needed.")
+        _check_numbers(facets, len(mesh.points), f"group '{name}': facet")
+    for name, cells in mesh.regions.items():
+        if len(cells) and not (cells.min() >= 0 and cells.max() < len(mesh.cells)):
+            raise MeshError(f"Region '{name}' names cells that do not exist; there are {len(mesh.cells)} cells.")
+
+
+def _check_numbers(rows: Indices, nodes: int, what: str) -> None:
+    wrong = np.flatnonzero(((rows < 0) | (rows >= nodes)).any(axis=1))
+    if len(wrong):
+        raise MeshError(
+            f"{len(wrong)} of {len(rows)} rows name nodes that do not exist (there are {nodes}), the first {what} "
+            f"{wrong[0]} with nodes {rows[wrong[0]].tolist()}; the file is damaged or cut short."
+        )
+
+
+def _check_coordinates(mesh: MeshData) -> None:
+    used = np.zeros(len(mesh.points), bool)
+    used[mesh.cells] = True
+    wrong = np.flatnonzero(used & ~np.isfinite(mesh.points).all(axis=1))
+    if len(wrong):
+        raise MeshError(
+            f"{len(wrong)} nodes have coordinates that are not finite numbers: node {_some(wrong)}, the first at "
+            f"{mesh.points[wrong[0]].tolist()}; export the mesh again."
+        )
+
+
+def _check_flat(mesh: MeshData) -> None:
+    flat = np.flatnonzero(np.abs(signed_measures(mesh.points, mesh.cells)) <= _flatness(mesh.points, mesh.cells))
+    if len(flat):
+        measure = "volume" if mesh.dim == 3 else "area"
+        raise MeshError(
+            f"{len(flat)} cells have no {measure}: cell {_some(flat)}, the first near "
+            f"{_place(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
+        )
+
+
+def _flatness(points: Points, cells: Indices) -> Floats:
+    """The measure [m^d] below which a cell cannot be told from a flat one: (m,).
+
+    Coordinates x are stored to eps |x|, which moves a node by that much and the measure by up to about
+    (d + 1) / (d - 1)! * eps |x| * L^(d - 1), L the longest edge; twice that is taken.
+    """
+    dim = points.shape[1]
+    corners = points[cells]
+    longest = _longest_edges(points, cells)
+    return 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
+
+
+def _precision(points: Points) -> float:
+    """Relative rounding of the coordinates: that of single precision where all of them fit into it."""
+    single = bool(np.array_equal(points, points.astype(np.float32)))
+    return float(np.finfo(np.float32 if single else np.float64).eps)
+
+
+def _check_cells_once(mesh: MeshData) -> None:
+    _, counts, inverse = distinct_rows(np.sort(mesh.cells, axis=1))
+    twice = np.flatnonzero(counts[inverse] > 1)
+    if len(twice):
+        raise MeshError(
+            f"{len(twice)} cells have the same nodes as another cell: cell {_some(twice)}, the first near "
+            f"{_place(mesh.points, mesh.cells[twice[0]])}; remove the copies."
+        )
+
+
+def _check_facets(mesh: MeshData, table: _FacetTable) -> None:
+    """Each facet belongs to one cell or to two on its opposite sides."""
+    _refuse_facets(mesh, table.facets[table.counts[table.place] > 2], "belong to more than two cells")
+    # Outward normals of the two cells are opposite; a facet met twice with one normal has both cells on one side.
+    _, same, place = distinct_rows(_canonical(table.facets))
+    _refuse_facets(mesh, table.facets[same[place] > 1], "have two cells on the same side, so that the cells overlap")
+
+
+def _canonical(facets: Indices) -> Indices:
+    """Each triangle turned in a circle so that its least node comes first; its normal is kept. Edges stay."""
+    if facets.shape[1] == 2:
+        return facets
+    columns = (facets.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(facets, columns, axis=1)
+
+
+def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
+    if len(facets):
+        distinct = distinct_rows(np.sort(facets, axis=1))[0]
+        raise MeshError(
+            f"{len(distinct)} facets {what}, the first with nodes {distinct[0].tolist()} near "
+            f"{_place(mesh.points, distinct[0])}; mend the mesh there."
+        )
+
+
+def _check_groups(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
+    """Each group facet is a facet of a cell; a note where it lies inside the body."""
+    cells_there = table.cells_at(list(mesh.facet_groups.values()))
+    for (name, facets), count in zip(mesh.facet_groups.items(), cells_there, strict=True):
+        _refuse_lost(mesh, name, facets, np.flatnonzero(count == 0))
+        inside = int((count > 1).sum())
+        if inside:
+            yield f"{inside} of the {len(facets)} facets of group '{name}' lie inside the body, between two cells."
+
+
+def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> None:
+    if len(lost):
+        raise MeshError(
+            f"{len(lost)} of the {len(facets)} facets of group '{name}' are not facets of any cell, the first with "
+            f"nodes {facets[lost[0]].tolist()} near {_place(mesh.points, facets[lost[0]])}; the group and the body "
+            "were meshed apart."
+        )
+
+
+# --- mended ---------------------------------------------------------------------------------------------------------
+
+
+def _without_orphans(mesh: MeshData) -> MeshData:
+    used = np.zeros(len(mesh.points), bool)
+    used[mesh.cells] = True
+    orphans = int((~used).sum())
+    if orphans == 0:
+        return mesh
+    number = np.cumsum(used) - 1
+    groups = {}
+    for name, facets in mesh.facet_groups.items():
+        _refuse_lost(mesh, name, facets, np.flatnonzero(~used[facets].all(axis=1)))
+        groups[name] = number[facets]
+    note = f"{orphans} of {len(used)} nodes belong to no cell and were removed."
+    return MeshData(mesh.points[used], number[mesh.cells], groups, mesh.regions, (*mesh.notes, note))
+
+
+def _turned(mesh: MeshData) -> MeshData:
+    cells, count = oriented(mesh.points, mesh.cells)
+    if count == 0:
+        return mesh
+    note = f"{count} of {len(cells)} cells were inverted and have been turned (two nodes swapped)."
+    return replace(mesh, cells=cells, notes=(*mesh.notes, note))
+
+
+def _groups_once(mesh: MeshData) -> MeshData:
+    """Group facets that are listed several times are kept once; nobody needs to be told."""
+    groups = {}
+    for name, facets in mesh.facet_groups.items():
+        _, _, place = distinct_rows(np.sort(facets, axis=1))
+        groups[name] = facets[np.sort(np.unique(place, return_index=True)[1])]
+    return replace(mesh, facet_groups=groups)
+
+
+# --- noted ----------------------------------------------------------------------------------------------------------
+
+
+def _coincident(mesh: MeshData) -> Iterator[str]:
+    order = np.lexsort(mesh.points.T)
+    same = (np.diff(mesh.points[order], axis=0) == 0).all(axis=1)
+    if same.any():
+        where = mesh.points[order[np.flatnonzero(same)[0]]].tolist()
+        yield (
+            f"{int(same.sum())} nodes lie exactly on another node (the first at {where}) and are not joined: the body "
+            "is open there, as along a crack."
+        )
+
+
+def _bodies(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
+    by_nodes = _components(edges_of(mesh.cells), len(mesh.points))
+    by_facets = _components(table.pairs(mesh.dim + 1), len(mesh.cells))
+    if by_nodes > 1:
+        yield f"The mesh has {by_nodes} bodies that share no node; each needs its own supports."
+    if by_facets > by_nodes:
+        how = "an edge or a node" if mesh.dim == 3 else "a node"
+        yield (
+            f"{by_facets - by_nodes} parts of the mesh touch the rest in {how} only, not through a facet, and turn there "
+            "as on a hinge."
+        )
+
+
+def _components(pairs: Indices, count: int) -> int:
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return int(connected_components(graph, directed=False, return_labels=False))
+
+
+def _regions(mesh: MeshData) -> Iterator[str]:
+    times = np.zeros(len(mesh.cells), np.int64)
+    for cells in mesh.regions.values():
+        times[np.unique(cells)] += 1
+    if (times > 1).any():
+        yield f"{int((times > 1).sum())} cells are in more than one region."
+
+
+# --- words ----------------------------------------------------------------------------------------------------------
+
+
+def _some(numbers: Iterable[int]) -> str:
+    """The first few numbers, and dots where there are more."""
+    listed = list(numbers)
+    return ", ".join(str(int(n)) for n in listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "")
+
+
+def _place(points: Points, nodes: Indices) -> str:
+    """The middle of the nodes, as text."""
+    return "(" + ", ".join(f"{x:.4g}" for x in points[nodes].mean(axis=0)) + ") m"
+
+
+def _longest_edges(points: Points, cells: Indices) -> Floats:
+    first, second = np.triu_indices(cells.shape[1], k=1)
+    return np.linalg.norm(points[cells[:, first]] - points[cells[:, second]], axis=2).max(axis=1)

@@ -1,0 +1,199 @@
+"""A mesh from file: Gmsh's own format through gmsh, everything else through meshio."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .contents import Block, Contents
+from .data import Indices, MeshData, MeshError
+from .gmsh_session import session
+
+# Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
+TAG_ARRAYS = ("gmsh:physical", "medit:ref", "cell_tags", "nastran:ref", "netgen:index", "su2:tag", "tetgen:ref")
+NOT_TAGS = ("gmsh:geometrical",)
+MOST_TAGS = 1000  # an integer array with more values than this numbers cells; it does not group them
+
+
+def read_mesh(path: str | Path) -> MeshData:
+    """The tetrahedra of a mesh file, or the triangles of a plane one, with its named groups; not checked yet.
+
+    Lower-order facets become facet groups, cells regions, under the names the file gives (Gmsh's physical names, cell
+    sets, MED families, Abaqus node sets); integer tags without a name are called "tag-<n>".
+
+    Raises:
+        MeshError: the file is missing, of unknown kind or damaged, or holds no mesh of simplices.
+    """
+    path = Path(path)
+    return read_contents(path).simplices(f"Mesh file '{path}'")
+
+
+def read_contents(path: Path) -> Contents:
+    """Everything in a mesh file.
+
+    Raises:
+        MeshError: the file is missing, of unknown kind or damaged.
+    """
+    if not path.is_file():
+        raise MeshError(f"Mesh file '{path}' {'is a folder' if path.is_dir() else 'does not exist'}.")
+    if path.stat().st_size == 0:
+        raise MeshError(f"Mesh file '{path}' is empty.")
+    version = _gmsh_version(path)
+    if version >= 4:
+        return _read_with_gmsh(path)
+    return replace(_read_with_meshio(path), copies=version > 0)
+
+
+def _gmsh_version(path: Path) -> int:
+    """Major version of Gmsh's own format; 0 for any other file."""
+    if path.suffix.lower() != ".msh":
+        return 0
+    with path.open("rb") as file:
+        _, found, rest = file.read(65536).partition(b"$MeshFormat")
+    return int(rest.split(maxsplit=1)[0].split(b".")[0]) if found and rest.split(maxsplit=1)[0][:1].isdigit() else 0
+
+
+# --- Gmsh's .msh, version 4 -----------------------------------------------------------------------------------------
+# Not by meshio (5.3), which refuses files where only some cells are in a physical group, and keeps one unnamed group of
+# each. Version 2 not by gmsh, which puts all elements of one entity into all groups that one of them is in.
+
+GMSH_SHAPES = {"Point": "vertex", "Line": "line", "Triangle": "triangle", "Tetrahedron": "tetra"}
+GMSH_SHAPES |= {"Quadrilateral": "quad", "Hexahedron": "hexahedron", "Prism": "wedge", "Pyramid": "pyramid"}
+
+
+def _read_with_gmsh(path: Path) -> Contents:
+    try:
+        with session() as gmsh:
+            gmsh.merge(str(path))
+            return _contents_of_model(gmsh)
+    except MeshError as error:
+        raise MeshError(f"Mesh file '{path}' could not be read: {error}") from error
+
+
+def _contents_of_model(gmsh: Any) -> Contents:
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    place = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
+    place[tags] = np.arange(len(tags))
+    blocks: list[Block] = []
+    owners: list[tuple[int, int]] = []
+    for entity in gmsh.model.getEntities():
+        for kind, _, nodes in zip(*gmsh.model.mesh.getElements(*entity), strict=True):
+            name, _, order, count, _, _ = gmsh.model.mesh.getElementProperties(kind)
+            shape = GMSH_SHAPES.get(name.split()[0], name)
+            blocks.append(Block(shape if order == 1 else f"{shape}{count}", place[nodes].reshape(-1, count)))
+            owners.append(entity)
+    return Contents(coordinates.reshape(-1, 3), blocks, _physical_groups(gmsh, blocks, owners))
+
+
+def _physical_groups(gmsh: Any, blocks: list[Block], owners: list[tuple[int, int]]) -> dict[str, list[Indices]]:
+    """Physical groups by name; entities of several dimensions may share one."""
+    sets: dict[str, list[Indices]] = {}
+    for dim, tag in gmsh.model.getPhysicalGroups():
+        name = gmsh.model.getPhysicalName(dim, tag) or f"tag-{tag}"
+        entities = set(gmsh.model.getEntitiesForPhysicalGroup(dim, tag).tolist())
+        members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
+        for i, (block, owner) in enumerate(zip(blocks, owners, strict=True)):
+            if owner[0] == dim and owner[1] in entities:
+                members[i] = np.arange(len(block.nodes))
+    return sets
+
+
+# --- everything else ------------------------------------------------------------------------------------------------
+
+
+def _read_with_meshio(path: Path) -> Contents:
+    mesh = _meshio_mesh(path)
+    points = np.asarray(mesh.points)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise MeshError(f"Mesh file '{path}' holds points of shape {points.shape}; (n, 2) or (n, 3) is needed.")
+    blocks = [_block(block) for block in mesh.cells]
+    sets, notes = _tag_sets(mesh, blocks)
+    named = _named_sets(mesh, blocks)
+    nodes = {str(name): np.asarray(members, np.int64) for name, members in (mesh.point_sets or {}).items()}
+    return Contents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
+
+
+def _meshio_mesh(path: Path) -> Any:
+    """meshio's mesh; its exits become errors and its printing is kept for their message."""
+    import meshio
+
+    known = sorted(meshio.extension_to_filetypes)
+    if not any(path.name.lower().endswith(extension) for extension in known):
+        raise MeshError(f"Mesh file '{path}' is of no known kind; known endings: {', '.join(known)}.")
+    said = io.StringIO()
+    try:
+        with _quiet(said):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit
+        reason = "" if isinstance(error, SystemExit) else str(error)
+        reason = " ".join((reason or said.getvalue()).split()) or type(error).__name__
+        raise MeshError(f"Mesh file '{path}' could not be read: {reason[:300]} (damaged, or of another kind?)") from error
+
+
+@contextlib.contextmanager
+def _quiet(said: io.StringIO) -> Iterator[None]:
+    """Keep what Python code prints."""
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        yield
+
+
+def _block(block: Any) -> Block:
+    if isinstance(block.data, np.ndarray) and block.data.dtype != object:
+        return Block(block.type, np.asarray(block.data, np.int64))
+    return Block(block.type, np.zeros((len(block.data), 0), np.int64))  # polygons and polyhedra: refused by kind later
+
+
+def _named_sets(mesh: Any, blocks: list[Block]) -> dict[str, list[Indices]]:
+    """Cell sets that have names in the file."""
+    sets = {}
+    for name, members in (mesh.cell_sets or {}).items():
+        if len(members) == len(blocks) and not str(name).startswith("gmsh:"):
+            sets[str(name)] = [np.asarray([] if part is None else part, np.int64) for part in members]
+    return sets
+
+
+def _tag_sets(mesh: Any, blocks: list[Block]) -> tuple[dict[str, list[Indices]], tuple[str, ...]]:
+    """Sets from an array of integer tags on the cells, under their names where the file gives some."""
+    arrays = {key: values for key, values in mesh.cell_data.items() if _groups_cells(key, values)}
+    chosen = next((key for key in TAG_ARRAYS if key in arrays), next(iter(arrays), None))
+    if chosen is None:
+        return {}, ()
+    others = [key for key in arrays if key != chosen]
+    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(others)}.",) if others else ()
+    sets: dict[str, list[Indices]] = {}
+    for i, (block, tags) in enumerate(zip(blocks, arrays[chosen], strict=True)):
+        for tag in np.unique(tags):
+            if tag == 0 and (chosen in TAG_ARRAYS or block.dim < _top(blocks)):
+                continue
+            for name in _names_of(mesh, int(tag), block.dim):
+                sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])[i] = np.flatnonzero(tags == tag)
+    return sets, notes
+
+
+def _groups_cells(key: str, values: list[Any]) -> bool:
+    """Whether an array on the cells holds tags: integers, one a cell, of few values."""
+    parts = [np.asarray(part) for part in values]
+    if key in NOT_TAGS or any(part.ndim != 1 or part.dtype.kind not in "iu" for part in parts):
+        return False
+    return len(np.unique(np.concatenate(parts))) <= MOST_TAGS
+
+
+def _top(blocks: list[Block]) -> int:
+    return max((block.dim for block in blocks if len(block.nodes)), default=0)
+
+
+def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:
+    """Names of a tag: of MED families, of a field of the same dimension, or made from the number."""
+    families = getattr(mesh, "cell_tags", {}).get(tag)
+    if families:
+        return [str(name) for name in families]
+    for name, value in (mesh.field_data or {}).items():
+        if np.shape(value) == (2,) and (int(value[0]), int(value[1])) == (tag, dim):
+            return [str(name)]
+    return [f"tag-{tag}"]

@@ -1,0 +1,39 @@
+"""Saving a mesh with its groups, in any format of meshio."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .data import MeshData, MeshError
+
+
+def write_mesh(mesh: MeshData, path: Path) -> None:
+    """Save cells, boundary facets and groups. Groups become cell data `group` (0: none), named in `field_data`.
+
+    A facet that is in several groups is saved with the last of them. MeshError where the format is not known.
+    """
+    import meshio
+
+    cell, facet = ("triangle", "line") if mesh.dim == 2 else ("tetra", "triangle")
+    names = [*mesh.facet_groups, *mesh.regions]
+    facets = [np.asarray(nodes) for nodes in mesh.facet_groups.values()]
+    region = np.zeros(len(mesh.cells), int)
+    for name, cells in mesh.regions.items():
+        region[cells] = names.index(name) + 1
+    tags = [np.full(len(nodes), number) for number, nodes in enumerate(facets, start=1)]
+    blocks = [(cell, mesh.cells), *((facet, nodes) for nodes in facets)]
+    points = np.pad(mesh.points, ((0, 0), (0, 3 - mesh.dim)))
+    values = [region, *tags]
+    data = {"gmsh:physical": values, "gmsh:geometrical": values} if path.suffix == ".msh" else {"group": values}
+    field_data = {
+        name: np.array([number, mesh.dim if name in mesh.regions else mesh.dim - 1])
+        for number, name in enumerate(names, start=1)
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        options = {"file_format": "gmsh22"} if path.suffix == ".msh" else {}
+        meshio.Mesh(points, blocks, cell_data=data, field_data=field_data).write(path, **options)
+    except (SystemExit, Exception) as error:
+        raise MeshError(f"cannot save the mesh as {path}: {error}") from None
