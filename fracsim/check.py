@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .bodies import bodies_of, not_held
 from .errors import InputError
-from .laws import in_time, motion_law, of_size
+from .laws import AXES, format_point, in_time, motion_law, of_size
 from .mesh_source import build_mesh, find_builder
+from .meshes.data import MeshData
 from .study import MOTIONS, Box, Plane, Study
-from .support import bodies_of
 
 
 @dataclass(frozen=True)
@@ -28,18 +29,29 @@ class Anatomy:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     size: str  # how many cells, in words
+    notes: tuple[str, ...] = ()  # what was mended while reading
 
 
 def check_study(study: Study) -> list[str]:
     """Lines that tell what the scene will build. InputError where the study cannot run."""
-    anatomy = mesh_anatomy(study)
-    _check_groups(study, anatomy)
-    _check_dimensions(study, anatomy.dim)
+    anatomy = _words_of(study) or anatomy_of(build_mesh(study.mesh))
+    _check(study, anatomy)
     return list(_description(study, anatomy))
 
 
-def mesh_anatomy(study: Study) -> Anatomy:
-    """From the builder's own words; a mesh from file is read, a surface is left to the run."""
+def checked_mesh(study: Study) -> MeshData:
+    """The mesh of a study that fits it. InputError; from a builder's own words before anything is built."""
+    words = _words_of(study)
+    if words is not None:
+        _check(study, words)
+    mesh = build_mesh(study.mesh)
+    if study.mesh.builder is None:
+        _check(study, anatomy_of(mesh))
+    return mesh
+
+
+def _words_of(study: Study) -> Anatomy | None:
+    """What a builder says of itself; a surface is left to the run. None where the mesh has to be read."""
     builder = find_builder(study.mesh)
     if builder is not None:
         lower, upper = builder.bounds()
@@ -48,11 +60,32 @@ def mesh_anatomy(study: Study) -> Anatomy:
     if study.mesh.surface is not None:
         infinite = (np.inf,) * 3
         return Anatomy(3, ("surface",), (), tuple(-x for x in infinite), infinite, "cells counted when it is filled")
-    mesh = build_mesh(study.mesh)
+    return None
+
+
+def anatomy_of(mesh: MeshData) -> Anatomy:
+    """What a mesh turned out to be."""
     count = bodies_of(mesh)[0]
     size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
-    lower, upper = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), tuple(lower), tuple(upper), size)
+    corners = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
+    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), *corners, size, mesh.notes)
+
+
+def _check(study: Study, anatomy: Anatomy) -> None:
+    _check_groups(study, anatomy)
+    _check_dimensions(study, anatomy)
+    if study.time.scheme == "quasi-static":
+        _check_held(study, anatomy.dim)
+
+
+def _check_held(study: Study, dim: int) -> None:
+    """A motion along an axis that no entry holds; the rest (turning, several bodies) needs the mesh, and the run finds it."""
+    held = np.zeros(dim, bool)
+    for i, entry in enumerate(study.boundary):
+        if entry.kind in MOTIONS:
+            held |= motion_law(entry, dim, f"boundary.{i}")[1]
+    if not held.all():
+        raise InputError(not_held("the body", f"moving along {AXES[int(np.argmin(held))]}"))
 
 
 def _check_groups(study: Study, anatomy: Anatomy) -> None:
@@ -84,10 +117,11 @@ def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
         slack = (where.within or 0.0) * np.linalg.norm(normal) + 1e-9 * np.abs(ends[np.isfinite(ends)]).sum()
         misses = ends[0].sum() > slack or ends[1].sum() < -slack
     if misses:
-        raise InputError(f"{key} selects no node: the body lies in {anatomy.lower} to {anatomy.upper}")
+        raise InputError(f"{key} selects no node; the body lies in {_extent(anatomy)}")
 
 
-def _check_dimensions(study: Study, dim: int) -> None:
+def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
+    dim = anatomy.dim
     for i, entry in enumerate(study.boundary):
         key = f"boundary.{i}"
         if entry.kind in MOTIONS:
@@ -104,14 +138,27 @@ def _check_dimensions(study: Study, dim: int) -> None:
         of_size(study.initial.spin, 1 if dim == 2 else 3, "initial.spin")
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
-            of_size(probe.point, dim, f"probe.{i}.point")
+            _check_inside(probe.point, anatomy, f"probe.{i}.point")
     if dim == 3 and study.material.plane == "stress":
         raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
+
+
+def _check_inside(point: list[float], anatomy: Anatomy, key: str) -> None:
+    at, lower, upper = of_size(point, anatomy.dim, key), np.array(anatomy.lower), np.array(anatomy.upper)
+    slack = 1e-9 * float(np.linalg.norm(upper - lower))
+    if np.any(at < lower - slack) or np.any(at > upper + slack):
+        raise InputError(f"{key} = {point} lies outside the body, which spans {_extent(anatomy)}")
+
+
+def _extent(anatomy: Anatomy) -> str:
+    return f"{format_point(anatomy.lower)} to {format_point(anatomy.upper)}"
 
 
 def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     source = study.mesh.builder or study.mesh.file or study.mesh.surface
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
+    for note in anatomy.notes:
+        yield f"            note: {note}"
     plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     yield f"material    {study.material.energy}{plane}{regions}"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from .errors import Exit, FracsimError
+from .errors import Exit, FracsimError, InputError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -32,10 +32,10 @@ def run(
 
     comm = MPI.COMM_WORLD
     path = find_study(study)
-    loaded = _load(comm, path, set_)
+    folder = out or Path("out") / path.stem
+    loaded = _load(comm, path, set_, folder)
     from .run import run_study
 
-    folder = out or Path("out") / path.stem
     summary = run_study(comm, loaded, folder, restart=restart, wall_limit=wall_limit)
     if comm.rank == 0:
         print(
@@ -69,9 +69,8 @@ def mesh(
     """Build and save the mesh of a study, print its quality."""
     if not _is_root():
         return
-    from .mesh_source import build_mesh
+    from .mesh_source import build_mesh, save_mesh
     from .meshes.quality import mesh_quality
-    from .meshes.write import write_mesh
     from .study_file import load_study
 
     data = build_mesh(load_study(find_study(study), set_).mesh)
@@ -79,7 +78,7 @@ def mesh(
         print(f"note: {note}")
     for name, value in mesh_quality(data).items():
         print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {value}")
-    write_mesh(data, out)
+    save_mesh(data, out)
     print(f"saved in {out}")
 
 
@@ -120,12 +119,26 @@ def find_study(name: str) -> Path:
     return packaged if packaged.exists() and path.parent == Path() else path
 
 
-def _load(comm: Any, path: Path, overrides: list[str]) -> Any:
+def _load(comm: Any, path: Path, overrides: list[str], folder: Path) -> Any:
     """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
     from .parallel import from_root
     from .study_file import load_study
 
-    return from_root(comm, lambda: load_study(path, overrides))
+    def work() -> Any:
+        loaded = load_study(path, overrides)
+        check_folder(folder)
+        return loaded
+
+    return from_root(comm, work)
+
+
+def check_folder(folder: Path) -> None:
+    """InputError where results cannot be written there; nothing is made yet."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
+    if not there.is_dir():
+        raise InputError(f"--out {folder}: {there} is not a folder; give another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(f"--out {folder}: no permission to write in {there}; give another one")
 
 
 def _is_root() -> bool:
@@ -135,9 +148,11 @@ def _is_root() -> bool:
 
 def main() -> NoReturn:
     """Entry point: one message and an exit code for what a user can mend, on any number of ranks."""
-    if not _is_root() and "--help" in sys.argv:
-        sys.exit(0)
-    sys.exit(_guarded(lambda: app(standalone_mode=False)))
+    bare = len(sys.argv) == 1  # shows the help, and yet is bad usage
+    if not _is_root() and (bare or "--help" in sys.argv):
+        sys.exit(Exit.BAD_INPUT if bare else Exit.DONE)
+    code = _guarded(lambda: app(standalone_mode=False))
+    sys.exit(Exit.BAD_INPUT if bare else code)
 
 
 def _guarded(work: Callable[[], Any]) -> int:
@@ -150,10 +165,13 @@ def _guarded(work: Callable[[], Any]) -> int:
         _say(str(error))
         return int(error.exit_code)
     except click.ClickException as error:
-        _say(f"{error.format_message()}; see fracsim --help")
+        _say(f"{error.format_message().rstrip('.')}; see fracsim --help")
         return int(Exit.BAD_INPUT)
     except click.exceptions.Exit as error:
         return error.exit_code
+    except click.exceptions.Abort:
+        _say("interrupted before the first step; nothing was written")
+        return 130  # as a shell reports SIGINT
     except Exception:
         _abort()
         raise

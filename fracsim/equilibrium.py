@@ -48,6 +48,7 @@ class Equilibrium:
     def __init__(self, domain: Domain, study: Study, material: MaterialFields, scheme: Scheme) -> None:
         self.domain, self.material, self.scheme = domain, material, scheme
         self.u = fem.Function(domain.space, name="displacement")
+        self.c_a, self.c_v = scheme.rates(study.time.step)
         self.chi = self._degradation(study)
         self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
         self.damping = study.damping

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +15,10 @@ from .fields_file import Field
 from .forms.energies import full_cauchy_stress, von_mises
 from .forms.kinematics import deformation_gradient
 from .kernels import CellExpression
-from .pieces import Pieces
 from .state import State
+
+if TYPE_CHECKING:
+    from .pieces import Pieces
 
 Values = npt.NDArray[Any]
 # XDMF's order of a symmetric tensor

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,22 @@ def in_time(value: Any, key: str, size: int) -> Law:
     """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
     table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
     times = np.asarray(table.time)
-    rows = np.array([[np.nan if v == "free" else float(v) for v in np.atleast_1d(row)] for row in table.value])
-    if rows.shape[1] != size:
-        raise InputError(f"{key} has {rows.shape[1]} components; the mesh has {size} dimensions")
+    rows = np.array([of_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
+    if np.any(np.isnan(rows) != np.isnan(rows[0])):
+        raise InputError(f'{key}: a component that is "free" at one time must be free at all of them')
     return lambda t: np.array([np.interp(t, times, column) for column in rows.T])
 
 
-def of_size(values: list[float], size: int, key: str) -> Values:
-    """A constant vector; InputError where it does not fit the dimension of the mesh."""
+def of_size(values: list[Any], size: int, key: str) -> Values:
+    """A constant vector; InputError where it does not fit the dimension of the mesh. "free" becomes nan."""
     if len(values) != size:
-        raise InputError(f"{key} = {values} has {len(values)} components; this mesh needs {size}")
-    return np.asarray(values, float)
+        raise InputError(f"{key} = {values}: this mesh needs {size} number{'s'[: size != 1]}")
+    return np.array([np.nan if value == "free" else float(value) for value in values])
+
+
+def format_point(point: Iterable[float]) -> str:
+    """A point for a message: "(0, 0.5, 1)"."""
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def integral_in_time(value: Any, key: str, size: int) -> Law:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from .errors import InputError
+from .explain import explain, unknown_key
 from .meshes import BUILDERS
 from .meshes.data import MeshData, MeshError
 from .study import Mesh
-from .study_file import explain
 
 
 def find_builder(mesh: Mesh) -> Any:
@@ -32,15 +33,12 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
     known = [field.name for field in dataclasses.fields(kind)]
     for key in parameters:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"this builder knows: {', '.join(known)}"
-            raise InputError(f"mesh.{key} is not a known key; {hint}")
+            raise InputError(unknown_key(f"mesh.{key}", known))
     try:
-        return TypeAdapter(kind).validate_python(parameters)
+        # through JSON: strict about numbers, and yet a list becomes a tuple
+        return TypeAdapter(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
-        raise InputError(f"mesh: {explain(error.errors()[0])}") from None
-    except MeshError as error:
-        raise InputError(f"mesh: {error}") from None
+        raise InputError(explain(error.errors(), "mesh")) from None
 
 
 def _check_source(mesh: Mesh) -> None:
@@ -79,3 +77,12 @@ def build_mesh(mesh: Mesh) -> MeshData:
     except MeshError as error:
         raise InputError(f"mesh: {error}") from None
 
+
+def save_mesh(data: MeshData, path: Path) -> None:
+    """Save with groups, in the format that the ending of the path names. InputError where that cannot be done."""
+    from .meshes.write import write_mesh
+
+    try:
+        write_mesh(data, path)
+    except MeshError as error:
+        raise InputError(f"--out: {error}") from None

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import platform
 import resource
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dolfinx
 import numpy as np
@@ -16,26 +17,29 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from . import __version__
+from .bodies import bodies_of
+from .check import checked_mesh
 from .checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
 from .domain import Domain, distribute
 from .equilibrium import Equilibrium
-from .errors import NotConverged, Stopped
+from .errors import InputError, NotConverged, Stopped
 from .fields_file import FieldsFile
 from .forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
 from .frames import Frames
 from .history import History, Probes
 from .interrupt import Interrupt
 from .material import material_fields
-from .mesh_source import build_mesh
 from .parallel import on_root, total
-from .pieces import Pieces, find_pieces
 from .progress import Progress
 from .solve import Solver
 from .state import State
 from .stepping import Report, Stepper
 from .study import Output, Study, Time
 from .study_file import study_text
-from .support import bodies_of, check_supports
+from .support import check_supports
+
+if TYPE_CHECKING:
+    from .pieces import Pieces
 
 
 @dataclass
@@ -53,7 +57,7 @@ class Scene:
 
 def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     """Mesh, equations, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
-    domain = distribute(comm, on_root(comm, lambda: build_mesh(study.mesh)))
+    domain = distribute(comm, on_root(comm, lambda: checked_mesh(study)))
     scheme = make_scheme(study.time)
     equations = Equilibrium(domain, study, material_fields(domain, study.material), scheme)
     if not scheme.inertia:
@@ -106,6 +110,7 @@ class Run:
         source = self.scene.domain.source
         self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
         self._clock = OutputClock(study.output, study.time)
+        self._clock.wrote(self.state)
         self._bodies = int(self.comm.bcast(bodies_of(source)[0] if source is not None else None))
 
     def _resolved(self) -> str:
@@ -175,6 +180,8 @@ class Run:
         graph = self._graph
         if graph is None:
             return 0, 0, None
+        from .pieces import find_pieces
+
         broken, split = total(self.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
         return int(broken), int(split), find_pieces(graph)
 
@@ -226,12 +233,14 @@ OWN_FILES = ("study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.j
 
 def make_folder(folder: Path, study: str, restart: bool) -> None:
     """Make the output folder and write study.toml; an earlier run's files go, unless it is continued (rank 0)."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if not restart:
-        for name in OWN_FILES:
-            (folder / name).unlink(missing_ok=True)
-        checkpoint_path(folder).unlink(missing_ok=True)
-    (folder / "study.toml").write_text(study)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not restart:
+            for path in (*(folder / name for name in OWN_FILES), checkpoint_path(folder)):
+                path.unlink(missing_ok=True)
+        (folder / "study.toml").write_text(study)
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot write there: {error.strerror}") from None
 
 
 def versions(comm: MPI.Comm) -> dict[str, str]:
@@ -250,6 +259,9 @@ def run_study(
 ) -> dict[str, Any]:
     """Build, run, draw the last frame; returns the summary (collective)."""
     scene = build_scene(comm, study)
+    if scene.domain.source is not None:
+        for note in scene.domain.source.notes:
+            print(f"fracsim: note: {note}", file=sys.stderr)
     summary = Run(scene, folder, restart=restart, wall_limit=wall_limit)()
     if study.output.picture:
         on_root(comm, lambda: _draw(folder))

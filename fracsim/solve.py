@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +12,7 @@ from petsc4py import PETSc
 from .domain import Domain
 from .equilibrium import Equilibrium
 from .errors import InputError
-
-Options = dict[str, bool | int | float | str]
+from .petsc_options import Options, OptionSet, refusing
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -22,11 +20,14 @@ DEFAULTS: Options = {
     "snes_max_it": 25,
     "snes_rtol": 1e-6,
     "snes_stol": 0.0,
+    "snes_lag_preconditioner": -2,  # made at the first tangent, then kept
+    "snes_lag_preconditioner_persists": True,
     "ksp_type": "cg",
     "ksp_rtol": 1e-5,
     "ksp_max_it": 500,
+}
+MULTIGRID: Options = {
     "pc_type": "gamg",
-    "pc_gamg_reuse_interpolation": True,
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
@@ -35,7 +36,6 @@ DEFAULTS: Options = {
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
-_prefixes = itertools.count()
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -51,27 +51,50 @@ class Outcome:
 
 
 class Solver:
-    """SNES on an `Equilibrium`, set up once and kept for the whole run."""
+    """SNES on an `Equilibrium`, set up once and kept for the whole run.
 
-    def __init__(self, equations: Equilibrium, options: Options) -> None:
+    The preconditioner is kept from tangent to tangent and made anew only where it has aged: where CG takes half as many
+    iterations again as when it was fresh. Making multigrid's coarse spaces costs as much as the rest of a Newton iteration.
+    """
+
+    def __init__(self, equations: Equilibrium, given: Options) -> None:
         self.equations = equations
-        snes = PETSc.SNES().create(equations.domain.comm)
+        chosen = _chosen(equations, given)
+        self._options = OptionSet(chosen)
+        snes = self.snes = PETSc.SNES().create(equations.domain.comm)
+        snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(equations.assemble_residual, equations.residual)
-        snes.setJacobian(equations.assemble_tangent, equations.tangent, equations.tangent)
-        chosen = DEFAULTS | _symmetry_defaults(equations) | options
-        if _uses_rigid_modes(chosen):
+        snes.setJacobian(self._assemble_tangent, equations.tangent, equations.tangent)
+        if chosen["pc_type"] in ("gamg", "ml", "hypre"):
             equations.tangent.setNearNullSpace(rigid_body_modes(equations.domain))
-        set_options(snes, chosen)
-        snes.setConvergenceTest(self._converged)
-        self.snes = snes
         self._x, self._correction = equations.residual.duplicate(), equations.residual.duplicate()
+        self._configure(given)
+        snes.setConvergenceTest(self._converged)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._krylov_type = snes.ksp.getType()
+        self._stale, self._fresh_its, self._first = True, 0, 0.0
+
+    def _configure(self, given: Options) -> None:
+        try:
+            refusing(self.snes.setFromOptions)
+            refusing(self.snes.ksp.setFromOptions)
+            self._options.check(given, self._set_up_at_rest)
+        except InputError:
+            self._options.remove()
+            raise
+
+    def _set_up_at_rest(self) -> None:
+        self.equations.assemble_tangent(self.snes, self._x, self.equations.tangent, self.equations.tangent)
+        self.snes.ksp.setOperators(self.equations.tangent)
+        self.snes.ksp.setUp()
 
     def solve(self, guess: npt.NDArray[np.float64]) -> Outcome:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution."""
         outcome = self._attempt(guess)
+        if not outcome.converged and self.snes.ksp.reason < 0 and self._fresh_its:
+            self._stale = True  # the body has changed more than the old coarse spaces can bear
+            outcome = self._attempt(guess)
         if not outcome.converged and self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
             # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
@@ -96,11 +119,21 @@ class Solver:
         equations, ksp = self.equations, self.snes.ksp
         b = equations.residual
         equations.assemble_extension(self._x, b)
-        equations.assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
+        self._assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
         ksp.setOperators(equations.tangent)
         ksp.solve(b, self._correction)
         self._x.axpy(-1.0, self._correction)
         return int(ksp.its)
+
+    def _assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
+        self.equations.assemble_tangent(snes, x, A, P)
+        ksp = self.snes.ksp
+        if not self._stale:
+            self._fresh_its = self._fresh_its or ksp.its
+            self._stale = ksp.its > 1.5 * self._fresh_its + 3
+        if self._stale:
+            ksp.pc.reset()  # SNES keeps what there is (see lag above); what is not there is made
+            self._stale, self._fresh_its = False, 0
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
@@ -128,48 +161,19 @@ class Solver:
         """Forces at the solution, for the reactions."""
         self.equations.assemble_residual(self.snes, self._x, self.equations.residual)
 
-    def rebuild_preconditioner(self) -> None:
-        """Forget the coarse spaces: the body has come apart since they were made."""
-        self.snes.ksp.pc.reset()
-
     def destroy(self) -> None:
-        """Give PETSc's memory back (collective)."""
-        self.snes.destroy()
-        self._x.destroy()
+        """Give PETSc's memory and options back (collective)."""
+        self._options.remove()
+        for held in (self.snes, self._x, self._correction):
+            held.destroy()
 
 
-def _symmetry_defaults(equations: Equilibrium) -> Options:
-    # the tangent of a following pressure is not symmetric
-    return {"ksp_type": "gmres"} if equations.forces.pressures and not equations.material.energy.linear else {}
-
-
-def _uses_rigid_modes(options: Options) -> bool:
-    return options["pc_type"] in ("gamg", "ml", "hypre")
-
-
-def set_options(snes: PETSc.SNES, options: Options) -> None:
-    """Give options to one SNES under a prefix of its own, and take them out of the database again.
-
-    InputError names an option that PETSc does not know or whose value it refuses.
-    """
-    prefix = f"fracsim{next(_prefixes)}_"
-    snes.setOptionsPrefix(prefix)
-    database = PETSc.Options()
-    for key, value in options.items():
-        database[prefix + key] = _text(value)
-    try:
-        snes.setFromOptions()
-        snes.ksp.setFromOptions()
-    except PETSc.Error as error:
-        raise InputError(f"[solver] PETSc refuses these options: {_petsc_message(error)}") from None
-
-
-def _text(value: bool | int | float | str) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _petsc_message(error: PETSc.Error) -> str:
-    return f"error {error.ierr}"
+def _chosen(equations: Equilibrium, given: Options) -> Options:
+    """The study's options over the defaults."""
+    chosen = DEFAULTS | ({} if given.get("pc_type", "gamg") != "gamg" else MULTIGRID)
+    if equations.forces.pressures and not equations.material.energy.linear:
+        chosen |= {"ksp_type": "gmres"}  # the tangent of a following pressure is not symmetric
+    return chosen | given
 
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
@@ -181,7 +185,7 @@ def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
         rotation = np.zeros_like(X)
         rotation[:, i], rotation[:, j] = -X[:, j], X[:, i]
         modes.append(rotation)
-    vectors = []
+    vectors: list[PETSc.Vec] = []
     for mode in modes:
         vector = PETSc.Vec().createMPI((X.size, None), bsize=d, comm=domain.comm)
         vector.array_w[:] = mode.reshape(-1)
@@ -190,5 +194,3 @@ def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
         vector.normalize()
         vectors.append(vector)
     return PETSc.NullSpace().create(vectors=vectors, comm=domain.comm)
-
-

@@ -157,7 +157,6 @@ class Stepper:
         state.forces[held] -= equations.unbalanced[held]
         self.solver.evaluate_residual()
         state.forces[held] += equations.unbalanced[held]
-        self.solver.rebuild_preconditioner()
 
     def _energies(self, state: State) -> tuple[float, float]:
         began = time.perf_counter()

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+# Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[Finite, Field(gt=0)]
+NonNegative = Annotated[Finite, Field(ge=0)]
+Strength = Annotated[float, Field(gt=0, strict=True)]  # Pa; inf never breaks
+Poisson = Annotated[Finite, Field(gt=-1, lt=0.5)]
+Flag = Annotated[bool, Field(strict=True)]
 Vector = Annotated[list[Finite], Field(min_length=2, max_length=3)]
-Component = Finite | Literal["free"]
+
+
+def _kind(value: Any) -> str:
+    """Tag of a component of a motion."""
+    return "<word>" if isinstance(value, str) else "<number>"
+
+
+Component = Annotated[
+    Annotated[Finite, Tag("<number>")] | Annotated[Literal["free"], Tag("<word>")], Discriminator(_kind)
+]
 Motion = Annotated[list[Component], Field(min_length=2, max_length=3)]
 
 
 class Table(BaseModel):
     """A table of the study file: unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
 
 
 class TimeTable[Value](Table):
@@ -39,11 +51,11 @@ class TimeTable[Value](Table):
 
 def _shape(value: Any) -> str:
     """Tag of a value that may be constant or tabulated."""
-    return "table" if isinstance(value, dict | TimeTable) else "constant"
+    return "<table>" if isinstance(value, dict | TimeTable) else "<constant>"
 
 
 type InTime[Value] = Annotated[
-    Annotated[Value, Tag("constant")] | Annotated[TimeTable[Value], Tag("table")], Discriminator(_shape)
+    Annotated[Value, Tag("<constant>")] | Annotated[TimeTable[Value], Tag("<table>")], Discriminator(_shape)
 ]
 
 
@@ -74,7 +86,7 @@ class Elastic(Table):
     """What may differ between the named regions of a mesh."""
 
     young: Positive  # Pa
-    poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+    poisson: Poisson
     density: Positive  # kg/m^3
 
 
@@ -82,9 +94,9 @@ class Region(Table):
     """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
 
     young: Positive | None = None
-    poisson: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
+    poisson: Poisson | None = None
     density: Positive | None = None
-    strength: Positive | None = None  # Pa
+    strength: Strength | None = None
 
 
 class Material(Elastic):
@@ -120,17 +132,24 @@ class Damping(Table):
 class Fracture(Table):
     """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
 
-    strength: Annotated[float, Field(gt=0)]  # Pa; inf never breaks
+    strength: Strength
     approach: Literal["chi"] = "chi"
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
-    tie_break: Annotated[float, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+    tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
 
 
 class Box(Table):
     """Nodes inside a box (m)."""
 
     box: Annotated[list[Vector], Field(min_length=2, max_length=2)]
+
+    @model_validator(mode="after")
+    def _corners(self) -> Box:
+        lower, upper = self.box
+        if any(a > b for a, b in zip(lower, upper, strict=False)):
+            raise ValueError(f"box = {self.box}: give the lower corner first, then the upper one")
+        return self
 
 
 class Plane(Table):
@@ -143,13 +162,13 @@ class Plane(Table):
 
 def _selector(value: Any) -> str:
     """Tag of a place: a group's name, a box or a plane."""
-    if isinstance(value, str):
-        return "group"
-    return "box" if isinstance(value, Box) or (isinstance(value, dict) and "box" in value) else "plane"
+    if isinstance(value, Box) or (isinstance(value, dict) and "box" in value):
+        return "<box>"
+    return "<plane>" if isinstance(value, dict | Plane) else "<group>"
 
 
 Where = Annotated[
-    Annotated[str, Tag("group")] | Annotated[Box, Tag("box")] | Annotated[Plane, Tag("plane")], Discriminator(_selector)
+    Annotated[str, Tag("<group>")] | Annotated[Box, Tag("<box>")] | Annotated[Plane, Tag("<plane>")], Discriminator(_selector)
 ]
 
 
@@ -203,10 +222,10 @@ class Time(Table):
     scheme: Literal["backward-euler", "newmark", "quasi-static"] = "backward-euler"
     step: Positive  # s
     end: Positive  # s
-    adapt: bool = True  # halve a step that fails, grow back after easy ones
+    adapt: Flag = True  # halve a step that fails, grow back after easy ones
     smallest: Positive | None = None  # s; default step / 1024
-    beta: Annotated[float, Field(gt=0, le=0.5)] = 0.25  # Newmark
-    gamma: Annotated[float, Field(ge=0.5, le=1)] = 0.5  # Newmark
+    beta: Annotated[Finite, Field(gt=0, le=0.5)] = 0.25  # Newmark
+    gamma: Annotated[Finite, Field(ge=0.5, le=1)] = 0.5  # Newmark
 
     @model_validator(mode="after")
     def _order(self) -> Time:
@@ -248,10 +267,10 @@ FRACTURE_FIELDS = ("damage", "chi", "piece")
 class Output(Table):
     """[output]: what is written, and how often."""
 
-    every: Annotated[int, Field(ge=1)] | None = None  # steps
+    every: Annotated[int, Field(ge=1, strict=True)] | None = None  # steps
     interval: Positive | None = None  # s
     fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
-    picture: bool = True  # a PNG of the last frame
+    picture: Flag = True  # a PNG of the last frame
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
 
     @model_validator(mode="after")
@@ -259,6 +278,15 @@ class Output(Table):
         if self.every is not None and self.interval is not None:
             raise ValueError("give every (in steps) or interval (in s), not both")
         return self
+
+
+def _is_setting(value: Any) -> Any:
+    if not isinstance(value, bool | int | float | str):
+        raise ValueError(f"{value!r} is not a PETSc option, which is a number, a text, true or false")
+    return value
+
+
+Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
 
 
 class Study(Table):
@@ -273,7 +301,7 @@ class Study(Table):
     boundary: list[Boundary] = []
     load: Load | None = None
     initial: Initial | None = None
-    solver: dict[str, bool | int | float | str] = {}  # PETSc options, given as they are
+    solver: dict[str, Setting] = {}  # PETSc options, given as they are
     probe: list[Probe] = []
     output: Output = Output()
 
@@ -290,6 +318,13 @@ class Study(Table):
         wanted = [name for name in self.output.fields or [] if name in FRACTURE_FIELDS]
         if wanted and self.fracture is None:
             raise ValueError(f'output.fields has "{wanted[0]}", which needs a [fracture] table')
+        return self
+
+    @model_validator(mode="after")
+    def _strength_needs_fracture(self) -> Study:
+        special = [name for name, region in self.material.regions.items() if region.strength is not None]
+        if special and self.fracture is None:
+            raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
         return self
 
     @model_validator(mode="after")

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
-import json
 import tomllib
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from .errors import InputError
+from .explain import explain
+from .mesh_source import find_builder
 from .study import Study
-
-# parts of a pydantic location that name a branch of a union, not a key of the file
-_BRANCHES = {"constant", "table", "group", "box", "plane"}
 
 
 def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
     """Read, override (`key.path=value`) and validate. Raises InputError with one message."""
     data = _parse(path)
+    _anchor(data, path.parent)
     for override in overrides:
         _apply(data, override)
     return validate(data, str(path))
@@ -31,7 +30,7 @@ def validate(data: dict[str, Any], name: str) -> Study:
     try:
         study = Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{name}: {explain(error.errors()[0])}") from None
+        raise InputError(f"{name}: {explain(error.errors())}") from None
     return study
 
 
@@ -41,14 +40,13 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
 
     data = study.model_dump(mode="json", exclude_none=True)
     data["material"] |= data["material"].pop("regions")
-    return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(_keep_infinity(data, study))
+    data["mesh"] |= _builder_parameters(study)
+    return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
 
 
-def _keep_infinity(data: dict[str, Any], study: Study) -> dict[str, Any]:
-    # JSON has no infinity and pydantic writes null; TOML has one
-    if study.fracture is not None and study.fracture.strength == float("inf"):
-        data["fracture"]["strength"] = float("inf")
-    return data
+def _builder_parameters(study: Study) -> dict[str, Any]:
+    builder = find_builder(study.mesh)
+    return {} if builder is None else {key: value for key, value in asdict(builder).items() if value is not None}
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -64,9 +62,17 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not TOML: {error}") from None
 
 
+def _anchor(data: dict[str, Any], folder: Path) -> None:
+    """Mesh files are looked for beside the study file (those given with --set: in the working folder)."""
+    mesh = data.get("mesh")
+    for key in ("file", "surface"):
+        if isinstance(mesh, dict) and isinstance(mesh.get(key), str):
+            mesh[key] = str((folder / mesh[key]).resolve())
+
+
 def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
-    if not equals or not key:
+    if not equals or not all(key.strip().split(".")):
         raise InputError(f"--set {override}: write key.path=value, for example --set time.step=1e-3")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
@@ -95,65 +101,3 @@ def _index(place: list[Any], part: str, override: str) -> int:
     if not part.isdigit() or int(part) >= len(place):
         raise InputError(f"--set {override}: {part} is not an entry; there are {len(place)}, counted from 0")
     return int(part)
-
-
-# --- messages -------------------------------------------------------------------------------------------------------
-
-
-def explain(error: Any) -> str:
-    """One sentence for one of pydantic's errors: the key, the value, what is allowed."""
-    location = [part for part in error["loc"] if part not in _BRANCHES]
-    where = ".".join(map(str, location))
-    if error["type"] == "extra_forbidden":
-        return _unknown(where, location[-1], _known_keys(location[:-1]))
-    if error["type"] == "missing":
-        return f"{where} is missing{_needed_in(location)}"
-    message = _sentence(error["msg"])
-    if error["type"] == "value_error":
-        return f"{_table_name(location)}{message}"
-    return f"{where} = {_show(error['input'])}: {message}"
-
-
-def _unknown(where: str, key: Any, known: list[str]) -> str:
-    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
-    return f"{where} is not a known key; {hint}"
-
-
-def _needed_in(location: list[Any]) -> str:
-    return f"; the table [{'.'.join(map(str, location[:-1]))}] needs it" if location[:-1] else "; every study needs it"
-
-
-def _table_name(location: list[Any]) -> str:
-    return f"{'.'.join(map(str, location))}: " if location else ""
-
-
-def _sentence(message: str) -> str:
-    text = message.removeprefix("Value error, ").removeprefix("Input ")
-    return text.replace("should be", "must be").replace("should match pattern '^[xyz]+$'", "must be made of x, y, z")
-
-
-def _show(value: Any) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _known_keys(location: list[Any]) -> list[str]:
-    """The keys allowed at a place of the study file, found by walking the schema."""
-    models: list[type[BaseModel]] = [Study]
-    for part in location:
-        if isinstance(part, int):
-            continue
-        inner = [m for model in models for m in _models_in(model.model_fields.get(part))]
-        models = inner or [m for model in models for m in _models_in(model.model_fields.get("regions"))]
-    return sorted({key for model in models for key in model.model_fields if key != "regions"})
-
-
-def _models_in(field: Any) -> list[type[BaseModel]]:
-    def walk(annotation: Any) -> list[type[BaseModel]]:
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            return [annotation]
-        inner = [found for argument in get_args(annotation) for found in walk(argument)]
-        return inner or walk(annotation.__value__) if hasattr(annotation, "__value__") else inner
-
-    return walk(field.annotation) if field is not None else []

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
-from .domain import Domain, format_point
+from .bodies import bodies_of, free_motion, not_held
+from .domain import Domain
 from .errors import InputError
-from .laws import AXES
+from .laws import format_point
 from .loads import Motion
 from .meshes.data import MeshData
 from .parallel import on_root
-
-Values = npt.NDArray[np.float64]
 
 
 def check_supports(domain: Domain, motion: Motion) -> None:
@@ -34,38 +31,7 @@ def _check(mesh: MeshData | None, held: npt.NDArray[np.bool_] | None) -> None:
         if free:
             where = f"the body around {format_point(mesh.points[nodes].mean(axis=0))} m"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"
-            raise InputError(
-                f"boundary: nothing holds {which} against {free}; a quasi-static study needs every body held: "
-                'add a [[boundary]] with fix or displacement, or choose a scheme with inertia (time.scheme = "newmark")'
-            )
+            raise InputError(not_held(which, free))
 
 
-def bodies_of(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
-    """How many bodies share no node, and the body of each node."""
-    first = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
-    links = (np.ones(len(first), np.int8), (first, mesh.cells[:, 1:].reshape(-1)))
-    count, label = connected_components(csr_matrix(links, shape=(len(mesh.points),) * 2), directed=False)
-    return int(count), label.astype(np.int64)
-
-
-def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
-    """A rigid motion in words that the held components ((n, d) flags) do not stop; empty where there is none.
-
-    Rows of A are the values of the rigid modes at held components, lengths scaled by the body's size; a motion c is
-    free where A c = 0, that is where A^T A has a zero eigenvalue.
-    """
-    d = points.shape[1]
-    X = points - points.mean(axis=0)
-    X = X / max(float(np.abs(X).max()), 1e-300)
-    modes = [np.broadcast_to(axis, X.shape) for axis in np.eye(d)]
-    names = [f"moving along {axis}" for axis in AXES[:d]]
-    for i, j, name in ((0, 1, "z"), (1, 2, "x"), (2, 0, "y"))[: 1 if d == 2 else 3]:
-        turn = np.zeros_like(X)
-        turn[:, i], turn[:, j] = -X[:, j], X[:, i]
-        modes.append(turn)
-        names.append(f"turning about {name}")
-    A = np.stack([mode[held] for mode in modes], axis=1)
-    values, vectors = np.linalg.eigh(A.T @ A)
-    if values[0] > 1e-10 * max(values[-1], 1.0):
-        return ""
-    return names[int(np.argmax(np.abs(vectors[:, 0])))]
+__all__ = ["bodies_of", "check_supports", "free_motion"]

@@ -1,11 +1,13 @@
 """Meshes as plain arrays with named groups: builders, files, closed surfaces to fill, and checks.
 
     BUILDERS["box"](size=(1.0, 1.0, 4.0), h=0.1).build()    a body by its name
-    read_mesh("part.msh")                                   a mesh from file
-    fill_surface("part.stl", h=0.01)                        tetrahedra inside a closed surface
-    check_mesh(mesh)                                        named or mended, before anything is solved
+    read.read_mesh("part.msh")                              a mesh from file
+    fill.fill_surface("part.stl", h=0.01)                   tetrahedra inside a closed surface
+    check.check_mesh(mesh)                                  named or mended, before anything is solved
+    quality.mesh_quality(mesh)                              numbers that tell a good mesh from a bad one
 
-Importing this needs NumPy only: gmsh and meshio are imported by what uses them, on the process that uses them.
+Importing this needs NumPy only: gmsh, meshio and SciPy are imported by the modules that use them, gmsh and meshio only
+when called, on the process that calls.
 """
 
 from __future__ import annotations

@@ -246,8 +246,8 @@ def _bodies(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
     if by_facets > by_nodes:
         how = "an edge or a node" if mesh.dim == 3 else "a node"
         yield (
-            f"{by_facets - by_nodes} parts of the mesh touch the rest in {how} only, not through a facet, and turn there "
-            "as on a hinge."
+            f"{by_facets - by_nodes} parts of the mesh touch the rest in {how} only, not through a facet, and turn "
+            "there as on a hinge."
         )
 
 

@@ -108,9 +108,9 @@ class Contents:
         size, height = np.ptp(body[:, :2], axis=0).max(), np.ptp(body[:, 2])
         if height > 1e-6 * size:
             raise MeshError(
-                f"{source} holds a surface of triangles in space, not a plane mesh (z varies by {height:.3g} m). To fill "
-                "a closed surface with tetrahedra, give it as [mesh] surface = ... with a size h; a plane mesh must "
-                "lie in a plane of constant z."
+                f"{source} holds a surface of triangles in space, not a plane mesh (z varies by {height:.3g} m). To "
+                "fill a closed surface with tetrahedra, give it as [mesh] surface = ... with a size h; a plane mesh "
+                "must lie in a plane of constant z."
             )
         level = float(body[0, 2])
         note = f"The plane mesh lies at z = {level:.6g} m; z is left out." if abs(level) > 1e-6 * size else ""

@@ -53,9 +53,7 @@ def mesh_profile(profile: Profile, thickness: float, sizing: Sizing) -> tuple[Po
     return points, cells
 
 
-def rectangle_groups(
-    points: Points, cells: Indices, size: tuple[float, float, float], rest: str
-) -> dict[str, Indices]:
+def rectangle_groups(points: Points, cells: Indices, size: tuple[float, float, float], rest: str) -> dict[str, Indices]:
     """Groups of a body cut from the rectangle or box of `size` (length, height, thickness) [m] at the origin.
 
     Left, right (x), bottom, top (the last axis), in 3D front, back (y), and every other boundary facet under `rest`.

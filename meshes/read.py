@@ -133,7 +133,9 @@ def _meshio_mesh(path: Path) -> Any:
     except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit
         reason = "" if isinstance(error, SystemExit) else str(error)
         reason = " ".join((reason or said.getvalue()).split()) or type(error).__name__
-        raise MeshError(f"Mesh file '{path}' could not be read: {reason[:300]} (damaged, or of another kind?)") from error
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: {reason[:300]} (damaged, or of another kind?)"
+        ) from error
 
 
 @contextlib.contextmanager

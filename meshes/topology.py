@@ -100,6 +100,4 @@ def facet_measures(points: Points, facets: Indices) -> Floats:
 def plane_groups(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:
     """Facet groups on planes: name -> (axis, coordinate [m]). Nodes count as on it within 1e-9 of the body's size."""
     tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
-    return {
-        name: facets_where(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()
-    }
+    return {name: facets_where(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()}

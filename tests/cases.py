@@ -1,0 +1,111 @@
+"""Tiny studies for the tests of input and output, and running the command line."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from fracsim.study import Study
+from fracsim.study_file import study_text, validate
+
+BAR = tomllib.loads("""
+title = "bar"
+[mesh]
+builder = "box"
+size = [1.0, 0.25, 0.25]
+h = 0.25
+[material]
+energy = "linear"
+young = 1e6
+poisson = 0.3
+density = 1000.0
+[[boundary]]
+on = "left"
+fix = "xyz"
+[[boundary]]
+on = "right"
+velocity = [0.1, 0.0, 0.0]
+[time]
+step = 0.01
+end = 0.03
+[[probe]]
+name = "grip"
+on = "right"
+[output]
+every = 1
+picture = false
+""")
+
+STRIP = tomllib.loads("""
+title = "strip"
+[mesh]
+builder = "box"
+size = [1.0, 0.25]
+h = 0.125
+[material]
+energy = "neo-hookean"
+young = 1e6
+poisson = 0.3
+density = 1000.0
+[fracture]
+strength = 2e4
+[[boundary]]
+on = "left"
+fix = "xy"
+[[boundary]]
+on = "right"
+velocity = [1.0, 0.0]
+[time]
+step = 0.005
+end = 0.05
+[[probe]]
+name = "grip"
+on = "right"
+[[probe]]
+name = "tip"
+point = [1.0, 0.25]
+[output]
+every = 1
+fields = ["damage", "chi", "piece", "velocity", "stress", "von_mises", "energy_density", "region"]
+picture = false
+""")
+
+
+def changed(base: dict[str, Any], **tables: Any) -> dict[str, Any]:
+    """A copy of a study with keys of its tables set: changed(BAR, time={"end": 1.0}); None removes, others replace."""
+    data = copy.deepcopy(base)
+    for name, value in tables.items():
+        if value is None:
+            del data[name]
+        elif isinstance(value, dict) and isinstance(data.get(name), dict):
+            data[name] |= value
+        else:
+            data[name] = value
+    return data
+
+
+def study(base: dict[str, Any], **tables: Any) -> Study:
+    return validate(changed(base, **tables), "test.toml")
+
+
+def write_study(path: Path, base: dict[str, Any], **tables: Any) -> Path:
+    path.write_text(study_text(study(base, **tables)))
+    return path
+
+
+def fracsim(
+    *arguments: str | Path, ranks: int = 0, timeout: float = 60, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own, under mpirun where `ranks` are given."""
+    return subprocess.run(
+        command(*arguments, ranks=ranks), capture_output=True, text=True, timeout=timeout, env=env, check=False
+    )
+
+
+def command(*arguments: str | Path, ranks: int = 0) -> list[str]:
+    mpirun = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+    return [*mpirun, str(Path(sys.executable).with_name("fracsim")), *map(str, arguments)]

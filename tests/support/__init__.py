@@ -1,0 +1,1 @@
+"""Helpers of the tests: small scenes, independent references, runs on several ranks."""

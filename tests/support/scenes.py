@@ -1,0 +1,83 @@
+"""Small scenes built from study tables, moved step by step in the test's own process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from fracsim.meshes.data import MeshData
+from fracsim.run import Scene, build_scene
+from fracsim.state import State
+from fracsim.stepping import Report
+from fracsim.study import Study
+from mpi4py import MPI
+
+Values = npt.NDArray[np.float64]
+
+# Newton's method with a direct solver: what is left is round-off, not a tolerance.
+DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "snes_rtol": 1e-13}
+
+
+def make_study(**tables: Any) -> Study:
+    """A study with the tables given; the others have small, plain defaults (E = 1 Pa, rho = 1 kg/m^3: c0 = 1 m/s)."""
+    plain: dict[str, Any] = {
+        "title": "test",
+        "mesh": {"builder": "box", "size": [1.0, 1.0], "h": 0.5},
+        "material": {"energy": "linear", "young": 1.0, "poisson": 0.0, "density": 1.0},
+        "time": {"scheme": "newmark", "step": 0.1, "end": 1.0},
+        "solver": DIRECT,
+    }
+    return Study.model_validate(plain | tables)
+
+
+def make_scene(**tables: Any) -> tuple[Scene, State]:
+    """A scene on every rank of the world, and its state at t = 0."""
+    study = make_study(**tables)
+    scene = build_scene(MPI.COMM_WORLD, study)
+    return scene, scene.stepper.start(study.initial)
+
+
+def march(scene: Scene, state: State, steps: int | None = None) -> list[Report]:
+    """Advance to the end of the study, or by a number of steps."""
+    reports: list[Report] = []
+    end = scene.study.time.end * (1 - 1e-12)
+    while state.t < end and (steps is None or len(reports) < steps):
+        reports.append(scene.stepper.advance(state))
+    return reports
+
+
+def mesh_of(scene: Scene) -> MeshData:
+    """The mesh as it was built (serial)."""
+    assert scene.domain.source is not None
+    return scene.domain.source
+
+
+def positions(scene: Scene) -> Values:
+    """(nodes, d) reference positions of the owned nodes, in the order of the dofs."""
+    return scene.domain.nodes[: scene.domain.node_count]
+
+
+def displacement(scene: Scene, state: State) -> Values:
+    """(nodes, d) displacement of the owned nodes."""
+    return state.u.reshape(-1, scene.domain.dim)
+
+
+def cell_corners(scene: Scene) -> Values:
+    """(cells, d + 1, d) reference corners."""
+    return scene.domain.nodes[scene.domain.cell_nodes]
+
+
+def deform(scene: Scene, F: Values) -> None:
+    """Give the body the homogeneous displacement u = (F - I) X."""
+    X = positions(scene)
+    scene.equations.displace((X @ (F - np.eye(len(F))).T).reshape(-1))
+
+
+def at_nodes(points: Values, values: Values) -> list[dict[str, Any]]:
+    """[[boundary]] entries that prescribe a displacement at each of the given nodes."""
+    size = 1e-9
+    return [
+        {"on": {"box": [(p - size).tolist(), (p + size).tolist()]}, "displacement": np.asarray(u).tolist()}
+        for p, u in zip(points, values, strict=True)
+    ]

@@ -1,0 +1,309 @@
+"""Builders against closed forms: volume, boundary, groups, bounds; and their messages."""
+
+from __future__ import annotations
+
+import sys
+from math import cos, pi, radians, sin, tan
+from subprocess import run
+from typing import Any
+
+import numpy as np
+import pytest
+from fracsim.meshes import BUILDERS, MeshData, MeshError
+from fracsim.meshes.check import check_mesh
+from fracsim.meshes.quality import mesh_quality
+from fracsim.meshes.topology import (
+    boundary_facets,
+    distinct_rows,
+    facet_measures,
+    facets_of,
+    signed_measures,
+)
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    ("box", {"size": (1.0, 2.0), "h": 0.2}),
+    ("box", {"size": (1.0, 0.5, 0.5), "h": 0.2, "origin": (0.1, -1.0, 3.0)}),
+    ("box", {"size": (1.0, 2.0), "h": 0.2, "pattern": "unstructured"}),
+    ("box", {"size": (1.0, 0.5, 0.5), "h": 0.2, "origin": (1.0, 2.0, 3.0), "pattern": "unstructured"}),
+    ("cylinder", {"h": 0.015}),
+    ("cylinder", {"h": 0.015, "axis": "x"}),
+    ("disk", {}),
+    ("loaf", {"h": 0.012}),
+    ("notched-bar", {"h": 0.002, "h_notch": 0.0004}),
+    ("notched-bar", {"thickness": 0.0}),
+    ("notched-bar", {"thickness": 0.0, "notch": "U", "span": 0.0}),
+    ("notched-bar", {"thickness": 0.0, "notch": "slit", "refined": 0.004}),
+    ("notched-plate", {}),
+    ("notched-plate", {"thickness": 0.004, "h": 0.003, "h_tip": 0.001}),
+    ("notched-plate", {"length": 1e-3, "height": 1e-3, "notch_length": 5e-4, "notch_width": 5e-6, "h": 4e-5}),
+]
+
+
+def names(case: tuple[str, dict[str, Any]]) -> str:
+    return case[0] + "-" + "-".join(str(v) for v in case[1].values())
+
+
+@pytest.fixture(scope="module", params=CASES, ids=names)
+def built(request: pytest.FixtureRequest) -> tuple[Any, MeshData]:
+    name, parameters = request.param
+    builder: Any = BUILDERS[name](**parameters)
+    return builder, builder.build()
+
+
+def volume(mesh: MeshData) -> float:
+    return float(signed_measures(mesh.points, mesh.cells).sum())
+
+
+def test_cells_are_positive_and_the_check_has_nothing_to_say(built: tuple[Any, MeshData]) -> None:
+    _, mesh = built
+    assert signed_measures(mesh.points, mesh.cells).min() > 0
+    assert check_mesh(mesh).notes == ()
+    assert mesh_quality(mesh)["radius_ratio_min"] > 0.15
+
+
+def test_facets_are_shared_by_two_cells_and_the_boundary_is_closed(built: tuple[Any, MeshData]) -> None:
+    _, mesh = built
+    _, counts, _ = distinct_rows(np.sort(facets_of(mesh.cells).reshape(-1, mesh.dim), axis=1))
+    assert set(counts) <= {1, 2}
+    # The boundary of a boundary is empty: every edge (2D: node) of the boundary lies in exactly two of its facets.
+    boundary = boundary_facets(mesh.cells)
+    ridges = facets_of(boundary).reshape(-1, mesh.dim - 1)
+    assert set(distinct_rows(np.sort(ridges, axis=1))[1]) == {2}
+
+
+def test_boundary_normals_point_outwards(built: tuple[Any, MeshData]) -> None:
+    """Divergence theorem: the volume is the surface integral of x . n / d."""
+    _, mesh = built
+    corners = mesh.points[boundary_facets(mesh.cells)]
+    centred = corners - mesh.points.mean(axis=0)
+    if mesh.dim == 2:
+        enclosed = np.linalg.det(centred).sum() / 2
+    else:
+        enclosed = np.linalg.det(centred).sum() / 6
+    assert enclosed == pytest.approx(volume(mesh), rel=1e-9)
+
+
+def test_groups_are_those_announced_and_cover_the_boundary_once(built: tuple[Any, MeshData]) -> None:
+    builder, mesh = built
+    assert tuple(mesh.facet_groups) and set(mesh.facet_groups) == set(builder.groups)
+    assert all(len(facets) for facets in mesh.facet_groups.values())
+    # The patches and the grips of a loaf lie in other groups; all others share the boundary among them.
+    parts = [f for name, f in mesh.facet_groups.items() if name not in ("support-left", "support-right", "load")]
+    if builder.name == "loaf":
+        parts = [mesh.facet_groups["bottom"], mesh.facet_groups["crust"]]
+    covered = np.concatenate([np.sort(part, axis=1) for part in parts])
+    boundary = distinct_rows(np.sort(boundary_facets(mesh.cells), axis=1))[0]
+    np.testing.assert_array_equal(distinct_rows(covered)[0], boundary)
+    assert len(covered) == len(boundary)
+
+
+def test_bounds_are_known_before_building(built: tuple[Any, MeshData]) -> None:
+    builder, mesh = built
+    low, high = builder.bounds()
+    size = np.subtract(high, low)
+    # A polygon in a circle misses the circle's extremes by up to r (1 - cos(h / 2r)) ~ h^2 / 8r.
+    slack = builder.h**2 / (8 * builder.radius) if builder.name == "disk" else 1e-12
+    np.testing.assert_allclose(mesh.points.min(axis=0), low, atol=slack + 1e-12 * size.max())
+    np.testing.assert_allclose(mesh.points.max(axis=0), high, atol=slack + 1e-12 * size.max())
+
+
+def test_cells_are_estimated(built: tuple[Any, MeshData]) -> None:
+    builder, mesh = built
+    assert 1 / 1.5 < builder.cells_estimate() / len(mesh.cells) < 1.5
+
+
+def test_plane_groups_lie_on_their_planes(built: tuple[Any, MeshData]) -> None:
+    builder, mesh = built
+    if builder.name not in ("box", "notched-bar", "notched-plate"):
+        pytest.skip("round")
+    low, high = builder.bounds()
+    up = mesh.dim - 1
+    planes = {"left": (0, low), "right": (0, high), "bottom": (up, low), "top": (up, high)}
+    if mesh.dim == 3:
+        planes |= {"front": (1, low), "back": (1, high)}
+    for name, (axis, corner) in planes.items():
+        assert np.ptp(mesh.points[mesh.facet_groups[name], axis]) <= 1e-12
+        np.testing.assert_allclose(mesh.points[mesh.facet_groups[name], axis], corner[axis], atol=1e-12)
+
+
+# --- measures against closed forms ----------------------------------------------------------------------------------
+
+
+def test_box_volume_and_sides() -> None:
+    mesh = BUILDERS["box"](size=(1.0, 2.0, 0.5), h=0.25).build()
+    assert volume(mesh) == pytest.approx(1.0, rel=1e-12)
+    assert len(mesh.cells) == 6 * 4 * 8 * 2
+    for name, area in {"left": 1.0, "right": 1.0, "front": 0.5, "back": 0.5, "bottom": 2.0, "top": 2.0}.items():
+        assert facet_measures(mesh.points, mesh.facet_groups[name]).sum() == pytest.approx(area, rel=1e-12)
+
+
+def test_box_has_at_least_one_step_a_side() -> None:
+    assert BUILDERS["box"](size=(1.0, 0.01), h=1.0).build().cells.shape == (2, 3)
+
+
+def test_box_edges_have_the_size_asked_for() -> None:
+    """Structured: h along the axes; unstructured: half of the edges are shorter than h, half longer."""
+    structured = mesh_quality(BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.1).build())
+    assert structured["edge_min"] == pytest.approx(0.1) and structured["edge_max"] == pytest.approx(0.1 * 3**0.5)
+    loose = mesh_quality(BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.1, pattern="unstructured").build())
+    assert loose["edge_median"] == pytest.approx(0.1, rel=0.05)
+
+
+def test_large_structured_box_is_quick() -> None:
+    mesh = BUILDERS["box"](size=(1.0, 1.0, 4.0), h=1 / 30).build()
+    assert len(mesh.cells) == 6 * 30 * 30 * 120 and len(mesh.points) == 31 * 31 * 121
+
+
+def test_cylinder_volume_is_that_of_its_polygon() -> None:
+    """The n nodes of the rim make a regular polygon of area n/2 r^2 sin(2 pi / n); nodes between the ends lie on the
+    circle too, at other angles, and the triangles between them cut off a little more or less, of second order in h."""
+    builder: Any = BUILDERS["cylinder"](radius=0.05, length=0.2, h=0.01)
+    mesh = builder.build()
+    rim = np.unique(mesh.facet_groups["bottom"])
+    n = int((np.linalg.norm(mesh.points[rim, :2], axis=1) > 0.05 * (1 - 1e-9)).sum())
+    polygon = n / 2 * 0.05**2 * sin(2 * pi / n)
+    assert facet_measures(mesh.points, mesh.facet_groups["bottom"]).sum() == pytest.approx(polygon, rel=1e-9)
+    assert facet_measures(mesh.points, mesh.facet_groups["top"]).sum() == pytest.approx(polygon, rel=1e-9)
+    assert volume(mesh) < 0.2 * pi * 0.05**2
+    assert volume(mesh) == pytest.approx(0.2 * polygon, rel=(0.01 / 0.05) ** 2 / 6)
+    side = mesh.points[np.unique(mesh.facet_groups["side"])]
+    np.testing.assert_allclose(np.linalg.norm(side[:, :2], axis=1), 0.05, rtol=1e-9)
+
+
+def test_sharp_v_notch_area() -> None:
+    """A triangle of height a and half-angle t is cut out: a^2 tan t."""
+    builder: Any = BUILDERS["notched-bar"](thickness=0.0, notch_radius=0.0)
+    wanted = 0.055 * 0.010 - 0.002**2 * tan(radians(22.5))
+    assert volume(builder.build()) == pytest.approx(wanted, rel=1e-12)
+    assert builder.mouth() == pytest.approx(2 * 0.002 * tan(radians(22.5)))
+
+
+@pytest.mark.parametrize("notch", ["V", "U"])
+def test_rounded_notch_area(notch: str) -> None:
+    """Half-angle t (0 for a U), root radius r, depth a. The flanks touch the root circle, of centre (0, a - r), at
+    x = r cos t, y = a - r (1 - sin t). Below y lies a trapezoid of half-widths w = x + y tan t and x; above it the
+    circular segment of half-angle pi/2 - t: r^2 (pi/2 - t - sin t cos t). The arc is drawn as k chords, which hug the
+    notch side of nothing: they leave the segments of the chords, r^2 k (c - sin c) / 2 with c = (pi - 2 t) / k,
+    to the body."""
+    r, a, t = 0.0005, 0.002, radians(22.5) if notch == "V" else 0.0
+    bar = BUILDERS["notched-bar"](thickness=0.0, notch=notch, notch_radius=r, h_notch=5e-5)
+    mesh = bar.build()
+    x, y = r * cos(t), a - r * (1 - sin(t))
+    notch_area = (2 * x + y * tan(t)) * y + r**2 * (pi / 2 - t - sin(t) * cos(t))
+    middles = mesh.points[mesh.facet_groups["notch"]].mean(axis=1)
+    k = int((middles[:, 1] > y).sum())
+    chord = (pi - 2 * t) / k
+    left_to_body = r**2 * k * (chord - sin(chord)) / 2
+    assert k > 10
+    assert volume(mesh) == pytest.approx(0.055 * 0.010 - notch_area + left_to_body, rel=1e-9)
+
+
+def test_charpy_supports_lie_where_they_should() -> None:
+    mesh = BUILDERS["notched-bar"](h=0.002, h_notch=0.0005).build()
+    for name, x, z in (("support-left", 0.0075, 0.0), ("support-right", 0.0475, 0.0), ("load", 0.0275, 0.010)):
+        patch = mesh.facet_groups[name]
+        assert facet_measures(mesh.points, patch).sum() == pytest.approx(0.001 * 0.010, rel=1e-9)
+        assert mesh.points[np.unique(patch), 0].min() == pytest.approx(x - 0.0005)
+        assert mesh.points[np.unique(patch), 0].max() == pytest.approx(x + 0.0005)
+        np.testing.assert_allclose(mesh.points[np.unique(patch), 2], z, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["notched-bar", "notched-plate"])
+def test_slit_area(name: str) -> None:
+    """Flanks w apart to a - w/2, then a right-angled point of height w/2: w (a - w/2) + w^2/4."""
+    if name == "notched-bar":
+        mesh, a, w, body = BUILDERS[name](thickness=0.0, notch="slit").build(), 0.002, 0.0005, 0.055 * 0.01
+    else:
+        mesh, a, w, body = BUILDERS[name]().build(), 0.05, 0.0005, 0.1 * 0.04
+    assert volume(mesh) == pytest.approx(body - (w * (a - w / 2) + w**2 / 4), rel=1e-12)
+    # flanks and the two sides of the point, each w / sqrt(2)
+    length = 2 * (a - w / 2) + 2 * w / 2**0.5
+    assert facet_measures(mesh.points, mesh.facet_groups["notch"]).sum() == pytest.approx(length, rel=1e-9)
+
+
+def test_cells_are_fine_ahead_of_the_tip_only() -> None:
+    mesh = BUILDERS["notched-plate"](h=0.002, h_tip=0.0005, refined=0.02).build()
+    middles = mesh.points[mesh.cells].mean(axis=1)
+    size = np.sqrt(signed_measures(mesh.points, mesh.cells) / 0.433)
+    ahead = (np.abs(middles[:, 1] - 0.02) < 0.0005) & (middles[:, 0] > 0.05) & (middles[:, 0] < 0.07)
+    assert np.median(size[ahead]) == pytest.approx(0.0005, rel=0.25)
+    assert np.median(size[middles[:, 0] < 0.03]) == pytest.approx(0.002, rel=0.25)
+
+
+def test_loaf_without_dome_is_a_block_with_round_edges() -> None:
+    """Steiner's formula for a box with edges p, q, s thickened by r: pqs + 2r(pq + qs + sp) + pi r^2 (p + q + s)
+    + 4/3 pi r^3. Facets on the round parts cut off a share of about (h / r)^2 / 24 of their volume."""
+    r, size, h = 0.025, (0.25, 0.11, 0.10), 0.008
+    mesh = BUILDERS["loaf"](size=size, h=h, rounding=r, bottom_rounding=r, dome=0.0, flare=0.0).build()
+    p, q, s = (length - 2 * r for length in size)
+    rounded = pi * r**2 * (p + q + s) + 4 / 3 * pi * r**3
+    wanted = p * q * s + 2 * r * (p * q + q * s + s * p) + rounded
+    assert volume(mesh) == pytest.approx(wanted, abs=rounded * (h / r) ** 2 / 6)
+
+
+def test_loaf_has_a_flat_bottom_grips_and_a_dome() -> None:
+    mesh = BUILDERS["loaf"]().build()
+    assert np.ptp(mesh.points[mesh.facet_groups["bottom"], 2]) == 0
+    assert mesh.points[mesh.facet_groups["left"], 0].max() <= -0.125 + 0.03
+    assert mesh.points[mesh.facet_groups["right"], 0].min() >= 0.125 - 0.03
+    middle = np.abs(mesh.points[:, 0]) < 0.02
+    end = np.abs(mesh.points[:, 0]) > 0.10
+    assert mesh.points[middle, 2].max() > 1.05 * mesh.points[end, 2].max()
+
+
+# --- behaviour ------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_parameters_make_the_same_mesh_quietly(capfd: pytest.CaptureFixture[str]) -> None:
+    first, second = (BUILDERS["loaf"](h=0.015).build() for _ in range(2))
+    np.testing.assert_array_equal(first.points, second.points)
+    np.testing.assert_array_equal(first.cells, second.cells)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_importing_builders_loads_neither_gmsh_nor_meshio() -> None:
+    code = "import sys, fracsim.meshes as m; m.BUILDERS['loaf'](); print({'gmsh', 'meshio', 'dolfinx'} & set(sys.modules))"
+    done = run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_gmsh_is_ended_after_an_error() -> None:
+    import gmsh
+    from fracsim.meshes.gmsh_session import session
+
+    with pytest.raises(MeshError, match=r"gmsh could not make the mesh: .+"), session() as g:
+        g.model.mesh.setNode(77, [0, 0, 0], [])
+    assert not gmsh.isInitialized()
+
+
+BAD: list[tuple[str, dict[str, Any], str]] = [
+    ("box", {"size": (1.0,)}, r"box: size = \[1.0\] must have two entries"),
+    ("box", {"size": (1.0, -1.0)}, r"box: size\[1\] = -1.0 must be a positive number"),
+    ("box", {"h": float("nan")}, "box: h = nan must be a positive number"),
+    ("box", {"h": "fine"}, "box: h = 'fine' must be a positive number"),
+    ("box", {"h": 1e-6}, "h = 1e-06 m would make about .* cells"),
+    ("box", {"origin": (0.0, 0.0)}, "origin = .* must have as many numbers as size"),
+    ("box", {"pattern": "hex"}, "pattern = 'hex' is not one of structured, unstructured"),
+    ("cylinder", {"length": 0.0}, "cylinder: length = 0.0 must be a positive number"),
+    ("cylinder", {"axis": "w"}, "axis = 'w' is not one of x, y, z"),
+    ("disk", {"radius": -1.0}, "disk: radius = -1.0"),
+    ("notched-bar", {"notch_depth": 0.02}, "notch_depth = 0.02 must be less than height = 0.01"),
+    ("notched-bar", {"notch_depth": 1e-5}, "more than the .* m that the root of the notch takes"),
+    ("notched-bar", {"notch_angle": 200.0}, "notch_angle = 200.0 must lie between 0 and 180 degrees"),
+    ("notched-bar", {"notch_angle": 176.0}, "the notch is .* m wide, length = 0.055 m only"),
+    ("notched-bar", {"span": 0.054}, "span = 0.054 leaves no room"),
+    ("notched-bar", {"notch": "W"}, "notch = 'W' is not one of V, U, slit"),
+    ("notched-plate", {"notch_length": 0.2}, "notch_length = 0.2 must be less than length = 0.1"),
+    ("notched-plate", {"notch_position": 0.04}, "does not lie within height = 0.04"),
+    ("notched-plate", {"notch_width": 0.0}, "notch_width = 0.0 must be a positive number"),
+    ("notched-plate", {"thickness": -1.0}, "thickness = -1.0 must be zero or a positive number"),
+    ("loaf", {"rounding": 0.06}, "rounding = 0.06 .* do not fit a block"),
+    ("loaf", {"grip": 0.2}, "grip = 0.2 must be less than half of the length"),
+    ("loaf", {"dome": 2.0}, "dome = 2.0 must lie between 0 and 1"),
+]
+
+
+@pytest.mark.parametrize(("name", "parameters", "message"), BAD)
+def test_bad_parameters_are_named(name: str, parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(MeshError, match=message):
+        BUILDERS[name](**parameters)
