@@ -39,5 +39,5 @@ def embed(tensor: Expr, out_of_plane: float) -> Expr:
     """A 2 x 2 tensor as the in-plane block of a 3 x 3 one; 3 x 3 tensors pass."""
     if tensor.ufl_shape[0] == 3:
         return tensor
-    (a, b), (c, d) = ((tensor[i, j] for j in range(2)) for i in range(2))
-    return ufl.as_tensor([[a, b, 0], [c, d, 0], [0, 0, out_of_plane]])
+    rows = [[tensor[i, 0], tensor[i, 1], 0] for i in range(2)]
+    return ufl.as_tensor([*rows, [0, 0, out_of_plane]])

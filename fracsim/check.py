@@ -108,7 +108,8 @@ def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
     """Whether a box or plane meets the body's bounding box at all."""
     if isinstance(where, Box):
         low, high = (of_size(corner, anatomy.dim, f"{key}.box") for corner in where.box)
-        misses = np.any(low > anatomy.upper) or np.any(high < anatomy.lower)
+        slack = 1e-9 * float(np.linalg.norm(np.subtract(anatomy.upper, anatomy.lower)))
+        misses = np.any(low > np.array(anatomy.upper) + slack) or np.any(high < np.array(anatomy.lower) - slack)
     else:
         normal, point = (of_size(v, anatomy.dim, f"{key}.{n}") for v, n in ((where.normal, "normal"), (where.point, "point")))
         if not np.any(normal):

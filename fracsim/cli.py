@@ -17,6 +17,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of one that comes along")]
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
 _NONE: list[str] = []
+INTERRUPTED = 130  # as typer and shells report SIGINT
 
 
 @app.command()
@@ -25,7 +26,7 @@ def run(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME)")] = None,
     set_: Set = _NONE,
     restart: Annotated[bool, typer.Option("--restart", help="go on from the checkpoint in the output folder")] = False,
-    wall_limit: Annotated[float | None, typer.Option(help="seconds after which to stop with a checkpoint")] = None,
+    wall_limit: Annotated[float | None, typer.Option(min=0, help="seconds after which to stop with a checkpoint")] = None,
 ) -> None:
     """Run a study. Works under mpirun."""
     from mpi4py import MPI
@@ -168,10 +169,9 @@ def _guarded(work: Callable[[], Any]) -> int:
         _say(f"{error.format_message().rstrip('.')}; see fracsim --help")
         return int(Exit.BAD_INPUT)
     except click.exceptions.Exit as error:
+        if error.exit_code == INTERRUPTED:
+            _say("interrupted before the first step; nothing was written")
         return error.exit_code
-    except click.exceptions.Abort:
-        _say("interrupted before the first step; nothing was written")
-        return 130  # as a shell reports SIGINT
     except Exception:
         _abort()
         raise

@@ -147,7 +147,8 @@ class Domain:
         return fem.locate_dofs_topological(self.space, self.dim - 1, facets)
 
     def _selected(self, where: Box | Plane, key: str) -> Ints:
-        inside = in_box(where, self.nodes, key) if isinstance(where, Box) else on_plane(where, self.nodes, self.size, key)
+        select = in_box if isinstance(where, Box) else on_plane
+        inside = select(where, self.nodes, self.size, key)  # type: ignore[arg-type]
         return np.flatnonzero(inside).astype(np.int32)
 
     def _facets_within(self, nodes: Ints) -> Ints:
@@ -168,10 +169,11 @@ class Domain:
         return f"{format_point(self.lower)} to {format_point(self.upper)}"
 
 
-def in_box(box: Box, points: npt.NDArray[np.float64], key: str) -> npt.NDArray[np.bool_]:
-    """Which points lie in the closed box."""
+def in_box(box: Box, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:
+    """Which points lie in the closed box, give or take 1e-9 of the body's size: faces that coincide are meant."""
     low, high = (_of_dimension(corner, points, f"{key}.box") for corner in box.box)
-    return np.all((points >= low) & (points <= high), axis=1)
+    slack = 1e-9 * size
+    return np.all((points >= low - slack) & (points <= high + slack), axis=1)
 
 
 def on_plane(plane: Plane, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 
 from .domain import Domain
 from .edge_stress import carried_by, edge_vectors, normal_stress
@@ -24,10 +25,11 @@ Cells = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PassResult:
-    """What one pass did, summed over the ranks but for `released`."""
+    """What one pass did."""
 
-    broken: int  # edges that broke in this pass
+    broken: int  # edges that broke in this pass, on all ranks
     released: float  # elastic energy that went with them on this rank, J
+    elastic: float  # elastic energy that is left on this rank, J
 
 
 class FracturePass:
@@ -48,24 +50,24 @@ class FracturePass:
         self._linear = equations.material.energy.linear
         rotation = equations.rotation.field if equations.rotation is not None else None
         F, energy = deformation_gradient(equations.u), equations.material.energy
-        cauchy = symmetric_components(cauchy_stress(energy, F, rotation))
-        self._stress = CellExpression(domain.comm, domain.mesh, cauchy, domain.cell_count)
-        self._density = CellExpression(domain.comm, domain.mesh, energy.psi(F, rotation), domain.cell_count)
+        stress = symmetric_components(cauchy_stress(energy, F, rotation))
+        both = ufl.as_vector([*stress, energy.psi(F, rotation)])  # one kernel: F is worked out once
+        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
         self._average = _average(domain, fracture)
 
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
-        stress = self._stress()
-        np.nan_to_num(stress, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        values = self._evaluate()
+        stress, psi = values[:, :-1], values[:, -1]
+        if not np.isfinite(values.sum()):  # a crushed cell: J = 0
+            np.nan_to_num(stress, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         averaged = self._averaged(stress)
         flags = np.zeros(len(self.graph.broken), bool)
         flags[self._overloaded(averaged)] = True
         broken = self.graph.break_edges(flags)
-        return PassResult(broken, self._degrade(stress))
-
-    def stress(self) -> Values:
-        """(cells, 3 or 6) Cauchy stress of the undegraded energy, Pa."""
-        return self._stress()
+        released = self._degrade(stress, psi)
+        chi = self.equations.chi.x.array[: self.domain.cell_count]
+        return PassResult(broken, released, float(np.sum(self.domain.volumes * chi * psi)))
 
     def _averaged(self, stress: Values) -> Values:
         """What intact edges carry, averaged over the neighbourhood; split cells carry nothing and enter no average."""
@@ -104,7 +106,7 @@ class FracturePass:
         ends = self.domain.nodes[self.graph.edge_nodes[unique]]
         return hashed(ends[:, 0] + ends[:, 1])[inverse.reshape(edges.shape)]
 
-    def _degrade(self, stress: Values) -> float:
+    def _degrade(self, stress: Values, psi: Values) -> float:
         """Lower chi of damaged cells (M22 eq. 28); returns the elastic energy released on this rank."""
         chi: Any = self.equations.chi
         values = chi.x.array
@@ -120,8 +122,7 @@ class FracturePass:
         cells, lost = cells[changed], lost[changed]
         values[cells] -= lost
         values[cells[self.graph.split[cells]]] = 0.0
-        density = self._density(cells.astype(np.int32))[:, 0]
-        return float(np.sum(self.domain.volumes[cells] * lost * density))
+        return float(np.sum(self.domain.volumes[cells] * lost * psi[cells]))
 
     def _intact(self, cells: Cells) -> npt.NDArray[np.bool_]:
         """(n, k) whether each local edge of the cells is intact."""

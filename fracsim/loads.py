@@ -52,8 +52,10 @@ class Forces:
         self._moving: list[tuple[fem.Constant, Law]] = []
         self._domain = domain
         self.body = self._body_force(study, density)
-        self.tractions = self._surface(study, "traction", domain.dim)
-        self.pressures = self._surface(study, "pressure", 1)
+        loaded = [(i, entry) for i, entry in enumerate(study.boundary) if entry.kind not in MOTIONS]
+        ds = surface_measure(domain, [domain.facets_of(entry.on, f"boundary.{i}.on") for i, entry in loaded])
+        self.tractions = self._surface(loaded, "traction", domain.dim, ds)
+        self.pressures = self._surface(loaded, "pressure", 1, ds)
 
     def set_time(self, t: float) -> bool:
         """Move every load to time t; whether any of them changed."""
@@ -80,20 +82,23 @@ class Forces:
             force = extra if force is None else force + extra
         return force
 
-    def _surface(self, study: Study, kind: str, size: int) -> list[tuple[fem.Constant, ufl.Measure]]:
+    def _surface(
+        self, loaded: list[tuple[int, Boundary]], kind: str, size: int, ds: ufl.Measure
+    ) -> list[tuple[fem.Constant, ufl.Measure]]:
         """(load, measure) of each boundary entry of a kind."""
         found = []
-        for index, boundary in enumerate(study.boundary):
-            if boundary.kind != kind:
-                continue
-            key = f"boundary.{index}"
-            facets = self._domain.facets_of(boundary.on, f"{key}.on")
-            law = in_time(getattr(boundary, kind), f"{key}.{kind}", size)
-            found.append((self._constant(law, size), facet_measure(self._domain, facets)))
+        for number, (index, entry) in enumerate(loaded):
+            if entry.kind == kind:
+                law = in_time(getattr(entry, kind), f"boundary.{index}.{kind}", size)
+                found.append((self._constant(law, size), ds(number)))
         return found
 
 
-def facet_measure(domain: Domain, facets: Ints) -> ufl.Measure:
-    """Surface measure over the given exterior facets."""
-    entities = fem.compute_integration_domains(fem.IntegralType.exterior_facet, domain.mesh.topology, facets, domain.dim - 1)
-    return ufl.Measure("ds", domain=domain.mesh, subdomain_data=[(1, entities)])(1)
+def surface_measure(domain: Domain, parts: list[Ints]) -> ufl.Measure:
+    """Surface measure whose part `number` is over the exterior facets parts[number]; parts may overlap."""
+    kind, topology = fem.IntegralType.exterior_facet, domain.mesh.topology
+    entities = [
+        (number, fem.compute_integration_domains(kind, topology, facets, domain.dim - 1))
+        for number, facets in enumerate(parts)
+    ]
+    return ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)

@@ -35,9 +35,8 @@ def polar_rotation(F: Tensors, iterations: int = 20) -> Tensors:
     About four times faster on arrays than a batched SVD, which serves only the cells that are inverted or nearly flat,
     where the iteration would find a reflection or stall (Higham 1986).
     """
-    determinant = np.linalg.det(F)
-    size = np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
-    regular = determinant > 1e-6 * size
+    with np.errstate(invalid="ignore", over="ignore"):  # cells of a diverging iterate fail the comparison
+        regular = np.linalg.det(F) > 1e-6 * np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
     if not regular.all():
         result = np.empty_like(F)
         result[regular] = polar_rotation(F[regular], iterations)

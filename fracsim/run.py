@@ -121,20 +121,21 @@ class Run:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged or Stopped after a checkpoint."""
         self._setup_seconds = time.perf_counter() - self._began
-        outcome = "failed"
         progress = Progress(self.comm, self.scene.study)
         try:
             with self._interrupt, progress:
                 self._loop(progress)
-            outcome = "done"
         except (NotConverged, Stopped) as error:
-            outcome = "not converged" if isinstance(error, NotConverged) else "stopped"
+            self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
             raise type(error)(f"{error}. Checkpoint: {self._checkpoint()}; go on with --restart") from None
-        finally:
-            summary = self._summary(outcome)
-            self.history.close()
-            if self.comm.rank == 0:
-                (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        return self._finish("done")
+
+    def _finish(self, outcome: str) -> dict[str, Any]:
+        """summary.json; only on ways out that all ranks take, since it sums over them."""
+        summary = self._summary(outcome)
+        self.history.close()
+        if self.comm.rank == 0:
+            (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         return summary
 
     def _loop(self, progress: Progress) -> None:
@@ -262,7 +263,10 @@ def run_study(
     if scene.domain.source is not None:
         for note in scene.domain.source.notes:
             print(f"fracsim: note: {note}", file=sys.stderr)
-    summary = Run(scene, folder, restart=restart, wall_limit=wall_limit)()
+    try:
+        summary = Run(scene, folder, restart=restart, wall_limit=wall_limit)()
+    finally:
+        scene.solver.forget_options()
     if study.output.picture:
         on_root(comm, lambda: _draw(folder))
     return summary

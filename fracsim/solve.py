@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ DEFAULTS: Options = {
 }
 MULTIGRID: Options = {
     "pc_type": "gamg",
+    "pc_gamg_reuse_interpolation": True,
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
@@ -38,6 +40,14 @@ LARGE_GAP = 0.01
 
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
+
+
+class Age(IntEnum):
+    """State of the preconditioner."""
+
+    FRESH = 0
+    DATED = 1  # same coarse spaces, new operators
+    WORN = 2  # everything anew
 
 
 @dataclass(frozen=True)
@@ -53,8 +63,9 @@ class Outcome:
 class Solver:
     """SNES on an `Equilibrium`, set up once and kept for the whole run.
 
-    The preconditioner is kept from tangent to tangent and made anew only where it has aged: where CG takes half as many
-    iterations again as when it was fresh. Making multigrid's coarse spaces costs as much as the rest of a Newton iteration.
+    The preconditioner is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a
+    Newton iteration. It is made anew where CG takes half as many iterations again as when it was fresh, and refreshed (new
+    coarse operators and smoothers on the same coarse spaces) after edges broke.
     """
 
     def __init__(self, equations: Equilibrium, given: Options) -> None:
@@ -72,8 +83,7 @@ class Solver:
         snes.setConvergenceTest(self._converged)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
-        self._krylov_type = snes.ksp.getType()
-        self._stale, self._fresh_its, self._first = True, 0, 0.0
+        self._age, self._keep, self._fresh_its, self._first = Age.WORN, True, 0, 0.0
 
     def _configure(self, given: Options) -> None:
         try:
@@ -92,15 +102,24 @@ class Solver:
     def solve(self, guess: npt.NDArray[np.float64]) -> Outcome:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution."""
         outcome = self._attempt(guess)
-        if not outcome.converged and self.snes.ksp.reason < 0 and self._fresh_its:
-            self._stale = True  # the body has changed more than the old coarse spaces can bear
+        if self._linear_failure(outcome):
+            # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
+            self._age, self._keep = Age.WORN, False
             outcome = self._attempt(guess)
-        if not outcome.converged and self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
+            self._keep = True
+        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg":
             # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             outcome = self._attempt(guess)
-            self.snes.ksp.setType(self._krylov_type)
+            self.snes.ksp.setType("cg")
         return outcome
+
+    def damage_changed(self) -> None:
+        """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
+        self._age = max(self._age, Age.DATED)
+
+    def _linear_failure(self, outcome: Outcome) -> bool:
+        return not outcome.converged and self.snes.ksp.reason < 0
 
     def _attempt(self, guess: npt.NDArray[np.float64]) -> Outcome:
         self._x.array_w[:] = guess
@@ -127,13 +146,22 @@ class Solver:
 
     def _assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         self.equations.assemble_tangent(snes, x, A, P)
-        ksp = self.snes.ksp
-        if not self._stale:
+        self._refresh(self.snes.ksp)
+
+    def _refresh(self, ksp: PETSc.KSP) -> None:
+        """Set the preconditioner up if it has aged. Done here, since SNES has no more than a fixed lag."""
+        if self._age == Age.FRESH:
             self._fresh_its = self._fresh_its or ksp.its
-            self._stale = ksp.its > 1.5 * self._fresh_its + 3
-        if self._stale:
-            ksp.pc.reset()  # SNES keeps what there is (see lag above); what is not there is made
-            self._stale, self._fresh_its = False, 0
+            worn = ksp.its > 1.5 * self._fresh_its + 3
+            self._age = Age.WORN if worn else Age.FRESH if self._keep else Age.DATED
+        if self._age == Age.FRESH:
+            return
+        if self._age == Age.WORN:
+            ksp.pc.reset()
+        ksp.pc.setReusePreconditioner(False)
+        ksp.setOperators(self.equations.tangent)
+        ksp.setUp()
+        self._age, self._fresh_its = Age.FRESH, 0
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
@@ -161,11 +189,9 @@ class Solver:
         """Forces at the solution, for the reactions."""
         self.equations.assemble_residual(self.snes, self._x, self.equations.residual)
 
-    def destroy(self) -> None:
-        """Give PETSc's memory and options back (collective)."""
+    def forget_options(self) -> None:
+        """Take this solver's options out of PETSc's database; it must not be used any more."""
         self._options.remove()
-        for held in (self.snes, self._x, self._correction):
-            held.destroy()
 
 
 def _chosen(equations: Equilibrium, given: Options) -> Options:

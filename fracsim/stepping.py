@@ -119,9 +119,9 @@ class Stepper:
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old)
-        broken, released = self._break(state)
-        kinetic, elastic = self._energies(state)
-        sums = total(equations.domain.comm, np.array([work, viscous + released, kinetic, elastic]))
+        broken, released, elastic = self._break(state)
+        kinetic = equations.kinetic_energy(state.v) if equations.scheme.inertia else 0.0
+        sums = total(self.comm, np.array([work, viscous + released, kinetic, elastic]))
         state.work += float(sums[0])
         state.dissipated += float(sums[1])
         self._grow(state)
@@ -141,29 +141,26 @@ class Stepper:
         state.forces, state.drag = forces, drag
         return work, viscous
 
-    def _break(self, state: State) -> tuple[int, float]:
-        if self.fracture is None:
-            return 0, 0.0
+    def _break(self, state: State) -> tuple[int, float, float]:
+        """(edges broken, energy released, elastic energy left) of the step; the energies on this rank, J."""
         began = time.perf_counter()
+        if self.fracture is None:
+            elastic = self.equations.elastic_energy()
+            self.phases["energies"] += time.perf_counter() - began
+            return 0, 0.0, elastic
         result = self.fracture()
         if result.broken:
             self._release(state)
         self.phases["fracture"] += time.perf_counter() - began
-        return result.broken, result.released
+        return result.broken, result.released, result.elastic
 
     def _release(self, state: State) -> None:
         """Reactions after the edges broke: the next step's work starts from them."""
         equations, held = self.equations, self.equations.held
         state.forces[held] -= equations.unbalanced[held]
         self.solver.evaluate_residual()
+        self.solver.damage_changed()
         state.forces[held] += equations.unbalanced[held]
-
-    def _energies(self, state: State) -> tuple[float, float]:
-        began = time.perf_counter()
-        kinetic = self.equations.kinetic_energy(state.v) if self.equations.scheme.inertia else 0.0
-        elastic = self.equations.elastic_energy()
-        self.phases["energies"] += time.perf_counter() - began
-        return kinetic, elastic
 
     def _grow(self, state: State) -> None:
         state.easy += 1

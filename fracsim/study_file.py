@@ -22,6 +22,7 @@ def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
     _anchor(data, path.parent)
     for override in overrides:
         _apply(data, override)
+    _anchor(data, Path())
     return validate(data, str(path))
 
 

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .data import Indices, MeshData, MeshError, Points
-from .topology import Floats, distinct_rows, edges_of, facets_of, oriented, signed_measures
+from .topology import Floats, Mask, distinct_rows, edges_of, facets_of, oriented, signed_measures
 
 SHOWN = 5  # examples in a message
 
@@ -108,7 +108,7 @@ def _check_coordinates(mesh: MeshData) -> None:
 
 
 def _check_flat(mesh: MeshData) -> None:
-    flat = np.flatnonzero(np.abs(signed_measures(mesh.points, mesh.cells)) <= _flatness(mesh.points, mesh.cells))
+    flat = np.flatnonzero(flat_cells(mesh.points, mesh.cells))
     if len(flat):
         measure = "volume" if mesh.dim == 3 else "area"
         raise MeshError(
@@ -117,8 +117,8 @@ def _check_flat(mesh: MeshData) -> None:
         )
 
 
-def _flatness(points: Points, cells: Indices) -> Floats:
-    """The measure [m^d] below which a cell cannot be told from a flat one: (m,).
+def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
+    """Whether each cell's measure cannot be told from zero, or is below a share of its longest edge^d: (m,).
 
     Coordinates x are stored to eps |x|, which moves a node by that much and the measure by up to about
     (d + 1) / (d - 1)! * eps |x| * L^(d - 1), L the longest edge; twice that is taken.
@@ -126,7 +126,8 @@ def _flatness(points: Points, cells: Indices) -> Floats:
     dim = points.shape[1]
     corners = points[cells]
     longest = _longest_edges(points, cells)
-    return 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
+    least = 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
+    return np.abs(signed_measures(points, cells)) <= np.maximum(least, share * longest**dim)
 
 
 def _precision(points: Points) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,16 @@ from .data import Indices, MeshData, MeshError
 from .gmsh_session import session
 
 # Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
-TAG_ARRAYS = ("gmsh:physical", "medit:ref", "cell_tags", "nastran:ref", "netgen:index", "su2:tag", "tetgen:ref")
+TAG_ARRAYS = (
+    "gmsh:physical",
+    "group",
+    "medit:ref",
+    "cell_tags",
+    "nastran:ref",
+    "netgen:index",
+    "su2:tag",
+    "tetgen:ref",
+)
 NOT_TAGS = ("gmsh:geometrical",)
 MOST_TAGS = 1000  # an integer array with more values than this numbers cells; it does not group them
 
@@ -140,8 +150,9 @@ def _meshio_mesh(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _quiet(said: io.StringIO) -> Iterator[None]:
-    """Keep what Python code prints."""
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    """Keep what Python code prints, and drop its warnings (meshio multiplies in 32 bits on every text STL)."""
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         yield
 
 

@@ -16,6 +16,7 @@ from .read import read_contents
 from .topology import Floats, Mask, distinct_rows
 
 JOINED = 1e-6  # points nearer than this share of the body's size are one
+PROBES = 300  # points of a part that are looked up in another part
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ def read_surface(path: str | Path) -> ClosedSurface:
     """A closed surface from STL, OBJ, PLY or another format with triangles or quads.
 
     Raises:
-        MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, or has
-            triangles without an area or points that are no numbers.
+        MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, has
+            triangles without an area or points that are no numbers, or parts that cut each other.
     """
     path = Path(path)
     contents = read_contents(path)
@@ -90,7 +91,7 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
     _check_areas(points, triangles, source)
     _check_closed(points, triangles, source)
     triangles, shell, turned = _consistent(triangles, source)
-    triangles, bodies, inside_out = _outwards(points, triangles, shell)
+    triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
     notes = []
     if turned:
         notes.append(f"{turned} of {len(triangles)} surface triangles faced the other way than the rest; turned.")
@@ -189,10 +190,10 @@ def _flipped(triangles: Indices, which: Mask) -> Indices:
     return np.where(which[:, None], triangles[:, ::-1], triangles)
 
 
-def _outwards(points: Points, triangles: Indices, shell: Indices) -> tuple[Indices, list[list[int]], int]:
+def _outwards(points: Points, triangles: Indices, shell: Indices, source: str) -> tuple[Indices, list[list[int]], int]:
     """Triangles with normals out of the material; for each body its outer shell and its cavities; shells turned."""
     volumes = np.bincount(shell, weights=enclosed_volumes(points, triangles))
-    holders = _holders(points, triangles, shell)
+    holders = _holders(points, triangles, shell, source)
     depth = holders.sum(axis=1)
     wrong = (volumes > 0) != (depth % 2 == 0)
     bodies = [[int(outer), *_cavities(outer, holders, depth)] for outer in np.flatnonzero(depth % 2 == 0)]
@@ -204,19 +205,29 @@ def _cavities(outer: np.int64, holders: Mask, depth: Indices) -> list[int]:
     return [int(shell) for shell in np.flatnonzero(inside)]
 
 
-def _holders(points: Points, triangles: Indices, shell: Indices) -> Mask:
-    """Whether shell i lies inside shell j: (s, s). Shells do not cut one another, so that one point of each tells."""
+def _holders(points: Points, triangles: Indices, shell: Indices, source: str) -> Mask:
+    """Whether shell i lies inside shell j: (s, s). Where only some of its points do, the two cut each other."""
     count = int(shell.max()) + 1
     inside = np.zeros((count, count), bool)
-    if count == 1:
-        return inside
-    probes = points[triangles[np.unique(shell, return_index=True)[1], 0]]
-    for j in range(count):
-        corners = points[triangles[shell == j]]
-        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-        for i in np.flatnonzero(((probes > low) & (probes < high)).all(axis=1)):
-            inside[i, j] = i != j and abs(_winding(probes[i], corners)) > 0.5
+    corners = [points[triangles[shell == j]] for j in range(count)]
+    for i, j in _near(corners):
+        probes = np.unique(corners[i].reshape(-1, 3), axis=0)
+        within = np.array([abs(_winding(p, corners[j])) > 0.5 for p in probes[:: 1 + len(probes) // PROBES]])
+        if within.any() and not within.all():
+            raise MeshError(
+                f"{source} has parts that cut each other, near {_place(points, triangles[shell == i].ravel())}; join "
+                "them into one surface, or move them apart."
+            )
+        inside[i, j] = within.all()
     return inside
+
+
+def _near(corners: list[Floats]) -> list[tuple[int, int]]:
+    """Pairs of different shells whose bounding boxes overlap."""
+    low = np.array([c.min(axis=(0, 1)) for c in corners])
+    high = np.array([c.max(axis=(0, 1)) for c in corners])
+    overlap = (low[:, None] < high[None]).all(axis=2) & (low[None] < high[:, None]).all(axis=2)
+    return [(int(i), int(j)) for i, j in np.argwhere(overlap) if i != j]
 
 
 def _winding(point: Floats, corners: Floats) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
+import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -106,6 +106,10 @@ def fracsim(
     )
 
 
+def mpirun(ranks: int) -> list[str]:
+    """Its own time limit ends the ranks as well, which killing mpirun from outside does not."""
+    return ["mpirun", "--oversubscribe", "--timeout", "50", "-n", str(ranks)]
+
+
 def command(*arguments: str | Path, ranks: int = 0) -> list[str]:
-    mpirun = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
-    return [*mpirun, str(Path(sys.executable).with_name("fracsim")), *map(str, arguments)]
+    return [*(mpirun(ranks) if ranks else []), shutil.which("fracsim") or "fracsim", *map(str, arguments)]

@@ -1,0 +1,246 @@
+"""Seconds per step of fracsim beside the same loop written bare, for boxes of 24k, 192k and 648k tetrahedra.
+
+    python -m fracsim.studies.bench [-o bench.json] [--boxes 10 20 30] [--ranks 1 2]
+
+A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
+steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
+solver options and the same policy for the preconditioner (made once: nothing in the body changes), so that the machine's
+moods hit both. Figures are medians over the steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+STEPS, WARM = 8, 2
+EVENTS = {"residual": "SNESFunctionEval", "tangent": "SNESJacobianEval", "preconditioner": "PCSetUp", "krylov": "KSPSolve"}
+OPTIONS: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
+
+
+def study(n: int) -> dict[str, Any]:
+    """The scene with n cells along a metre: 24 n^3 tetrahedra. It is never stressed enough to break."""
+    return {
+        "title": f"bench {24 * n**3} tetrahedra",
+        "mesh": {"builder": "box", "size": [1.0, 1.0, 4.0], "h": 1 / n},
+        "material": {"energy": "neo-hookean", "young": 1e7, "poisson": 0.35, "density": 1000.0},
+        "fracture": {"strength": 4e6},
+        "boundary": [{"on": "bottom", "fix": "xyz"}, {"on": "top", "velocity": [0.0, 0.0, 1.0]}],
+        "load": {"gravity": [0.0, 0.0, -9.81]},
+        "time": {"step": 5e-3, "end": 1.0},
+        "solver": OPTIONS,
+        "output": {"every": 1000, "picture": False},
+    }
+
+
+# --- one case, run under mpirun -------------------------------------------------------------------------------------
+
+
+def case(n: int, bare: bool) -> dict[str, Any]:
+    """Figures of one box on the ranks of this process (collective)."""
+    import numpy as np
+    from mpi4py import MPI
+    from petsc4py import PETSc
+
+    from ..run import Run, build_scene
+    from ..study_file import validate
+
+    PETSc.Log.begin()
+    comm = MPI.COMM_WORLD
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(build_scene(comm, validate(study(n), "bench")), Path(comm.bcast(folder)))
+        loop = Bare(n, run.scene.domain) if bare else None
+        stage = PETSc.Log.Stage("fracsim")
+        times: dict[str, list[float]] = {name: [] for name in ("step", "bare", "fracture", *EVENTS)}
+        for _ in range(WARM + STEPS):
+            _timed_step(run, stage, times)
+            if loop is not None:
+                times["bare"].append(_timed(comm, loop.step))
+        figures = {name: float(np.median(values[WARM:])) for name, values in times.items() if values}
+        figures["output"] = _timed(comm, run._write_frame)
+        figures["after_fracture"] = _after_fracture(run, stage)
+    memory = comm.allreduce(_peak_memory())
+    return {"tetrahedra": 24 * n**3, "ranks": comm.size, "peak_memory_GiB": memory, **figures}
+
+
+def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
+    from petsc4py import PETSc
+
+    events = {name: PETSc.Log.Event(event) for name, event in EVENTS.items()}
+    before = {name: event.getPerfInfo(stage)["time"] for name, event in events.items()}
+    fracture = run.scene.stepper.phases["fracture"]
+    stage.push()
+    times["step"].append(_timed(run.comm, lambda: _step(run)))
+    stage.pop()
+    for name, event in events.items():
+        times[name].append(event.getPerfInfo(stage)["time"] - before[name])
+    times["fracture"].append(run.scene.stepper.phases["fracture"] - fracture)
+
+
+def _step(run: Any) -> None:
+    """A step as `fracsim run` takes it, without a frame."""
+    report = run.scene.stepper.advance(run.state)
+    run.history.append(run.state, report, run._figures(), run.scene.probes())
+
+
+def _after_fracture(run: Any, stage: Any) -> float:
+    """Median step once every edge is broken."""
+    import numpy as np
+
+    fracture = run.scene.fracture
+    fracture.graph.break_edges(np.ones(len(fracture.graph.broken), bool))
+    run.scene.solver.damage_changed()
+    times: dict[str, list[float]] = {name: [] for name in ("step", "fracture", *EVENTS)}
+    for _ in range(WARM + STEPS):
+        _timed_step(run, stage, times)
+    return float(np.median(times["step"][WARM:]))
+
+
+def _timed(comm: Any, work: Any) -> float:
+    comm.Barrier()
+    began = time.perf_counter()
+    work()
+    comm.Barrier()
+    return time.perf_counter() - began
+
+
+def _peak_memory() -> float:
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+
+
+class Bare:
+    """Assemble, solve, move on: the same scene in DOLFINx and PETSc alone."""
+
+    def __init__(self, n: int, domain: Any) -> None:
+        import numpy as np
+        import ufl
+        from dolfinx import fem
+        from dolfinx.fem import petsc as fem_petsc
+        from petsc4py import PETSc
+
+        from ..forms.balance import internal_work
+        from ..forms.energies import NeoHookean, lame
+        from ..kernels import jit_options
+        from ..solve import MULTIGRID, rigid_body_modes
+
+        scene = study(n)
+        V, mesh = domain.space, domain.mesh
+        self.dt, self.petsc, self.fem_petsc, self.PETSc = scene["time"]["step"], fem_petsc, fem_petsc, PETSc
+        self.u, self.g = fem.Function(V), fem.Function(V)
+        mu, lmbda = lame(1e7, 0.35)
+        energy = NeoHookean(fem.Constant(mesh, mu), fem.Constant(mesh, lmbda))
+        w, dx = ufl.TestFunction(V), ufl.Measure("dx", domain=mesh)
+        residual = internal_work(energy, self.u, w, dx)
+        self.R = fem.form(residual, jit_options=jit_options())
+        self.K = fem.form(ufl.derivative(residual, self.u, ufl.TrialFunction(V)), jit_options=jit_options())
+        vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
+        mass = fem_petsc.assemble_vector(fem.form(1000.0 * ufl.inner(fem.Constant(mesh, np.ones(3)), w) * vertex))
+        mass.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        self.mass = mass.array_r.copy()
+        self.weight = self.mass * np.tile([0.0, 0.0, -9.81], len(self.mass) // 3)
+        bottom, top = (fem.locate_dofs_topological(V, 2, domain.facets[name]) for name in ("bottom", "top"))
+        self.top = top
+        self.bcs = [fem.dirichletbc(self.g, np.sort(np.concatenate([bottom, top])).astype(np.int32))]
+        rows, owned = self.bcs[0].dof_indices()
+        self.held = rows[:owned]
+        self.A, self.b = fem_petsc.create_matrix(self.K), fem_petsc.create_vector(self.R)
+        self.A.setNearNullSpace(rigid_body_modes(domain))
+        self.diagonal, self.du = self.A.createVecLeft(), self.A.createVecLeft()
+        self.ksp = PETSc.KSP().create(mesh.comm)
+        self.ksp.setOptionsPrefix("bare_")
+        options = PETSc.Options()
+        for key, value in (MULTIGRID | {"ksp_type": "cg", "ksp_rtol": 1e-6}).items():
+            options[f"bare_{key}"] = str(value).lower() if isinstance(value, bool) else value
+        self.ksp.setFromOptions()
+        self.ksp.setOperators(self.A)
+        self.t, self.v, self.u_n = 0.0, np.zeros_like(self.mass), np.zeros_like(self.mass)
+
+    def step(self) -> None:
+        """One backward Euler step with one Newton iteration."""
+        PETSc, n = self.PETSc, len(self.mass)
+        self.t += self.dt
+        self.g.x.array.reshape(-1, 3)[self.top, 2] = self.t
+        predicted = self.u_n + self.dt * self.v
+        self.u.x.array[:n] = predicted
+        self.u.x.array[self.held] = self.g.x.array[self.held]
+        self.u.x.scatter_forward()
+        with self.b.localForm() as local:
+            local.set(0.0)
+        self.fem_petsc.assemble_vector(self.b, self.R)
+        self.b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        rows = self.b.array_w
+        rows += self.mass * (self.u.x.array[:n] - predicted) / self.dt**2 - self.weight
+        rows[self.held] = 0.0
+        self.A.zeroEntries()
+        self.fem_petsc.assemble_matrix_mat(self.A, self.K, bcs=self.bcs)
+        self.A.assemble()
+        self.diagonal.array_w[:] = self.mass / self.dt**2
+        self.A.setDiagonal(self.diagonal, PETSc.InsertMode.ADD)
+        self.ksp.solve(self.b, self.du)
+        self.ksp.pc.setReusePreconditioner(True)
+        self.u.x.array[:n] -= self.du.array_r
+        self.u.x.scatter_forward()
+        self.v = (self.u.x.array[:n] - self.u_n) / self.dt
+        self.u_n = self.u.x.array[:n].copy()
+
+
+# --- all cases ------------------------------------------------------------------------------------------------------
+
+
+def launch(n: int, ranks: int, bare: bool) -> dict[str, Any]:
+    """Run one case in processes of its own."""
+    command = ["mpirun", "-n", str(ranks), sys.executable, "-m", "fracsim.studies.bench", "--case", str(n)]
+    output = subprocess.run([*command, *(["--bare"] if bare else [])], check=True, capture_output=True, timeout=1800, text=True)
+    line = next(line for line in output.stdout.splitlines() if line.startswith("{"))
+    result: dict[str, Any] = json.loads(line)
+    return result
+
+
+def table(cases: list[dict[str, Any]]) -> str:
+    """The figures on screen: seconds, then ratios."""
+    parts = ("step", "bare", *EVENTS, "fracture", "output", "after_fracture")
+    lines = [f"{'tets':>8} {'ranks':>5} " + " ".join(f"{part[:9]:>9}" for part in parts) + "  step/bare  pass/step  after/before  GiB"]
+    for row in cases:
+        seconds = " ".join(f"{row[part]:9.4f}" for part in parts)
+        ratios = f"{row['step'] / row['bare']:9.3f} {row['fracture'] / row['step']:10.3f} {row['after_fracture'] / row['step']:13.3f}"
+        lines.append(f"{row['tetrahedra']:8d} {row['ranks']:5d} {seconds} {ratios} {row['peak_memory_GiB']:5.2f}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/bench.json"))
+    parser.add_argument("--boxes", type=int, nargs="+", default=[10, 20, 30])
+    parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--case", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--bare", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.case is not None:
+        from mpi4py import MPI
+
+        figures = case(given.case, given.bare)
+        if MPI.COMM_WORLD.rank == 0:
+            print(json.dumps(figures), flush=True)
+        return
+    cases = []
+    for n in given.boxes:
+        for ranks in given.ranks:
+            row = launch(n, ranks, bare=True)
+            row["peak_memory_GiB"] = launch(n, ranks, bare=False)["peak_memory_GiB"]  # of the program alone
+            cases.append(row)
+            print(table([row]), flush=True)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(json.dumps(cases, indent=2) + "\n")
+    print(f"\nseconds per step, medians of {STEPS} steps (table in {given.out})\n{table(cases)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""The command line as a user meets it: commands, exit codes, and what each command imports."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import meshio
+import pytest
+from cases import BAR, STRIP, fracsim, mpirun, study, write_study
+
+import fracsim as package
+from fracsim import cli
+from fracsim.check import check_study
+from fracsim.errors import Exit
+
+HEAVY = ("dolfinx", "gmsh", "petsc4py", "mpi4py", "pyvista", "meshio", "ufl", "basix", "h5py", "matplotlib")
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """Exit code of the command line, called in this process."""
+    monkeypatch.setattr(sys, "argv", ["fracsim", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+# --- check ----------------------------------------------------------------------------------------------------------
+
+
+def test_check_imports_nothing_heavy_and_is_quick() -> None:
+    code = (
+        "import sys; sys.argv = ['fracsim', 'check', 'loaf']\n"
+        "from fracsim.cli import main\n"
+        "try: main()\n"
+        "finally: print('heavy:', [name for name in %r if name in sys.modules])" % (HEAVY,)
+    )
+    began = time.monotonic()
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert time.monotonic() - began < 2
+    assert result.stdout.splitlines()[-1] == "heavy: []"
+    assert "mesh        loaf: 3D, about" in result.stdout
+
+
+def test_check_tells_what_is_built_and_what_is_not() -> None:
+    lines = check_study(study(BAR))
+    assert lines[0] == "mesh        box: 3D, about 24 cells; groups left, right, front, back, bottom, top"
+    assert "fracture    off: no damage field, no graph, no average" in lines
+    assert "damping     off" in lines
+    assert "time        backward-euler, 3 steps of 0.01 s, halved where a step fails" in lines
+    assert "probes      grip (reaction)" in lines
+
+
+def test_check_tells_of_fracture() -> None:
+    lines = check_study(study(STRIP, fracture={"radius": 0.1}))
+    assert "fracture    degraded energy (chi), strength 20000 Pa, average over 0.1 m (linear)" in lines
+    assert "material    neo-hookean, plane strain" in lines
+
+
+# --- a scene costs only what it uses --------------------------------------------------------------------------------
+
+
+def test_a_scene_without_fracture_builds_none_of_it(tmp_path: Path) -> None:
+    bar = write_study(tmp_path / "bar.toml", BAR)
+    code = f"""
+import sys
+from pathlib import Path
+from mpi4py import MPI
+from fracsim.study_file import load_study
+from fracsim.run import Run, build_scene
+scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
+Run(scene, Path({str(tmp_path / "out")!r}))()
+parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")
+print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.splitlines()[-1] == "None None []"
+
+
+# --- mesh, list, render ---------------------------------------------------------------------------------------------
+
+
+def test_mesh_saves_a_mesh_that_a_study_can_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bar, saved = write_study(tmp_path / "bar.toml", BAR), tmp_path / "new" / "bar.msh"
+    assert called(monkeypatch, "mesh", bar, "-o", saved) == Exit.DONE
+    said = capsys.readouterr().out
+    assert "cells                    24" in said and f"saved in {saved}" in said
+    lines = check_study(study({**BAR, "mesh": {"file": str(saved)}}))
+    assert lines[0].endswith("3D, 24 cells, 20 nodes, 1 body; groups left, right, front, back, bottom, top")
+
+
+def test_mesh_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    strip = write_study(tmp_path / "strip.toml", STRIP)
+    assert called(monkeypatch, "mesh", strip, "-o", tmp_path / "strip.vtu") == Exit.DONE
+    assert len(meshio.read(tmp_path / "strip.vtu").cells_dict["triangle"]) == 32
+    assert called(monkeypatch, "mesh", strip, "-o", tmp_path / "strip.odd") == Exit.BAD_INPUT
+    error = capsys.readouterr().err
+    assert error.startswith(f"fracsim: --out: cannot save the mesh as {tmp_path / 'strip.odd'}") and error.count("\n") == 1
+
+
+def test_list(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(monkeypatch, "list") == Exit.DONE
+    said = capsys.readouterr().out
+    for word in ("studies", "loaf", "builders", "notched-bar", "energies", "neo-hookean", "schemes", "quasi-static"):
+        assert word in said
+
+
+def test_render_needs_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(monkeypatch, "render", tmp_path) == Exit.BAD_INPUT
+    assert capsys.readouterr().err == f"fracsim: {tmp_path} has no fields.h5: it is not the output folder of a run\n"
+
+
+# --- usage ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["frobnicate"], "No such command 'frobnicate'"),
+        (["run"], "Missing argument 'STUDY.toml'"),
+        (["run", "loaf", "--frob"], "No such option: --frob"),
+        (["run", "loaf", "--wall-limit", "soon"], "Invalid value for '--wall-limit'"),
+        (["run", "loaf", "--wall-limit", "-5"], "Invalid value for '--wall-limit'"),
+        (["check", "loaf", "more"], "Got unexpected extra argument (more)"),
+        (["check", "loaf", "--set"], "Option '--set' requires an argument"),
+        (["mesh", "loaf"], "Missing option '-o' / '--out'"),
+        (["check", "nope.toml"], "there is no study file nope.toml"),
+    ],
+)
+def test_bad_usage(
+    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(monkeypatch, *arguments) == Exit.BAD_INPUT
+    error = capsys.readouterr().err
+    assert error.startswith("fracsim: ") and message in error and error.count("\n") == 1
+
+
+def test_help_and_no_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert called(monkeypatch, "--help") == Exit.DONE
+    first = capsys.readouterr().out
+    assert called(monkeypatch) == Exit.BAD_INPUT
+    assert capsys.readouterr().out == first
+    for command in ("run", "check", "mesh", "render", "list"):
+        assert f"  {command} " in first
+
+
+def test_interrupted_before_the_first_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "find_study", interrupt)
+    assert called(monkeypatch, "check", "loaf") == 130
+    assert capsys.readouterr().err.strip() == "fracsim: interrupted before the first step; nothing was written"
+
+
+# --- faults of the program ------------------------------------------------------------------------------------------
+
+
+def test_a_fault_on_one_rank_ends_all(tmp_path: Path) -> None:
+    """Rank 1 fails inside the first step while rank 0 waits for it in a reduction."""
+    bar = write_study(tmp_path / "bar.toml", BAR)
+    script = tmp_path / "faulty.py"
+    script.write_text(f"""
+import sys
+from mpi4py import MPI
+from fracsim.solve import Solver
+solve = Solver.solve
+def faulty(self, guess):
+    if MPI.COMM_WORLD.rank == 1:
+        raise ZeroDivisionError("a fault of rank 1")
+    return solve(self, guess)
+Solver.solve = faulty
+sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]
+from fracsim.cli import main
+main()
+""")
+    began = time.monotonic()
+    result = subprocess.run([*mpirun(2), sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode not in (0, 2, 3, 4)
+    assert "ZeroDivisionError: a fault of rank 1" in result.stderr
+    assert time.monotonic() - began < 30
+
+
+def test_every_command_works_under_mpirun(tmp_path: Path) -> None:
+    """Commands that need no parallel work are done by one rank, and say so once."""
+    result = fracsim("check", "loaf", ranks=2)
+    assert result.returncode == 0 and result.stdout.count("mesh        loaf") == 1
+    strip = write_study(tmp_path / "strip.toml", STRIP)
+    result = fracsim("run", strip, "-o", tmp_path / "out", "--set", "time.end=0.01", ranks=2)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("Results in") == 1 and "2 steps to t = 0.01 s" in result.stdout
+
+
+def test_the_package_is_light() -> None:
+    assert package.__version__
+    code = "import sys, fracsim.cli; print([name for name in %r if name in sys.modules])" % ((*HEAVY, "numpy", "pydantic"),)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.strip() == "[]"

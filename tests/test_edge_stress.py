@@ -1,0 +1,122 @@
+"""Stress along edges against the matrix T of M22 (with the factor 2 on shear) written out and inverted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fracsim.edge_stress import barycentric_gradients, carried_by, edge_vectors, normal_stress
+from fracsim.graph import local_edges
+from hypothesis import given
+from hypothesis import strategies as st
+from support.laws import Tensor, rotation
+
+EPS = np.finfo(float).eps
+DIMS = (2, 3)
+
+
+def simplex(dim: int, seed: int) -> Tensor:
+    """Corners of a random simplex that is not too flat: the unit simplex under a well-conditioned map."""
+    random = np.random.default_rng(seed)
+    unit = np.vstack([np.zeros(dim), np.eye(dim)])
+    F = rotation(dim, seed) @ np.diag(random.uniform(0.3, 3, dim)) @ rotation(dim, seed + 1)
+    return unit @ F.T + random.uniform(-5, 5, dim)
+
+
+def stress_components(dim: int, seed: int) -> Tensor:
+    """Random symmetric tensor: xx, yy, xy or xx, yy, zz, xy, xz, yz."""
+    return np.random.default_rng(seed).uniform(-1, 1, 3 if dim == 2 else 6)
+
+
+def as_matrix(components: Tensor) -> Tensor:
+    """The tensor of its components."""
+    if len(components) == 3:
+        xx, yy, xy = components
+        return np.array([[xx, xy], [xy, yy]])
+    xx, yy, zz, xy, xz, yz = components
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def T_stress(corners: Tensor) -> Tensor:
+    """Rows turn stress components into normal stress along one edge: n_i^2 on normal, 2 n_i n_j on shear components."""
+    rows = []
+    for i, j in local_edges(corners.shape[1]):
+        n = (corners[j] - corners[i]) / np.linalg.norm(corners[j] - corners[i])
+        if len(n) == 2:
+            rows.append([n[0] ** 2, n[1] ** 2, 2 * n[0] * n[1]])
+        else:
+            rows.append([*(n**2), 2 * n[0] * n[1], 2 * n[0] * n[2], 2 * n[1] * n[2]])
+    return np.array(rows)
+
+
+def flags_of(patterns: Tensor, edges: int) -> Tensor:
+    """(patterns, edges) which edges are intact."""
+    return (patterns[:, None] >> np.arange(edges)) & 1 == 0
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@given(seed=st.integers(0, 10**6))
+def test_normal_stress_is_n_sigma_n(dim: int, seed: int) -> None:
+    """n . sigma . n by matrix products, edge by edge."""
+    corners, components = simplex(dim, seed), stress_components(dim, seed)
+    found = normal_stress(components[None], edge_vectors(corners[None]))[0]
+    sigma = as_matrix(components)
+    for (i, j), value in zip(local_edges(dim), found, strict=True):
+        n = (corners[j] - corners[i]) / np.linalg.norm(corners[j] - corners[i])
+        assert value == pytest.approx(n @ sigma @ n, abs=20 * EPS)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@given(seed=st.integers(0, 10**6))
+def test_carried_stress_is_the_dense_projection(dim: int, seed: int) -> None:
+    """T^-1 diag(integrity) T sigma for all 8 or 64 patterns; round-off grows with the condition of T."""
+    corners, components = simplex(dim, seed), stress_components(dim, seed)
+    T = T_stress(corners)
+    intact = flags_of(np.arange(1 << len(T)), len(T))
+    n = len(intact)
+    found = carried_by(np.tile(components, (n, 1)), np.tile(corners, (n, 1, 1)), intact)
+    expected = np.array([np.linalg.solve(T, np.where(flags, T @ components, 0.0)) for flags in intact])
+    np.testing.assert_allclose(found, expected, atol=100 * EPS * np.linalg.cond(T))
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@given(seed=st.integers(0, 10**6), pattern=st.integers(0, 63))
+def test_intact_edges_keep_their_stress(dim: int, seed: int, pattern: int) -> None:
+    """Along an intact edge the carried stress is the full one, along a broken edge it is zero (METHOD section 3)."""
+    corners, components = simplex(dim, seed)[None], stress_components(dim, seed)[None]
+    intact = flags_of(np.array([pattern]), len(local_edges(dim)))
+    vectors = edge_vectors(corners)
+    kept = normal_stress(carried_by(components, corners, intact), vectors)
+    expected = np.where(intact, normal_stress(components, vectors), 0.0)
+    np.testing.assert_allclose(kept, expected, atol=100 * EPS * np.linalg.cond(T_stress(corners[0])))
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_edge_stress_turns_with_the_body(dim: int) -> None:
+    """n . sigma . n does not change where edge and stress are turned together."""
+    corners, components, Q = simplex(dim, 3), stress_components(dim, 3), rotation(dim, 5)
+    turned = Q @ as_matrix(components) @ Q.T
+    upper = ((0, 0), (1, 1), (0, 1)) if dim == 2 else ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    after = normal_stress(np.array([[turned[i, j] for i, j in upper]]), edge_vectors((corners @ Q.T)[None]))
+    np.testing.assert_allclose(after, normal_stress(components[None], edge_vectors(corners[None])), atol=50 * EPS)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_barycentric_gradients(dim: int) -> None:
+    """They sum to zero and their coordinates are 1 at the own corner and 0 at the others."""
+    corners = simplex(dim, 11)
+    gradients = barycentric_gradients(corners[None])[0]
+    np.testing.assert_allclose(gradients.sum(axis=0), 0, atol=50 * EPS)
+    values = (corners[:, None] - corners[None]) @ gradients.T  # lambda_k(x_i) - lambda_k(x_j)
+    identity = np.eye(dim + 1)
+    np.testing.assert_allclose(values, identity[:, None] - identity[None], atol=100 * EPS)
+
+
+def test_flat_cells_carry_nothing() -> None:
+    """A collapsed cell has no T^-1: it carries no stress, and its neighbours in the array are not disturbed."""
+    good = simplex(3, 1)
+    flat = good.copy()
+    flat[3] = flat[:3].mean(axis=0)
+    corners, components = np.array([good, flat]), np.tile(stress_components(3, 1), (2, 1))
+    found = carried_by(components, corners, np.ones((2, 6), bool))
+    np.testing.assert_allclose(found[0], components[0], atol=1000 * EPS)
+    assert not found[1].any()

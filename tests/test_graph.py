@@ -1,0 +1,102 @@
+"""Cells as small graphs: what each pattern of broken edges means, and damage that never heals."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from fracsim.graph import EdgeGraph, is_split, local_edges, node_groups
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from support.scenes import make_scene
+
+DIMS = (2, 3)
+
+
+def intact_edges(dim: int, pattern: int) -> list[tuple[int, int]]:
+    """Local edges of a pattern that are not broken."""
+    return [(int(i), int(j)) for bit, (i, j) in enumerate(local_edges(dim)) if not pattern >> bit & 1]
+
+
+def groups(dim: int, pattern: int) -> npt.NDArray[np.integer]:
+    """Connected components of the nodes by SciPy."""
+    edges = np.array(intact_edges(dim, pattern)).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(dim + 1, dim + 1))
+    return connected_components(graph, directed=False)[1]
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_local_edges_are_all_pairs_of_nodes(dim: int) -> None:
+    """A simplex joins every two of its nodes."""
+    assert {tuple(sorted(edge)) for edge in local_edges(dim).tolist()} == set(combinations(range(dim + 1), 2))
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_groups_of_every_pattern(dim: int) -> None:
+    """Each node is named after the lowest node of its connected component, for all 8 or 64 patterns."""
+    for pattern, found in enumerate(node_groups(dim)):
+        label = groups(dim, pattern)
+        expected = [np.flatnonzero(label == own)[0] for own in label]
+        assert found.tolist() == expected
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_split_means_not_connected(dim: int) -> None:
+    """A cell is split where its intact edges leave more than one component."""
+    expected = [groups(dim, pattern).max() > 0 for pattern in range(len(is_split(dim)))]
+    assert is_split(dim).tolist() == expected
+
+
+def test_triangles_split_with_two_broken_edges() -> None:
+    """METHOD section 4: 2D, two broken edges."""
+    assert is_split(2).tolist() == [pattern.bit_count() >= 2 for pattern in range(8)]
+
+
+def test_tetrahedra_split_around_a_node_or_between_pairs() -> None:
+    """METHOD section 4: a node with all three edges broken, or two pairs of nodes with all four edges between them."""
+    for pattern in range(64):
+        intact = {frozenset(edge) for edge in intact_edges(3, pattern)}
+        lonely = any(not any(node in edge for edge in intact) for node in range(4))
+        pairs = [({0, i}, {1, 2, 3} - {i}) for i in (1, 2, 3)]
+        parted = any(all(frozenset((a, b)) not in intact for a in one for b in other) for one, other in pairs)
+        assert is_split(3)[pattern] == (lonely or parted)
+    assert is_split(3).sum() == 26  # 64 patterns less the 38 connected graphs on four labelled nodes
+
+
+@pytest.fixture(scope="module")
+def graph() -> EdgeGraph:
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1, 1, 1], "h": 0.5}, fracture={"strength": 1.0})
+    return scene.fracture.graph
+
+
+def test_edges_of_the_mesh(graph: EdgeGraph) -> None:
+    """Kuhn's lattice of n^3 cubes: 3 n (n+1)^2 axis edges, 3 n^2 (n+1) face and n^3 body diagonals."""
+    n = 2
+    assert graph.edge_count == 3 * n * (n + 1) ** 2 + 3 * n**2 * (n + 1) + n**3
+    ends = graph.edge_nodes[graph.cell_edges]
+    expected = graph.cell_nodes[:, local_edges(3)]
+    assert np.array_equal(np.sort(ends, axis=2), np.sort(expected, axis=2))
+
+
+def test_damage_only_grows(graph: EdgeGraph) -> None:
+    """Breaking counts what is new, never heals, and every cell's pattern says which of its edges are broken."""
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        before, flags = graph.broken.copy(), random.random(len(graph.broken)) < 0.1
+        count = graph.break_edges(flags)
+        assert count == np.count_nonzero(flags & ~before)
+        assert np.array_equal(graph.broken, before | flags)
+        bits = graph.broken[graph.cell_edges] @ (1 << np.arange(6))
+        assert np.array_equal(graph.pattern, bits)
+    assert graph.broken_count == np.count_nonzero(graph.broken)
+    assert graph.break_edges(np.zeros(len(graph.broken), bool)) == 0
+
+
+def test_keys_name_edges(graph: EdgeGraph) -> None:
+    """Edges found again from their pairs of input nodes."""
+    keys = graph.broken_keys()
+    assert keys is not None
+    assert np.array_equal(graph.flags_of_keys(keys), graph.broken)
+    assert np.all(keys[:, 0] < keys[:, 1])

@@ -1,0 +1,218 @@
+"""Closed surfaces filled with tetrahedra: volumes, sharp edges, bodies and cavities; and surfaces that are no body."""
+
+from __future__ import annotations
+
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fracsim.meshes import BUILDERS, MeshError
+from fracsim.meshes.data import Indices, Points
+from fracsim.meshes.fill import fill_surface
+from fracsim.meshes.quality import mesh_quality
+from fracsim.meshes.surface import closed_surface
+from fracsim.meshes.topology import boundary_facets, signed_measures
+
+meshio = pytest.importorskip("meshio")
+
+Shell = tuple[Points, Indices]
+
+
+def skin(name: str, **parameters: object) -> Shell:
+    """The boundary of a builder's mesh, without its inner nodes."""
+    mesh = BUILDERS[name](**parameters).build()
+    used, triangles = np.unique(boundary_facets(mesh.cells), return_inverse=True)
+    return mesh.points[used], triangles.reshape(-1, 3)
+
+
+def cube(size: float = 1.0, at: float = 0.0) -> Shell:
+    """Twelve triangles, normals outwards, around the point (at, at, at)."""
+    return skin("box", size=(size,) * 3, origin=(at - size / 2,) * 3, h=size)
+
+
+def torus(ring: float = 0.5, tube: float = 0.2, around: int = 48, across: int = 20) -> Shell:
+    """A torus as a polyhedron: its volume is below 2 pi^2 ring tube^2."""
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    u, v = 2 * pi * i / around, 2 * pi * j / across
+    reach = ring + tube * np.cos(v)
+    points = np.stack([reach * np.cos(u), reach * np.sin(u), tube * np.sin(v)], axis=-1).reshape(-1, 3)
+    a, b = i * across + j, (i + 1) % around * across + j
+    c, d = (i + 1) % around * across + (j + 1) % across, i * across + (j + 1) % across
+    return points, np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+
+
+def save(path: Path, *shells: Shell) -> Path:
+    starts = np.cumsum([0] + [len(points) for points, _ in shells])
+    triangles = np.concatenate([t + start for (_, t), start in zip(shells, starts, strict=False)])
+    meshio.Mesh(np.concatenate([p for p, _ in shells]), [("triangle", triangles)]).write(path)
+    return path
+
+
+def volume(shell: Shell) -> float:
+    return float(np.linalg.det(shell[0][shell[1]]).sum() / 6)
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "off", "vtk"])
+def test_cube_from_every_format(tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]) -> None:
+    path = save(tmp_path / f"cube.{ending}", cube())
+    capfd.readouterr()
+    mesh = fill_surface(path, h=0.25)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1.0, rel=1e-6)
+    assert mesh.notes == ()
+    assert mesh_quality(mesh)["edge_median"] == pytest.approx(0.25, rel=0.1)
+    assert len(mesh.facet_groups["surface"]) == len(boundary_facets(mesh.cells))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_quads_are_cut(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for y in (0, 1) for x in (0, 1))
+    quads = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"]
+    (tmp_path / "cube.obj").write_text(corners + "".join(f"f {quad}\n" for quad in quads))
+    mesh = fill_surface(tmp_path / "cube.obj", h=0.4)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "shell", "h"),
+    [
+        ("cylinder", skin("cylinder", radius=0.3, length=1.0, h=0.1), 0.1),
+        ("loaf", skin("loaf", h=0.015), 0.015),
+        ("notched-bar", skin("notched-bar", h=0.002, h_notch=0.001, span=0.0), 0.001),
+        ("torus", torus(), 0.1),
+    ],
+)
+def test_volume_is_that_of_the_surface(tmp_path: Path, name: str, shell: Shell, h: float) -> None:
+    """Meshed anew, a round surface of radius R loses a share of about h^2 / (4 R^2): 6 % of the torus's tube."""
+    mesh = fill_surface(save(tmp_path / f"{name}.stl", shell), h)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(volume(shell), rel=0.06)
+    assert mesh_quality(mesh)["edge_median"] == pytest.approx(h, rel=0.15)
+
+
+def test_sharp_edges_are_kept(tmp_path: Path) -> None:
+    """A notched bar is flat but for its root: its volume is kept to a share far below (h / height)^2."""
+    shell = skin("notched-bar", notch="slit", notch_width=0.001, h=0.002, span=0.0)
+    mesh = fill_surface(save(tmp_path / "bar.stl", shell), h=0.001)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(volume(shell), rel=1e-6)
+
+
+def test_two_bodies(tmp_path: Path) -> None:
+    mesh = fill_surface(save(tmp_path / "two.stl", cube(), cube(0.5, at=2.0)), h=0.25)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1.125, rel=1e-6)
+    assert mesh.notes == ("The surface encloses 2 separate bodies; each needs its own supports.",)
+
+
+@pytest.mark.parametrize("inwards", [True, False])
+def test_cavity(tmp_path: Path, inwards: bool) -> None:
+    points, triangles = cube(0.5)
+    mesh = fill_surface(
+        save(tmp_path / "hollow.stl", cube(), (points, triangles[:, ::-1] if inwards else triangles)), 0.2
+    )
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1 - 0.125, rel=1e-6)
+    assert "1 closed parts of the surface lie inside another and are taken as cavities." in mesh.notes
+
+
+def test_body_inside_a_cavity(tmp_path: Path) -> None:
+    mesh = fill_surface(save(tmp_path / "nut.stl", cube(), cube(0.7), cube(0.3)), h=0.15)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1 - 0.343 + 0.027, rel=1e-6)
+
+
+def test_inside_out_and_mixed_triangles_are_turned() -> None:
+    points, triangles = cube()
+    turned = closed_surface(points, triangles[:, ::-1], "S")
+    assert turned.volume == pytest.approx(1.0) and turned.notes == (
+        "1 parts of the surface were inside out and have been turned.",
+    )
+    triangles = triangles.copy()
+    triangles[[2, 7]] = triangles[[2, 7], ::-1]
+    mixed = closed_surface(points, triangles, "S")
+    assert mixed.volume == pytest.approx(1.0)
+    assert mixed.notes == ("2 of 12 surface triangles faced the other way than the rest; turned.",)
+
+
+def test_points_that_nearly_coincide_are_joined() -> None:
+    points, triangles = cube()
+    apart = points[triangles].reshape(-1, 3)
+    apart = apart + 1e-8 * np.random.default_rng(0).standard_normal(apart.shape)
+    surface = closed_surface(apart, np.arange(36).reshape(-1, 3), "S")
+    assert len(surface.points) == 8 and surface.volume == pytest.approx(1.0)
+
+
+def test_open_surface_tells_where(tmp_path: Path) -> None:
+    points, triangles = cube()
+    with pytest.raises(MeshError, match=r"open.stl' is open: 3 edges belong to one triangle only, the first at \("):
+        fill_surface(save(tmp_path / "open.stl", (points, triangles[1:])), 0.2)
+
+
+def test_surface_that_branches_is_refused() -> None:
+    points, triangles = cube()
+    points = np.concatenate([points, [[3.0, 3, 3]]])
+    a, b = triangles[0, :2]
+    fin = np.array([[a, b, 8], [b, a, 8]])
+    with pytest.raises(MeshError, match="S is not the surface of a body: 1 edges belong to more than two triangles"):
+        closed_surface(points, np.concatenate([triangles, fin]), "S")
+
+
+def test_klein_bottle_is_refused() -> None:
+    """A square whose sides are joined, one pair of them reversed: closed, but with one side only."""
+    n = 6
+    number = np.arange(n * n).reshape(n, n)
+    corner = lambda i, j: number[i % n, (j if i < n else -j) % n]  # noqa: E731
+    squares = [
+        (corner(i, j), corner(i + 1, j), corner(i + 1, j + 1), corner(i, j + 1)) for i in range(n) for j in range(n)
+    ]
+    triangles = np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))])
+    points = np.random.default_rng(1).random((n * n, 3))
+    with pytest.raises(MeshError, match="S has one side only"):
+        closed_surface(points, triangles, "S")
+
+
+def test_points_that_are_no_numbers_are_named() -> None:
+    points, triangles = cube()
+    points[3, 0] = np.nan
+    with pytest.raises(MeshError, match="S has 1 points that are not finite numbers, the first is point 3"):
+        closed_surface(points, triangles, "S")
+
+
+def test_flat_triangle_is_named() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 1]])
+    with pytest.raises(MeshError, match="S has 1 triangles without an area"):
+        closed_surface(points, np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [0, 2, 3]]), "S")
+
+
+def test_coarse_size_keeps_the_surface_and_says_so(tmp_path: Path) -> None:
+    """At h of half the tube a torus would lose its shape."""
+    shell = torus(around=24, across=10)
+    mesh = fill_surface(save(tmp_path / "torus.stl", shell), h=0.35)
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(volume(shell), rel=1e-5)
+    assert "keeps its own 480 triangles" in mesh.notes[0]
+
+
+def test_surface_that_cuts_itself_is_refused(tmp_path: Path) -> None:
+    """One corner of a cube is pulled out through the opposite face."""
+    points, triangles = cube()
+    corner = int(np.argmax(points.sum(axis=1)))
+    points = points.copy()
+    points[corner] = [-0.6, 0.2, 0.1]
+    with pytest.raises(MeshError, match=r"Surface file '.*fold.stl'"):
+        fill_surface(save(tmp_path / "fold.stl", (points, triangles)), 0.3)
+
+
+def test_bodies_that_cut_each_other_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"cross.stl' has parts that cut each other, near"):
+        fill_surface(save(tmp_path / "cross.stl", cube(), cube(at=0.4)), h=0.3)
+
+
+def test_size_must_be_sensible(tmp_path: Path) -> None:
+    path = save(tmp_path / "cube.stl", cube())
+    with pytest.raises(MeshError, match="h = 0 must be a positive number"):
+        fill_surface(path, 0)
+    with pytest.raises(MeshError, match=r"h = 0.0001 m would make about"):
+        fill_surface(path, 0.0001)
+
+
+def test_volume_mesh_is_no_surface(tmp_path: Path) -> None:
+    mesh = BUILDERS["box"](h=0.25).build()
+    meshio.Mesh(mesh.points, [("tetra", mesh.cells)]).write(tmp_path / "solid.vtu")
+    with pytest.raises(MeshError, match="holds no triangles in space"):
+        fill_surface(tmp_path / "solid.vtu", 0.1)
