@@ -52,6 +52,8 @@ class Equilibrium:
         self.chi = self._degradation(study)
         self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
         self.damping = study.damping
+        self.u_n: Any = None
+        self.u_v: Any = None
         self.motion = Motion(domain, study.boundary)
         density = _coefficient(domain, material.density)
         self.forces = Forces(domain, study, density)
@@ -78,8 +80,14 @@ class Equilibrium:
         residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
         self._internal_form = compile_form(residual)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
-        residual = residual + self._viscous(w, dx, chi) + self._pressure(w)
+        viscous, pressure = self._viscous(w, dx, chi), self._pressure(w)
+        self._viscous_form = compile_form(viscous) if viscous else None
+        self._pressure_form = compile_form(pressure) if pressure else None
+        residual = residual + viscous + pressure
         self._residual = compile_form(residual)
+        near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
+        at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
+        self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
         self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
         self._dead = self._dead_loads(w, dx)
         vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
@@ -95,23 +103,19 @@ class Equilibrium:
         return RESIDUAL_STIFFNESS + (1 - RESIDUAL_STIFFNESS) * self.chi
 
     def _viscous(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form | int:
-        """Stiffness-proportional damping; the start of the step and c_v become coefficients."""
-        self.u_n = self.u_v = None
-        self._viscous_form = None
+        """Stiffness-proportional damping; the start of the step and c_v are coefficients that `begin` moves."""
         if self.damping is None or self.damping.stiffness == 0:
             return 0
-        space = self.domain.space
-        self.u_n, self.u_v = fem.Function(space), fem.Function(space)
-        self._c_v = fem.Constant(self.domain.mesh, 0.0)
+        if self.u_n is None:
+            space = self.domain.space
+            self.u_n, self.u_v = fem.Function(space), fem.Function(space)
+            self._c_v = fem.Constant(self.domain.mesh, 0.0)
         rate = self._c_v * (self.u - self.u_v)
-        form = viscous_work(self.material.energy, rate, self.u_n, w, dx, b=self.damping.stiffness, chi=chi)
-        self._viscous_form = compile_form(form)
-        return form
+        return viscous_work(self.material.energy, rate, self.u_n, w, dx, b=self.damping.stiffness, chi=chi)
 
     def _pressure(self, w: Any) -> ufl.Form | int:
         normal, linear = ufl.FacetNormal(self.domain.mesh), self.material.energy.linear
         terms = [pressure_work(p, self.u, w, normal, ds, linear=linear) for p, ds in self.forces.pressures]
-        self._pressure_form = compile_form(-sum(terms)) if terms else None
         return -sum(terms) if terms else 0
 
     def _dead_loads(self, w: Any, dx: ufl.Measure) -> fem.Form | None:
@@ -139,11 +143,14 @@ class Equilibrium:
 
     def _assembled(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled linear form."""
-        with self._work.localForm() as local:
+        return self._assemble_into(self._work, form).array_r.copy()
+
+    def _assemble_into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+        with b.localForm() as local:
             local.set(0.0)
-        fem_petsc.assemble_vector(self._work, form)
-        self._work.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
-        return self._work.array_r.copy()
+        fem_petsc.assemble_vector(b, form)
+        b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        return b
 
     # --- a step ---
 
@@ -191,8 +198,7 @@ class Equilibrium:
         the Krylov solve.
         """
         self.load_displacement(x)
-        self._assemble_internal(b)
-        b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        self._assemble_into(b, self._residual)
         self._add_inertia(b)
         np.copyto(self.unbalanced, b.array_r)
         b.array_w[self.held] = 0.0
@@ -204,16 +210,13 @@ class Equilibrium:
         otherwise take all of it and may turn inside out.
         """
         self.load_displacement(x, hold=False)
-        self._assemble_internal(b)
+        with b.localForm() as local:
+            local.set(0.0)
+        fem_petsc.assemble_vector(b, self._residual)
         fem_petsc.apply_lifting(b, [self._tangent], [self.bcs], x0=[self.u.x.petsc_vec], alpha=-1.0)
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         self._add_inertia(b)
         b.array_w[self.held] = 0.0
-
-    def _assemble_internal(self, b: PETSc.Vec) -> None:
-        with b.localForm() as local:
-            local.set(0.0)
-        fem_petsc.assemble_vector(b, self._residual)
 
     def largest_gap(self, u: Values) -> float:
         """Farthest that a prescribed dof of the owned values `u` is from its value, in mean edge lengths."""
@@ -221,6 +224,18 @@ class Equilibrium:
             return 0.0
         gap = np.max(np.abs(u[self.held] - self._prescribed.x.array[self.held]), initial=0.0)
         return float(self.domain.comm.allreduce(gap, op=MPI.MAX)) / self.domain.mean_edge
+
+    def update_reactions(self) -> None:
+        """Refresh `unbalanced` on prescribed dofs alone: a residual over the few cells that touch them."""
+        self._assemble_into(self._work, self._reactions)
+        self._add_inertia(self._work)
+        self.unbalanced[self.held] = self._work.array_r[self.held]
+
+    def _cells_at_supports(self) -> npt.NDArray[np.int32]:
+        """Owned cells with a prescribed dof."""
+        touched = np.zeros(len(self.domain.nodes), bool)
+        touched[self.motion.dofs // self.domain.dim] = True
+        return np.flatnonzero(touched[self.domain.cell_nodes].any(axis=1)).astype(np.int32)
 
     def _add_inertia(self, b: PETSc.Vec) -> None:
         c_mass, c_drag = self._inertia

@@ -126,10 +126,9 @@ class Solver:
         extended = self._extend() if self.equations.largest_gap(guess) > LARGE_GAP else 0
         self.snes.solve(None, self._x)
         snes, reason = self.snes, self.snes.reason
-        if reason > 0 and self._single:
-            self.evaluate_residual()
-        else:
-            self.equations.load_displacement(self._x)
+        self.equations.load_displacement(self._x)
+        if reason > 0 and self._single:  # Newton's method has evaluated them for its test
+            self.equations.update_reactions()
         krylov = snes.getLinearSolveIterations() + extended
         return Outcome(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
 
@@ -184,10 +183,6 @@ class Solver:
         if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
             return int(reason.CONVERGED_FNORM_RELATIVE)
         return int(reason.ITERATING)
-
-    def evaluate_residual(self) -> None:
-        """Forces at the solution, for the reactions."""
-        self.equations.assemble_residual(self.snes, self._x, self.equations.residual)
 
     def forget_options(self) -> None:
         """Take this solver's options out of PETSc's database; it must not be used any more."""

@@ -158,7 +158,7 @@ class Stepper:
         """Reactions after the edges broke: the next step's work starts from them."""
         equations, held = self.equations, self.equations.held
         state.forces[held] -= equations.unbalanced[held]
-        self.solver.evaluate_residual()
+        equations.update_reactions()
         self.solver.damage_changed()
         state.forces[held] += equations.unbalanced[held]
 

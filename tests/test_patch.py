@@ -16,7 +16,7 @@ from fracsim.meshes.topology import boundary_facets
 from fracsim.run import Scene
 from fracsim.state import State
 from support.laws import law_of
-from support.scenes import Values, at_nodes, make_scene, march, mesh_of, positions
+from support.scenes import Values, at_nodes, each_step, make_scene, march, mesh_of, positions
 
 EPS = np.finfo(float).eps
 YOUNG, POISSON = 2.0, 0.3
@@ -99,7 +99,7 @@ def test_dynamic_patch(energy: str, scheme: str, dim: int) -> None:
     X = positions(scene)
     velocity = X @ GRADIENT[dim].T / (0.1 * steps)
     state.v = velocity.reshape(-1).copy()
-    for report in march(scene, state):
+    for report in each_step(scene, state):
         assert report.kinetic == pytest.approx(0.5 * scene.equations.mass @ velocity.reshape(-1) ** 2, rel=TOLERANCE)
         np.testing.assert_allclose(state.u.reshape(X.shape), state.t * velocity, atol=TOLERANCE)
         np.testing.assert_allclose(state.v.reshape(X.shape), velocity, atol=TOLERANCE / 0.1)

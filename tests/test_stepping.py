@@ -12,7 +12,7 @@ from fracsim.run import Scene, make_scheme
 from fracsim.state import State
 from support.oscillator import exact, run, slopes
 from support.reference import lumped_mass, modes, stiffness
-from support.scenes import DIRECT, Values, make_scene, march, positions
+from support.scenes import DIRECT, Values, each_step, make_scene, march, positions
 
 EPS = np.finfo(float).eps
 MATERIAL = {"energy": "linear", "young": 2.0, "poisson": 0.3, "density": 3.0}
@@ -164,7 +164,7 @@ def test_work_is_energy_plus_dissipation(case: dict[str, Any]) -> None:
     """
     scene, state = make_scene(mesh=MESH, material=MATERIAL, time={"scheme": "newmark", "step": 0.1, "end": 4.0}, **case)
     start = scene.equations.kinetic_energy(state.v)
-    for report in march(scene, state):
+    for report in each_step(scene, state):
         balance = start + state.work - report.kinetic - report.elastic - state.dissipated
         assert balance == pytest.approx(0, abs=SOLVED)
     assert (state.dissipated > 0) == ("damping" in case)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -38,13 +40,15 @@ def make_scene(**tables: Any) -> tuple[Scene, State]:
     return scene, scene.stepper.start(study.initial)
 
 
+def each_step(scene: Scene, state: State) -> Iterator[Report]:
+    """Advance to the end of the study; `state` can be looked at after each step."""
+    while state.t < scene.study.time.end * (1 - 1e-12):
+        yield scene.stepper.advance(state)
+
+
 def march(scene: Scene, state: State, steps: int | None = None) -> list[Report]:
     """Advance to the end of the study, or by a number of steps."""
-    reports: list[Report] = []
-    end = scene.study.time.end * (1 - 1e-12)
-    while state.t < end and (steps is None or len(reports) < steps):
-        reports.append(scene.stepper.advance(state))
-    return reports
+    return list(islice(each_step(scene, state), steps))
 
 
 def mesh_of(scene: Scene) -> MeshData:

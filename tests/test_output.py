@@ -1,0 +1,231 @@
+"""The output folder: every file is complete, agrees with the others, and opens in the programs it is meant for."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+import pytest
+import xdmf_reader
+from cases import BAR, STRIP, command, study, write_study
+from mpi4py import MPI
+
+from fracsim.run import Run, build_scene
+from fracsim.study import Study
+from fracsim.study_file import load_study
+
+COLUMNS = (
+    "step time dt kinetic elastic dissipated external_work broken_edges split_cells pieces newton_its krylov_its wall_step"
+).split()
+XDMF_TENSOR = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # of the six components in XDMF's order: xx xy xz yy yz zz
+
+
+@dataclass
+class Output:
+    """A finished run."""
+
+    study: Study
+    folder: Path
+    summary: dict[str, Any]
+
+
+@pytest.fixture(scope="module", params=["bar", "strip"])
+def output(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Output:
+    """3D without fracture, and 2D with it."""
+    fields = {"fields": ["von_mises", "velocity", "stress", "region"]}
+    made = study(BAR, output=fields) if request.param == "bar" else study(STRIP)
+    folder = tmp_path_factory.mktemp(request.param) / "out"
+    return Output(made, folder, Run(build_scene(MPI.COMM_SELF, made), folder)())
+
+
+def history(folder: Path) -> dict[str, np.ndarray]:
+    with (folder / "history.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_files_are_there_and_no_others(output: Output) -> None:
+    names = {path.name for path in output.folder.iterdir()}
+    assert names == {"study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json"}
+
+
+def test_the_study_as_run(output: Output) -> None:
+    again = load_study(output.folder / "study.toml")
+    assert again.model_copy(update={"mesh": output.study.mesh}) == output.study
+    comments = [line for line in (output.folder / "study.toml").read_text().splitlines() if line.startswith("# ")]
+    assert [line.split(":")[0] for line in comments] == ["# fracsim", "# dolfinx", "# petsc", "# python", "# ranks"]
+    assert comments[-1] == "# ranks: 1"
+
+
+def test_history_has_its_columns_and_a_row_a_step(output: Output) -> None:
+    axes = "xyz" if "bar" in output.study.title else "xy"
+    probes = [f"reaction_grip_{axis}" for axis in axes]
+    probes += [f"probe_tip_{axis}" for axis in axes] if "strip" in output.study.title else []
+    rows = history(output.folder)
+    assert list(rows) == COLUMNS + probes
+    assert rows["step"].tolist() == list(range(1, output.summary["steps"] + 1))
+    assert np.allclose(rows["time"], np.cumsum(rows["dt"]))
+    assert rows["time"][-1] == pytest.approx(output.study.time.end)
+    assert all(np.isfinite(column).all() for column in rows.values())
+
+
+def test_the_probe_at_a_prescribed_point_moves_as_prescribed(output: Output) -> None:
+    rows = history(output.folder)
+    if "probe_tip_x" not in rows:
+        return  # this study has none
+    assert np.allclose(rows["probe_tip_x"], 1.0 * rows["time"], rtol=1e-6)
+    assert np.allclose(rows["probe_tip_y"], 0.0, atol=1e-12)
+
+
+def test_the_summary_is_complete(output: Output) -> None:
+    summary = json.loads((output.folder / "summary.json").read_text())
+    assert summary == output.summary
+    rows = history(output.folder)
+    assert summary["outcome"] == "done" and summary["title"] == output.study.title
+    assert summary["time"] == pytest.approx(output.study.time.end)
+    for key, column in (("broken_edges", "broken_edges"), ("split_cells", "split_cells"), ("pieces", "pieces")):
+        assert summary[key] == rows[column][-1]
+    assert summary["external_work"] == pytest.approx(rows["external_work"][-1])
+    assert summary["peak_reactions"]["reaction_grip_x"] == pytest.approx(np.abs(rows["reaction_grip_x"]).max())
+    assert set(summary["seconds"]) >= {"setup", "solve", "fracture", "energies", "output"}
+    assert summary["ranks"] == 1 and summary["peak_memory_MiB"] > 10 and summary["wall"] > 0
+    assert (summary["nodes"], summary["cells"]) == ((20, 24) if "bar" in output.study.title else (27, 32))
+
+
+def test_the_strip_tears(output: Output) -> None:
+    """So that the fields above are of a body with damage: broken edges, split cells and pieces agree with the fields."""
+    with h5py.File(output.folder / "fields.h5") as file:
+        last = file["frames"][max(file["frames"])]
+        if "damage" not in last:
+            assert output.summary["broken_edges"] == output.summary["split_cells"] == 0
+            return
+        assert output.summary["broken_edges"] > 0
+        assert len(np.unique(last["piece"])) == output.summary["pieces"]
+        assert np.count_nonzero(last["chi"][()] < 1) == output.summary["split_cells"]
+        assert np.all((last["damage"][()] > 0) == (last["chi"][()] < 1))
+
+
+# --- fields ---------------------------------------------------------------------------------------------------------
+
+
+def frames_by_hand(folder: Path) -> list[tuple[float, dict[tuple[str, str], np.ndarray]]]:
+    """(time, (centre, name) -> values) from the XML and what it points at in the HDF5 file."""
+    collections = ElementTree.parse(folder / "fields.xdmf").getroot().findall("Domain/Grid")
+    assert len(collections) == 1 and collections[0].get("CollectionType") == "Temporal"
+    with h5py.File(folder / "fields.h5") as file:
+        return [_frame(grid, file) for grid in collections[0].findall("Grid")]
+
+
+def _frame(grid: ElementTree.Element, file: h5py.File) -> tuple[float, dict[tuple[str, str], np.ndarray]]:
+    assert grid.get("GridType") == "Uniform"
+    found = {("Mesh", part): _item(grid.find(f"{part}/DataItem"), file) for part in ("Topology", "Geometry")}
+    for each in grid.findall("Attribute"):
+        found[str(each.get("Center")), str(each.get("Name"))] = _item(each.find("DataItem"), file)
+    return float(grid.find("Time").get("Value")), found  # type: ignore[union-attr, arg-type]
+
+
+def _item(element: ElementTree.Element | None, file: h5py.File) -> np.ndarray:
+    assert element is not None and element.text is not None and element.get("Format") == "HDF"
+    name, _, path = element.text.partition(":")
+    assert name == Path(file.filename).name
+    data = file[path]
+    assert element.get("Dimensions") == " ".join(map(str, data.shape))
+    assert (element.get("NumberType"), element.get("Precision")) == (
+        "Int" if data.dtype.kind == "i" else "Float", str(data.dtype.itemsize),
+    )  # fmt: skip
+    return data[()]
+
+
+def test_one_grid_a_time_carries_all_fields(output: Output) -> None:
+    frames = frames_by_hand(output.folder)
+    wanted = {"displacement", *(output.study.output.fields or [])}
+    for _, fields in frames:
+        assert {name for centre, name in fields if centre != "Mesh"} == wanted
+    rows = history(output.folder)
+    assert np.allclose([t for t, _ in frames], [0.0, *rows["time"]], rtol=1e-9, atol=0)
+    centres = {name: centre for centre, name in frames[-1][1]}
+    assert centres["displacement"] == centres["velocity"] == "Node" and centres["stress"] == "Cell"
+
+
+def test_fields_agree_with_each_other(output: Output) -> None:
+    """von Mises from the stress components; displacement of the gripped end from the study."""
+    t, fields = frames_by_hand(output.folder)[-1]
+    s = fields["Cell", "stress"][:, XDMF_TENSOR].reshape(-1, 3, 3)
+    deviator = s - np.trace(s, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
+    mises = np.sqrt(1.5 * np.einsum("cij,cij->c", deviator, deviator))
+    assert np.allclose(mises, fields["Cell", "von_mises"], rtol=1e-9, atol=1e-9 * mises.max())
+    right = fields["Mesh", "Geometry"][:, 0] == 1.0
+    speed = 0.1 if "bar" in output.study.title else 1.0
+    assert np.allclose(fields["Node", "displacement"][right], [speed * t, 0, 0], atol=1e-9 * speed)
+    assert np.allclose(fields["Node", "velocity"][right], [speed, 0, 0], rtol=1e-6, atol=1e-6 * speed)
+    assert np.isfinite(np.concatenate([values.ravel() for values in fields.values()])).all()
+
+
+def test_vtk_reads_the_same(output: Output, tmp_path: Path) -> None:
+    script, target = xdmf_reader.__file__, tmp_path / "read.npz"
+    arguments = [sys.executable, script, str(output.folder / "fields.xdmf"), str(target)]
+    result = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
+    if result.returncode == xdmf_reader.NO_READER:
+        pytest.skip(f"no VTK with an XDMF reader here; pip install --target {xdmf_reader.READERS} vtk")
+    assert (result.returncode, result.stderr) == (0, "")
+    read = np.load(target)
+    frames = frames_by_hand(output.folder)
+    assert np.allclose(read["times"], [t for t, _ in frames])
+    for index, (_, fields) in enumerate(frames):
+        for (centre, name), values in fields.items():
+            if centre == "Mesh":
+                continue
+            full = values[:, XDMF_TENSOR] if name == "stress" else values
+            assert np.array_equal(read[f"{index}/{centre}/{name}"], full), name
+        points = fields["Mesh", "Geometry"]
+        assert np.array_equal(read[f"{index}/points"], points) and read[f"{index}/cells"] == len(fields["Mesh", "Topology"])
+        warped = points + fields["Node", "displacement"]
+        assert np.allclose(read[f"{index}/warped"], warped, rtol=1e-6, atol=1e-7)  # VTK warps in single precision
+
+
+def test_frames_come_at_intervals(tmp_path: Path) -> None:
+    data = {**BAR, "output": {"interval": 0.02, "picture": False, "fields": []}, "time": {"step": 0.01, "end": 0.05}}
+    Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path / "out")()
+    assert np.allclose([t for t, _ in frames_by_hand(tmp_path / "out")], [0, 0.02, 0.04, 0.05])
+
+
+def test_a_killed_run_leaves_whole_files(tmp_path: Path) -> None:
+    bar = write_study(tmp_path / "bar.toml", BAR, time={"step": 1e-4, "end": 10.0}, output={"fields": ["stress"]})
+    process = subprocess.Popen(command("run", bar, "-o", tmp_path / "out"), stdout=subprocess.DEVNULL)
+    xdmf = tmp_path / "out" / "fields.xdmf"
+    until = time.monotonic() + 40
+    while time.monotonic() < until and (not xdmf.exists() or xdmf.stat().st_size < 20_000):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait(timeout=20)
+    frames = frames_by_hand(tmp_path / "out")
+    assert len(frames) > 5
+    assert len(history(tmp_path / "out")["step"]) >= len(frames) - 1
+
+
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    from fracsim.picture import render_last
+
+    pixels = imread(render_last(output.folder, tmp_path / "shot.png"))[..., :3]
+    assert pixels.shape == (900, 1400, 3)
+    body = np.abs(pixels - pixels[0, 0]).max(axis=2) > 0.05
+    assert 0.03 < body.mean() < 0.9
+    assert len(np.unique((pixels[body] * 255).astype(int), axis=0)) > 20

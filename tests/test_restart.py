@@ -1,0 +1,243 @@
+"""Runs that end early, and going on: the same result as a run that was never interrupted, on any number of ranks."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from cases import BAR, STRIP, changed, command, fracsim, study, write_study
+from mpi4py import MPI
+
+from fracsim.errors import Exit, InputError, NotConverged, Stopped
+from fracsim.run import Run, build_scene
+
+Data = dict[str, Any]
+
+# Tight tolerances: what is left of the difference between two ways to the same state is their solver error.
+SOLVER = {"snes_rtol": 1e-11, "ksp_rtol": 1e-9}
+TEARING: Data = changed(
+    STRIP, solver=SOLVER, fracture={"radius": 0.2}, damping={"mass": 1.0, "stiffness": 1e-4},
+    output={"fields": ["damage", "chi", "piece"]},
+)  # fmt: skip
+# kept apart from `wall_step`, which is a time, and the iteration counts, which depend on the preconditioner's history
+PHYSICAL = (
+    "time dt kinetic elastic dissipated external_work broken_edges split_cells pieces reaction_grip_x reaction_grip_y "
+    "probe_tip_x probe_tip_y"
+).split()
+
+
+def run(data: Data, folder: Path, *, restart: bool = False, wall_limit: float | None = None) -> dict[str, Any]:
+    scene = build_scene(MPI.COMM_SELF, study(data))
+    return Run(scene, folder, restart=restart, wall_limit=wall_limit)()
+
+
+def history(folder: Path) -> dict[str, np.ndarray]:
+    with (folder / "history.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
+
+
+def last_frame(folder: Path) -> dict[str, np.ndarray]:
+    with h5py.File(folder / "fields.h5") as file:
+        frame = file["frames"][max(file["frames"])]
+        return {"time": frame.attrs["time"]} | {name: data[()] for name, data in frame.items()}
+
+
+def assert_same_run(folder: Path, reference: Path, columns: list[str] = PHYSICAL, rtol: float = 1e-6) -> None:
+    """History rows and the last frame of two runs agree to solver tolerance, damage exactly."""
+    rows, wanted = history(folder), history(reference)
+    assert rows["step"].tolist() == wanted["step"].tolist()
+    for name in columns:
+        scale = np.abs(wanted[name]).max()
+        assert np.allclose(rows[name], wanted[name], rtol=rtol, atol=rtol * scale + 1e-12), name
+    found, frame = last_frame(folder), last_frame(reference)
+    assert found.keys() == frame.keys() and found["time"] == pytest.approx(frame["time"])
+    for name in ("damage", "chi", "piece"):
+        assert name not in frame or np.array_equal(found[name], frame[name]), name
+    size = np.abs(frame["displacement"]).max()
+    assert np.abs(found["displacement"] - frame["displacement"]).max() < rtol * size
+    with h5py.File(folder / "fields.h5") as file, h5py.File(reference / "fields.h5") as other:
+        assert len(file["frames"]) == len(other["frames"])
+
+
+# --- going on -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tearing strip without interruption."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    summary = run(TEARING, folder)
+    assert summary["broken_edges"] > 0
+    return folder
+
+
+def stopped_after(data: Data, folder: Path, steps: int) -> None:
+    """Run and end by a signal in step number `steps`."""
+    scene = build_scene(MPI.COMM_SELF, study(data))
+    advance, count = scene.stepper.advance, iter(range(1, 1000))
+
+    def counted(state: Any) -> Any:
+        if next(count) == steps:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return advance(state)
+
+    scene.stepper.advance = counted  # type: ignore[method-assign]
+    with pytest.raises(Stopped) as end:
+        Run(scene, folder)()
+    assert str(end.value).startswith(f"stopped by signal SIGTERM at t = {steps * scene.study.time.step:g} s after {steps} steps")
+    assert f"Checkpoint: {folder / 'checkpoint' / 'state.h5'}; go on with --restart" in str(end.value)
+
+
+def test_a_restart_gives_the_same_run(tmp_path: Path, whole: Path) -> None:
+    breaking = np.flatnonzero(history(whole)["broken_edges"])[0] + 1  # the first step that breaks edges
+    for steps in (2, int(breaking)):
+        folder = tmp_path / str(steps)
+        stopped_after(TEARING, folder, steps)
+        assert json.loads((folder / "summary.json").read_text())["outcome"] == "stopped"
+        assert len(history(folder)["step"]) == steps
+        summary = run(TEARING, folder, restart=True)
+        assert summary["outcome"] == "done"
+        assert_same_run(folder, whole)
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "quasi-static"])
+def test_a_restart_with_other_schemes(tmp_path: Path, scheme: str) -> None:
+    data = changed(BAR, time={"scheme": scheme, "end": 0.06}, solver=SOLVER, material={"energy": "corotated"})
+    run(data, tmp_path / "whole")
+    stopped_after(data, tmp_path / "parts", 3)
+    run(data, tmp_path / "parts", restart=True)
+    columns = [name for name in PHYSICAL if "tip" not in name] + ["reaction_grip_z"]
+    assert_same_run(tmp_path / "parts", tmp_path / "whole", columns)
+
+
+def test_peak_reactions_and_totals_survive_a_restart(tmp_path: Path, whole: Path) -> None:
+    stopped_after(TEARING, tmp_path / "out", 6)
+    summary, wanted = run(TEARING, tmp_path / "out", restart=True), json.loads((whole / "summary.json").read_text())
+    for key in ("steps", "time", "broken_edges", "split_cells", "pieces", "external_work", "dissipated"):
+        assert summary[key] == pytest.approx(wanted[key], rel=1e-6), key
+    assert summary["peak_reactions"] == pytest.approx(wanted["peak_reactions"], rel=1e-6)
+
+
+def test_rows_and_frames_after_the_checkpoint_are_written_anew(tmp_path: Path, whole: Path) -> None:
+    """A run with a checkpoint some steps ago that was then killed: what it wrote since is dropped."""
+    stopped_after(TEARING, tmp_path / "early", 3)
+    shutil.copytree(whole, tmp_path / "late")
+    shutil.copytree(tmp_path / "early" / "checkpoint", tmp_path / "late" / "checkpoint")
+    run(TEARING, tmp_path / "late", restart=True)
+    assert_same_run(tmp_path / "late", whole)
+
+
+def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:
+    stopped_after(BAR, tmp_path / "out", 2)
+    run(BAR, tmp_path / "out")
+    assert not (tmp_path / "out" / "checkpoint" / "state.h5").exists()
+    with pytest.raises(InputError, match="--restart: there is no checkpoint"):
+        run(BAR, tmp_path / "out", restart=True)
+
+
+def test_a_checkpoint_of_another_mesh_is_refused(tmp_path: Path) -> None:
+    stopped_after(BAR, tmp_path / "out", 2)
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"--restart: .*state\.h5 belongs to another mesh; run without --restart"):
+        run(changed(BAR, mesh={"h": 0.125}), tmp_path / "out", restart=True)
+    assert before == {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+
+
+def test_a_checkpoint_without_fracture_can_go_on_with_it(tmp_path: Path) -> None:
+    """[fracture] may be added (nothing is broken then), and a torn body cannot lose it."""
+    plain = changed(STRIP, fracture=None, output={"fields": []}, probe=[])
+    torn = changed(STRIP, output={"fields": []}, probe=[])
+    stopped_after(plain, tmp_path / "plain", 2)
+    assert run(torn, tmp_path / "plain", restart=True)["broken_edges"] > 0
+    stopped_after(torn, tmp_path / "torn", 8)
+    with pytest.raises(InputError, match=r"--restart: .* has broken edges; the study needs its \[fracture\] table"):
+        run(plain, tmp_path / "torn", restart=True)
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    stopped_after(BAR, tmp_path / "out", 2)
+    (tmp_path / "out" / "checkpoint" / "state.h5").write_bytes(b"junk")
+    with pytest.raises(InputError, match=r"--restart: cannot read .*state\.h5"):
+        run(BAR, tmp_path / "out", restart=True)
+
+
+# --- ending early ---------------------------------------------------------------------------------------------------
+
+
+def test_the_wall_limit_ends_a_run(tmp_path: Path) -> None:
+    with pytest.raises(Stopped, match=r"stopped by the wall-time limit at t = 0\.01 s after 1 steps\. Checkpoint: "):
+        run(BAR, tmp_path / "out", wall_limit=0.0)
+    assert run(BAR, tmp_path / "out", restart=True)["steps"] == 3
+
+
+def test_a_run_that_does_not_converge(tmp_path: Path) -> None:
+    """One Newton iteration does not solve a large rotation, and no smaller step is allowed."""
+    data = changed(
+        BAR, material={"energy": "neo-hookean"}, time={"adapt": False}, solver={"snes_max_it": 1},
+        boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [-30, 5, 0]}],
+    )  # fmt: skip
+    with pytest.raises(NotConverged) as end:
+        run(data, tmp_path / "out")
+    message = str(end.value)
+    assert message.startswith("no solution at t = 0.01 s with a step of 0.01 s (time.adapt is off). Newton's method stopped")
+    assert "Last good time: 0 s." in message
+    assert f"Checkpoint: {tmp_path / 'out' / 'checkpoint' / 'state.h5'}; go on with --restart" in message
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["outcome"] == "not converged"
+    # with more iterations it goes on from there
+    assert run(changed(data, solver={"snes_max_it": 25}), tmp_path / "out", restart=True)["outcome"] == "done"
+
+
+def test_the_exit_code_of_a_run_that_does_not_converge(tmp_path: Path) -> None:
+    bar = write_study(tmp_path / "bar.toml", BAR, material={"energy": "neo-hookean"})
+    hard = ["time.adapt=false", "solver.snes_max_it=1", "boundary.1.velocity=[-30, 5, 0]"]
+    options = [option for each in hard for option in ("--set", each)]
+    result = fracsim("run", bar, "-o", tmp_path / "out", *options, ranks=2)
+    assert result.returncode == Exit.NOT_CONVERGED
+    assert result.stderr.count("fracsim: no solution at t = 0.01 s") == 1
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("name", "ranks"), [("SIGTERM", 0), ("SIGUSR1", 2)])
+def test_a_signal_ends_a_run_with_a_checkpoint(tmp_path: Path, name: str, ranks: int) -> None:
+    """On two ranks mpirun passes the signal on to its ranks."""
+    bar = write_study(tmp_path / "bar.toml", BAR, time={"step": 1e-4, "end": 10.0}, output={"every": 1000})
+    process = subprocess.Popen(command("run", bar, "-o", tmp_path / "out", ranks=ranks), stderr=subprocess.PIPE, text=True)
+    rows = tmp_path / "out" / "history.csv"
+    until = time.monotonic() + 40
+    while time.monotonic() < until and (not rows.exists() or rows.stat().st_size < 1000):
+        time.sleep(0.05)
+    process.send_signal(signal.Signals[name])
+    _, error = process.communicate(timeout=50)
+    assert process.returncode == Exit.STOPPED, error
+    assert error.count(f"fracsim: stopped by signal {name} at t = ") == 1
+    assert (tmp_path / "out" / "checkpoint" / "state.h5").exists()
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["outcome"] == "stopped"
+
+
+# --- any number of ranks --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ranks", [0, 3])
+def test_a_checkpoint_of_two_ranks_goes_on_with_others(tmp_path: Path, whole: Path, ranks: int) -> None:
+    """Two ranks up to the first step that breaks edges, with a checkpoint after every step; then to the end."""
+    strip, out = write_study(tmp_path / "strip.toml", TEARING), tmp_path / "out"
+    broken = history(whole)["broken_edges"]
+    steps = int(np.flatnonzero(broken)[0] + 1)
+    part = ["--set", f"time.end={0.005 * steps}"]
+    first = fracsim("run", strip, "-o", out, *part, "--set", "output.checkpoint=1e-9", ranks=2)
+    assert first.returncode == 0, first.stderr
+    assert history(out)["broken_edges"][-1] == broken[steps - 1]
+    second = fracsim("run", strip, "-o", out, "--restart", ranks=ranks)
+    assert second.returncode == 0, second.stderr
+    assert_same_run(out, whole)

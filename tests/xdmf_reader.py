@@ -1,0 +1,58 @@
+"""Read a fields.xdmf with VTK's own reader, as ParaView does: python xdmf_reader.py FILE.xdmf FILE.npz
+
+A process of its own: Debian's VTK is built without the reader, PyPI's has it, and the two must not meet in one process.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+READERS = Path(os.environ.get("FRACSIM_READERS", Path(sys.prefix) / "readers"))
+NO_READER = 77
+
+
+def main(source: str, target: str) -> None:
+    """Every time, field and warped point of the file as arrays: times, <index>/<centre>/<name>, <index>/warped."""
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
+
+    reader = vtkXdmfReader()
+    reader.SetFileName(source)
+    reader.UpdateInformation()
+    times = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS())
+    found = {"times": np.array(times)}
+    for index, t in enumerate(times):
+        reader.UpdateTimeStep(t)
+        found |= {f"{index}/{key}": value for key, value in fields(reader.GetOutputDataObject(0)).items()}
+    np.savez(target, **found)
+
+
+def fields(grid: Any) -> dict[str, Any]:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersGeneral import vtkWarpVector
+
+    assert grid.GetClassName() == "vtkUnstructuredGrid"  # one grid, no blocks
+    found = {"points": vtk_to_numpy(grid.GetPoints().GetData()), "cells": np.array(grid.GetNumberOfCells())}
+    for centre, data in (("Node", grid.GetPointData()), ("Cell", grid.GetCellData())):
+        for k in range(data.GetNumberOfArrays()):
+            found[f"{centre}/{data.GetArrayName(k)}"] = vtk_to_numpy(data.GetArray(k))
+    warp = vtkWarpVector()
+    warp.SetInputData(grid)
+    warp.SetInputArrayToProcess(0, 0, 0, 0, "displacement")  # array 0 of input 0, on points
+    warp.Update()
+    return found | {"warped": vtk_to_numpy(warp.GetOutput().GetPoints().GetData())}
+
+
+if __name__ == "__main__":
+    if READERS.is_dir():
+        sys.path.insert(0, str(READERS))
+    try:
+        import vtkmodules.vtkIOXdmf2  # noqa: F401
+    except ImportError:
+        sys.exit(NO_READER)
+    main(*sys.argv[1:])
