@@ -13,12 +13,13 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from .domain import Domain
 from .equilibrium import Equilibrium
 from .errors import InputError
 from .meshes.data import MeshData
-from .parallel import from_root, on_root
+from .parallel import Gather, on_root
 from .state import State
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
@@ -57,28 +58,39 @@ def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain) -> 
 
 def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equilibrium, graph: Any = None) -> None:
     """Bring a checkpoint into the state, chi and the graph (collective). InputError where there is none that fits."""
-    path = checkpoint_path(folder)
-    arrays, clock = from_root(domain.comm, lambda: (_read(path, domain.source), None))[0], None
-    clock = arrays.pop("clock")
+    path, comm = checkpoint_path(folder), domain.comm
+    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=graph is not None))
+    clock, names, broken = comm.bcast((arrays.pop("clock"), list(arrays), arrays.get("broken")) if arrays is not None else None)
     for name in _CLOCK:
         setattr(state, name, clock[name])
+
+    def scattered(gather: Gather, name: str) -> npt.NDArray[Any]:
+        return gather.scatter(arrays[name] if arrays is not None else None)
+
     for name in (*_NODAL, "drag"):
-        if name in arrays:
-            setattr(state, name, domain.gather_nodes.scatter(arrays[name]).reshape(-1))
-    if equations.chi is not None:
-        graph.break_edges(graph.flags_of_keys(arrays["broken"]))
-        equations.chi.x.array[: domain.cell_count] = domain.gather_cells.scatter(arrays["chi"])
+        if name in names:
+            setattr(state, name, scattered(domain.gather_nodes, name).reshape(-1))
+    if graph is not None and broken is not None:
+        graph.break_edges(graph.flags_of_keys(broken))
+        equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
 
 
-def _read(path: Path, mesh: MeshData) -> dict[str, Any]:
+def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:
+    """The arrays and the clock; `torn_too`: the study can go on with broken edges."""
     if not path.exists():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
-    with h5py.File(path) as file:
-        if file.attrs["mesh"] != fingerprint(mesh):
-            raise InputError(f"--restart: {path} belongs to another mesh; run without --restart")
-        arrays = {name: data[()] for name, data in file.items()}
-        return arrays | {"clock": {name: file.attrs[name].item() for name in _CLOCK}}
+    try:
+        with h5py.File(path) as file:
+            arrays = {name: data[()] for name, data in file.items()}
+            clock, name = {key: file.attrs[key].item() for key in _CLOCK}, file.attrs["mesh"]
+    except (OSError, KeyError) as error:
+        raise InputError(f"--restart: cannot read {path}: {error}; run without --restart") from None
+    if name != fingerprint(mesh):
+        raise InputError(f"--restart: {path} belongs to another mesh; run without --restart")
+    if len(arrays.get("broken", ())) and not torn_too:
+        raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
+    return arrays | {"clock": clock}
 
 
 def fingerprint(mesh: MeshData) -> str:

@@ -123,14 +123,16 @@ def find_study(name: str) -> Path:
 def _load(comm: Any, path: Path, overrides: list[str], folder: Path) -> Any:
     """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
     from .parallel import from_root
+    from .study import Study
     from .study_file import load_study
 
     def work() -> Any:
         loaded = load_study(path, overrides)
         check_folder(folder)
-        return loaded
+        return loaded.model_dump(exclude_none=True)
 
-    return from_root(comm, work)
+    # as plain data: pydantic's generic tables cannot be pickled
+    return Study.model_validate(from_root(comm, work))
 
 
 def check_folder(folder: Path) -> None:
@@ -151,8 +153,10 @@ def main() -> NoReturn:
     """Entry point: one message and an exit code for what a user can mend, on any number of ranks."""
     bare = len(sys.argv) == 1  # shows the help, and yet is bad usage
     if not _is_root() and (bare or "--help" in sys.argv):
-        sys.exit(Exit.BAD_INPUT if bare else Exit.DONE)
+        sys.exit(Exit.DONE)
     code = _guarded(lambda: app(standalone_mode=False))
+    if not _is_root() and "mpi4py.MPI" not in sys.modules:
+        sys.exit(Exit.DONE)  # mpirun kills all ranks at the first that fails, and rank 0 may still have to say why
     sys.exit(Exit.BAD_INPUT if bare else code)
 
 
@@ -161,6 +165,8 @@ def _guarded(work: Callable[[], Any]) -> int:
 
     try:
         code = work()
+        if code == INTERRUPTED:
+            _say("interrupted before the first step; nothing was written")
         return code if isinstance(code, int) else Exit.DONE
     except FracsimError as error:
         _say(str(error))
@@ -169,8 +175,6 @@ def _guarded(work: Callable[[], Any]) -> int:
         _say(f"{error.format_message().rstrip('.')}; see fracsim --help")
         return int(Exit.BAD_INPUT)
     except click.exceptions.Exit as error:
-        if error.exit_code == INTERRUPTED:
-            _say("interrupted before the first step; nothing was written")
         return error.exit_code
     except Exception:
         _abort()

@@ -25,9 +25,9 @@ def render_last(folder: Path, png: Path | None = None) -> Path:
 
         plotter = pyvista.Plotter(off_screen=True, window_size=(1400, 900))
         plotter.set_background("white")
-        _add_body(plotter, grid, field)
+        body = _add_body(plotter, grid, field)
         plotter.add_text(f"t = {t:.4g} s", font_size=11, color="black")
-        _aim(plotter, grid)
+        _aim(plotter, body)
         plotter.screenshot(target)
         plotter.close()
     return target
@@ -56,25 +56,30 @@ def read_frame(folder: Path, index: int = -1) -> tuple[Any, str, float]:
     return grid, field, t
 
 
-def _add_body(plotter: Any, grid: Any, field: str) -> None:
+def _add_body(plotter: Any, grid: Any, field: str) -> Any:
+    """Draw the cells that hold together; returns what was drawn."""
     whole = grid
     if "damage" in grid.cell_data:
         # a cell with half of its edges broken has come apart or nearly so; leaving it out opens the crack
         whole = grid.extract_cells(np.flatnonzero(grid.cell_data["damage"] < 0.5))
     if whole.n_cells == 0:
         whole = grid
-    surface = whole.extract_surface()
-    bar = {"title": field, "color": "black", "vertical": False}
-    plotter.add_mesh(surface, scalars=field, cmap="YlOrBr", show_edges=grid.n_cells < 60_000, line_width=0.3, scalar_bar_args=bar)
+    bar = {"title": field.replace("_", " "), "color": "black", "vertical": False, "height": 0.06, "position_y": 0.03}
+    edges = grid.n_cells < 60_000
+    plotter.add_mesh(
+        whole.extract_surface(), scalars=field, cmap="YlOrBr", show_edges=edges, line_width=0.5, edge_opacity=0.35,
+        scalar_bar_args=bar,
+    )  # fmt: skip
+    return whole
 
 
-def _aim(plotter: Any, grid: Any) -> None:
-    if np.ptp(grid.points[:, 2]) == 0:
+def _aim(plotter: Any, body: Any) -> None:
+    if np.ptp(body.points[:, 2]) == 0:
         plotter.view_xy()
     else:
-        plotter.camera_position = [(1.0, -1.6, 0.8), (0, 0, 0), (0, 0, 1)]
-        plotter.reset_camera(bounds=grid.bounds)
-    plotter.camera.zoom(1.2)
+        plotter.camera_position = [(0.7, -1.6, 0.8), (0, 0, 0), (0, 0, 1)]
+    plotter.reset_camera(bounds=body.bounds)
+    plotter.camera.zoom(1.3)
 
 
 @contextmanager

@@ -83,7 +83,8 @@ class Solver:
         snes.setConvergenceTest(self._converged)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
-        self._age, self._keep, self._fresh_its, self._first = Age.WORN, True, 0, 0.0
+        self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
+        self._age, self._keep, self._fresh_its, self._first = Age.WORN, self._iterative, 0, 0.0
 
     def _configure(self, given: Options) -> None:
         try:
@@ -106,7 +107,7 @@ class Solver:
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
             self._age, self._keep = Age.WORN, False
             outcome = self._attempt(guess)
-            self._keep = True
+            self._keep = self._iterative
         if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg":
             # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")

@@ -218,21 +218,23 @@ def test_gravity_on_a_free_body_is_free_fall() -> None:
 def test_damping_does_not_hold_a_rigid_spin_back() -> None:
     """Stiffness damping of a nonlinear body sees strain rates only: a rigidly turning body loses nothing to it.
 
-    The trapezoidal rule moves points along chords, so there is strain of order (w dt)^2, and loss of a higher order.
+    The strain rate is taken with F at the start of the step, off by w^2 dt: the loss falls with dt^2 and tends to what the
+    small vibration about the stretched shape loses, a share (w L / c0)^2 of the energy.
     """
-    losses = []
-    for steps in (10, 20):
+    losses, stiff = [], 2e5
+    for steps in (50, 100, 200):
         scene, state = make_scene(
             mesh=MESH,
-            material=MATERIAL | {"energy": "neo-hookean", "young": 2000.0},
+            material=MATERIAL | {"energy": "neo-hookean", "young": stiff},
             initial={"spin": [1.0]},
-            damping={"stiffness": 1e-3},
+            damping={"stiffness": 1e-4},
             time={"scheme": "newmark", "step": 1.0 / steps, "end": 1.0},
         )
         kinetic = scene.equations.kinetic_energy(state.v)
         march(scene, state)
         losses.append(abs(state.dissipated) / kinetic)
-    assert losses[-1] < 1e-3
+    assert slopes(losses)[-1] == pytest.approx(2, abs=0.2)
+    assert (4 * losses[2] - losses[1]) / 3 < 10 * 3.0 / stiff + 1e-2 * losses[2]
 
 
 def test_step_halving_reaches_the_same_end() -> None:
@@ -242,7 +244,7 @@ def test_step_halving_reaches_the_same_end() -> None:
         material=MATERIAL | {"energy": "neo-hookean"},
         boundary=[*CLAMP, {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [1.5, 0.8]]}}],
         time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
-        solver=DIRECT | {"snes_max_it": 4, "snes_rtol": 1e-8},
+        solver=DIRECT | {"snes_max_it": 3, "snes_rtol": 1e-8},
     )
     reports = march(scene, state)
     assert len(reports) > 1

@@ -18,7 +18,7 @@ from mpi4py import MPI
 Values = npt.NDArray[np.float64]
 
 # Newton's method with a direct solver: what is left is round-off, not a tolerance.
-DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "snes_rtol": 1e-13}
+DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "snes_rtol": 1e-11}
 
 
 def make_study(**tables: Any) -> Study:
