@@ -38,10 +38,12 @@ def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
         modes.append(turn)
         names.append(f"turning about {name}")
     A = np.stack([mode[held] for mode in modes], axis=1)
-    values, vectors = np.linalg.eigh(A.T @ A)
-    if values[0] > 1e-10 * max(values[-1], 1.0):
-        return ""
-    return names[int(np.argmax(np.abs(vectors[:, 0])))]
+    # translations by themselves first: turning about a line far from the middle moves the middle as well
+    for first, count in ((0, d), (d, len(modes))):
+        values, vectors = np.linalg.eigh(A[:, :count].T @ A[:, :count])
+        if values[0] <= 1e-10 * max(values[-1], 1.0):
+            return names[first + int(np.argmax(np.abs(vectors[first:, 0])))]
+    return ""
 
 
 def not_held(which: str, motion: str) -> str:

@@ -1,7 +1,7 @@
 """`fracsim check`: everything that can be known of a study without solving, and what its scene will build.
 
-Names, dimensions and places are compared with what the builder says of itself, or with the mesh file. No DOLFINx: the answer
-comes in a second.
+Names, dimensions and places are compared with what the builder says of itself, or with the mesh file. No DOLFINx: the
+answer comes in a second.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     """What a mesh turned out to be."""
     count = bodies_of(mesh)[0]
     size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
-    corners = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
-    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), *corners, size, mesh.notes)
+    lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
+    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), lower, upper, size, mesh.notes)
 
 
 def _check(study: Study, anatomy: Anatomy) -> None:
@@ -79,7 +79,7 @@ def _check(study: Study, anatomy: Anatomy) -> None:
 
 
 def _check_held(study: Study, dim: int) -> None:
-    """A motion along an axis that no entry holds; the rest (turning, several bodies) needs the mesh, and the run finds it."""
+    """A motion along an axis that no entry holds. Turning and single bodies need the mesh: the run finds them."""
     held = np.zeros(dim, bool)
     for i, entry in enumerate(study.boundary):
         if entry.kind in MOTIONS:
@@ -111,10 +111,10 @@ def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
         slack = 1e-9 * float(np.linalg.norm(np.subtract(anatomy.upper, anatomy.lower)))
         misses = np.any(low > np.array(anatomy.upper) + slack) or np.any(high < np.array(anatomy.lower) - slack)
     else:
-        normal, point = (of_size(v, anatomy.dim, f"{key}.{n}") for v, n in ((where.normal, "normal"), (where.point, "point")))
+        normal, point = (of_size(getattr(where, name), anatomy.dim, f"{key}.{name}") for name in ("normal", "point"))
         if not np.any(normal):
             raise InputError(f"{key}.normal = {where.normal}: a normal must not be zero")
-        ends = np.sort(np.array([normal * (np.array(anatomy.lower) - point), normal * (np.array(anatomy.upper) - point)]), axis=0)
+        ends = np.sort(normal * (np.array([anatomy.lower, anatomy.upper]) - point), axis=0)
         slack = (where.within or 0.0) * np.linalg.norm(normal) + 1e-9 * np.abs(ends[np.isfinite(ends)]).sum()
         misses = ends[0].sum() > slack or ends[1].sum() < -slack
     if misses:

@@ -1,7 +1,7 @@
 """Checkpoints: the state in the order of the input mesh, so that a run may go on with another number of ranks.
 
-The mesh itself is built again from the study. Nodal and cell values, broken edges (as pairs of input nodes) and the clock are
-all there is; a finite-element checkpoint library would store spaces that carry no edges.
+The mesh itself is built again from the study. Nodal and cell values, broken edges (as pairs of input nodes) and the
+clock are all there is; a finite-element checkpoint library would store spaces that carry no edges.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain) -> 
 def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equilibrium, graph: Any = None) -> None:
     """Bring a checkpoint into the state, chi and the graph (collective). InputError where there is none that fits."""
     path, comm = checkpoint_path(folder), domain.comm
-    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=graph is not None))
-    clock, names, broken = comm.bcast((arrays.pop("clock"), list(arrays), arrays.get("broken")) if arrays is not None else None)
+    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=equations.chi is not None))
+    head = (arrays.pop("clock"), list(arrays), arrays.get("broken")) if arrays is not None else None
+    clock, names, broken = comm.bcast(head)
     for name in _CLOCK:
         setattr(state, name, clock[name])
 
@@ -70,7 +71,7 @@ def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equil
     for name in (*_NODAL, "drag"):
         if name in names:
             setattr(state, name, scattered(domain.gather_nodes, name).reshape(-1))
-    if graph is not None and broken is not None:
+    if equations.chi is not None and broken is not None:
         graph.break_edges(graph.flags_of_keys(broken))
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
@@ -93,8 +94,9 @@ def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:
     return arrays | {"clock": clock}
 
 
-def fingerprint(mesh: MeshData) -> str:
-    """A short name of a mesh's nodes and cells."""
+def fingerprint(mesh: MeshData | None) -> str:
+    """A short name of a mesh's nodes and cells (rank 0, where the mesh is)."""
+    assert mesh is not None
     digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
     digest.update(np.ascontiguousarray(mesh.cells).tobytes())
     return digest.hexdigest()[:16]

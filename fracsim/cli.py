@@ -14,7 +14,7 @@ from .errors import Exit, FracsimError, InputError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of one that comes along")]
+StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of a packaged one")]
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
 _NONE: list[str] = []
 INTERRUPTED = 130  # as typer and shells report SIGINT
@@ -26,7 +26,7 @@ def run(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME)")] = None,
     set_: Set = _NONE,
     restart: Annotated[bool, typer.Option("--restart", help="go on from the checkpoint in the output folder")] = False,
-    wall_limit: Annotated[float | None, typer.Option(min=0, help="seconds after which to stop with a checkpoint")] = None,
+    wall_limit: Annotated[float | None, typer.Option(min=0, help="seconds until it stops with a checkpoint")] = None,
 ) -> None:
     """Run a study. Works under mpirun."""
     from mpi4py import MPI

@@ -51,7 +51,8 @@ def unknown_key(where: str, known: Iterable[str]) -> str:
     """`where` is not a key; the nearest one, or all that are known at its place."""
     known = sorted(known)
     near = difflib.get_close_matches(where.rpartition(".")[2], known, n=1, cutoff=0.5)
-    return f"{where} is not a known key; {f'did you mean {near[0]}?' if near else f'known here: {", ".join(known)}'}"
+    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+    return f"{where} is not a known key; {hint}"
 
 
 def _location(parts: Sequence[Any]) -> list[Any]:

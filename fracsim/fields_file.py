@@ -1,7 +1,7 @@
 """fields.xdmf with fields.h5: the computational mesh in time, one grid a time with every field on it.
 
-Written by rank 0 in the order of the input mesh, so that the files do not depend on the partition. One grid per time (DOLFINx's
-own writer makes one per field) lets ParaView warp by displacement and colour by damage at once.
+Written by rank 0 in the order of the input mesh, so that the files do not depend on the partition. One grid per time
+(DOLFINx's own writer makes one per field) lets ParaView warp by displacement and colour by damage at once.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ class FieldsFile:
         kind = _KINDS[shape[1] if len(shape) > 1 else 1]
         number = "Int" if field.values.dtype.kind == "i" else "Float"
         item = self._item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
-        return f'        <Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">{item}</Attribute>\n'
+        head = f'<Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">'
+        return f"        {head}{item}</Attribute>\n"
 
     def _item(self, path: str, shape: tuple[int, ...], number: str = "Float", size: int = 0) -> str:
         precision = size or (4 if number == "Int" else 8)

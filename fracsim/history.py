@@ -94,7 +94,9 @@ class History:
             self._writer.writerow(row)
             self._note_peaks(dict(zip(self.columns, map(float, row), strict=True)))
 
-    def append(self, state: State, report: Report, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]) -> None:
+    def append(
+        self, state: State, report: Report, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
+    ) -> None:
         """One row; `damage` is (broken edges, split cells, pieces)."""
         values = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,

@@ -168,7 +168,8 @@ def _selector(value: Any) -> str:
 
 
 Where = Annotated[
-    Annotated[str, Tag("<group>")] | Annotated[Box, Tag("<box>")] | Annotated[Plane, Tag("<plane>")], Discriminator(_selector)
+    Annotated[str, Tag("<group>")] | Annotated[Box, Tag("<box>")] | Annotated[Plane, Tag("<plane>")],
+    Discriminator(_selector),
 ]
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import BAR, STRIP, changed, fracsim, study, write_study
 from mpi4py import MPI
 
+from cases import BAR, STRIP, changed, fracsim, study, write_study
 from fracsim.check import check_study
 from fracsim.cli import check_folder
 from fracsim.errors import InputError
@@ -64,7 +64,10 @@ REFUSED: list[tuple[Data, str]] = [
     (changed(BAR, time={"sheme": "newmark"}), "time.sheme is not a known key; did you mean scheme?"),
     (changed(BAR, output={"evry": 1}), "output.evry is not a known key; did you mean every?"),
     # an unknown key is named before the missing one that it stands for
-    (changed(without("material", "young"), material={"yung": 1.0}), "material.yung is not a known key; did you mean young?"),
+    (
+        changed(without("material", "young"), material={"yung": 1.0}),
+        "material.yung is not a known key; did you mean young?",
+    ),
     # missing
     (without("title"), "title is missing; every study needs it"),
     (without("mesh"), "mesh is missing; every study needs it"),
@@ -133,9 +136,15 @@ REFUSED: list[tuple[Data, str]] = [
     (moving([0, 1], [[0, 0, 0], [1, 0]]), "boundary.1.velocity = [1.0, 0.0]: this mesh needs 3 numbers"),
     (moving([0, 1], [[0, 0, 0], ["free", 0, 0]]), '"free" at one time must be free at all of them'),
     # what does not fit the mesh
-    (held_at("lefft"), 'boundary.0.on = "lefft": the mesh has no such facet group; it has: back, bottom, front, left, right, top'),
+    (
+        held_at("lefft"),
+        'boundary.0.on = "lefft": the mesh has no such facet group; it has: back, bottom, front, left, right, top',
+    ),
     (probing(on="rite"), 'probe.0.on = "rite": the mesh has no such facet group; it has: back'),
-    (held_at({"box": [[5, 5, 5], [6, 6, 6]]}), "boundary.0.on selects no node; the body lies in (0, 0, 0) to (1, 0.25, 0.25)"),
+    (
+        held_at({"box": [[5, 5, 5], [6, 6, 6]]}),
+        "boundary.0.on selects no node; the body lies in (0, 0, 0) to (1, 0.25, 0.25)",
+    ),
     (held_at({"box": [[1, 1, 1], [0, 0, 0]]}), "give the lower corner first"),
     (held_at({"box": [[0, 0], [1, 1]]}), "boundary.0.on.box = [0.0, 0.0]: this mesh needs 3 numbers"),
     (held_at({"point": [9, 0, 0], "normal": [1, 0, 0]}), "boundary.0.on selects no node; the body lies in"),
@@ -143,7 +152,10 @@ REFUSED: list[tuple[Data, str]] = [
     (right(velocity=[1, 0]), "boundary.1.velocity = [1.0, 0.0]: this mesh needs 3 numbers"),
     (right(traction=[1, 0]), "boundary.1.traction = [1.0, 0.0]: this mesh needs 3 numbers"),
     (changed(BAR, load={"gravity": [0, -9.81]}), "load.gravity = [0.0, -9.81]: this mesh needs 3 numbers"),
-    (changed(BAR, load={"body_force": {"time": [0], "value": [[1, 2]]}}), "load.body_force = [1.0, 2.0]: this mesh needs 3"),
+    (
+        changed(BAR, load={"body_force": {"time": [0], "value": [[1, 2]]}}),
+        "load.body_force = [1.0, 2.0]: this mesh needs 3",
+    ),
     (changed(BAR, initial={"velocity": [1, 2]}), "initial.velocity = [1.0, 2.0]: this mesh needs 3 numbers"),
     (changed(BAR, initial={"spin": [1]}), "initial.spin = [1.0]: this mesh needs 3 numbers"),
     (changed(STRIP, initial={"spin": [0, 0, 1]}), "initial.spin = [0.0, 0.0, 1.0]: this mesh needs 1 number"),
@@ -151,7 +163,10 @@ REFUSED: list[tuple[Data, str]] = [
     (changed(STRIP, boundary=[{"on": "left", "fix": "z"}]), 'boundary.0.fix = "z": a 2D mesh has no z'),
     (changed(STRIP, material={"plane": "stress"}), "is offered by the energies linear and stvk, not by neo-hookean"),
     (changed(BAR, material={"plane": "stress"}), "is for 2D meshes; this one has 3 dimensions"),
-    (changed(BAR, material={"crust": {"young": 1.0}}), "material.crust: the mesh has no region of that name; it has: none"),
+    (
+        changed(BAR, material={"crust": {"young": 1.0}}),
+        "material.crust: the mesh has no region of that name; it has: none",
+    ),
     (changed(BAR, material={"crust": {"strength": 1.0}}), "material.crust.strength needs a [fracture] table"),
     (probing(point=[9, 9, 9]), "probe.0.point = [9.0, 9.0, 9.0] lies outside the body, which spans (0, 0, 0) to (1,"),
     (probing(), "probe.0: give either point or on"),
@@ -165,8 +180,14 @@ REFUSED: list[tuple[Data, str]] = [
     (changed(BAR, time={"scheme": "quasi-static"}, initial={"velocity": [1, 0, 0]}), "[initial] sets a velocity"),
     # files
     (changed(BAR) | {"mesh": {"file": "/no/such.msh"}}, 'mesh.file = "/no/such.msh": there is no such file'),
-    (changed(BAR) | {"mesh": {"surface": "/no/such.stl", "h": 1.0}}, 'mesh.surface = "/no/such.stl": there is no such file'),
-    (changed(BAR) | {"mesh": {"file": __file__, "h": 1.0}}, "mesh.h is not a known key beside mesh.file; known here: file"),
+    (
+        changed(BAR) | {"mesh": {"surface": "/no/such.stl", "h": 1.0}},
+        'mesh.surface = "/no/such.stl": there is no such file',
+    ),
+    (
+        changed(BAR) | {"mesh": {"file": __file__, "h": 1.0}},
+        "mesh.h is not a known key beside mesh.file; known here: file",
+    ),
     (changed(BAR) | {"mesh": {"surface": __file__}}, "mesh.h = None: a surface is filled with cells of size h > 0"),
     (changed(BAR) | {"mesh": {"file": __file__}}, "is of no known kind; known endings:"),
 ]
@@ -187,7 +208,7 @@ QUASI = {"scheme": "quasi-static"}
 NEEDS_MESH: list[tuple[Data, str]] = [
     (
         held_at({"box": [[0.05, 0.05, 0.05], [0.06, 0.06, 0.06]]}),
-        "boundary.0.on: box [0.05, 0.05, 0.05] to [0.06, 0.06, 0.06] selects no node; the body lies in (0, 0, 0) to (1, 0.25",
+        "boundary.0.on: box [0.05, 0.05, 0.05] to [0.06, 0.06, 0.06] selects no node; the body lies in (0, 0, 0)",
     ),
     (
         changed(BAR, boundary=[LEFT, {"on": {"point": [0.5, 0, 0], "normal": [1, 0, 0]}, "pressure": 1.0}]),
@@ -204,7 +225,7 @@ NEEDS_MESH: list[tuple[Data, str]] = [
 def test_the_scene_refuses(data: Data, message: str) -> None:
     from fracsim.run import build_scene
 
-    with pytest.raises(InputError, match=".") as refusal:
+    with pytest.raises(InputError) as refusal:
         build_scene(MPI.COMM_SELF, validate(data, "test.toml"))
     assert message in str(refusal.value)
 
@@ -230,7 +251,7 @@ def test_petsc_options_are_refused(option: Data, message: str) -> None:
 # --- mesh files -----------------------------------------------------------------------------------------------------
 
 
-def mesh_file(path: Path, points: list[list[float]], cells: list[list[int]]) -> Data:
+def mesh_file(path: Path, points: list[Any], cells: list[list[int]]) -> Data:
     import meshio
 
     meshio.Mesh(np.array(points, float), [("tetra", np.array(cells))]).write(path)
@@ -268,7 +289,9 @@ def test_each_body_must_be_held(tmp_path: Path) -> None:
 
     data = mesh_file(tmp_path / "two.vtu", TET + APART, [[0, 1, 2, 3], [4, 5, 6, 7]])
     data |= {"boundary": [{"on": {"box": [[0, 0, 0], [2, 1, 1]]}, "fix": "xyz"}], "time": BAR["time"] | QUASI}
-    with pytest.raises(InputError, match=r"nothing holds the body around \(5\.25, 0\.25, 0\.25\) m \(one of 2\) against moving"):
+    with pytest.raises(
+        InputError, match=r"nothing holds the body around \(5\.25, 0\.25, 0\.25\) m \(one of 2\) against moving"
+    ):
         build_scene(MPI.COMM_SELF, validate(data, "test.toml"))
 
 

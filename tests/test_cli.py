@@ -9,9 +9,9 @@ from pathlib import Path
 
 import meshio
 import pytest
-from cases import BAR, STRIP, fracsim, mpirun, study, write_study
 
 import fracsim as package
+from cases import BAR, STRIP, fracsim, mpirun, study, write_study
 from fracsim import cli
 from fracsim.check import check_study
 from fracsim.errors import Exit
@@ -31,12 +31,12 @@ def called(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
 
 
 def test_check_imports_nothing_heavy_and_is_quick() -> None:
-    code = (
-        "import sys; sys.argv = ['fracsim', 'check', 'loaf']\n"
-        "from fracsim.cli import main\n"
-        "try: main()\n"
-        "finally: print('heavy:', [name for name in %r if name in sys.modules])" % (HEAVY,)
-    )
+    code = f"""
+import sys; sys.argv = ['fracsim', 'check', 'loaf']
+from fracsim.cli import main
+try: main()
+finally: print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])
+"""
     began = time.monotonic()
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert time.monotonic() - began < 2
@@ -99,7 +99,8 @@ def test_mesh_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert len(meshio.read(tmp_path / "strip.vtu").cells_dict["triangle"]) == 32
     assert called(monkeypatch, "mesh", strip, "-o", tmp_path / "strip.odd") == Exit.BAD_INPUT
     error = capsys.readouterr().err
-    assert error.startswith(f"fracsim: --out: cannot save the mesh as {tmp_path / 'strip.odd'}") and error.count("\n") == 1
+    assert error.startswith(f"fracsim: --out: cannot save the mesh as {tmp_path / 'strip.odd'}")
+    assert error.count("\n") == 1
 
 
 def test_list(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,9 +151,7 @@ def test_help_and_no_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         assert f"  {command} " in first
 
 
-def test_interrupted_before_the_first_step(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interrupted_before_the_first_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -183,7 +182,8 @@ from fracsim.cli import main
 main()
 """)
     began = time.monotonic()
-    result = subprocess.run([*mpirun(2), sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False)
+    arguments = [*mpirun(2), sys.executable, str(script)]
+    result = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode not in (0, 2, 3, 4)
     assert "ZeroDivisionError: a fault of rank 1" in result.stderr
     assert time.monotonic() - began < 30
@@ -201,6 +201,7 @@ def test_every_command_works_under_mpirun(tmp_path: Path) -> None:
 
 def test_the_package_is_light() -> None:
     assert package.__version__
-    code = "import sys, fracsim.cli; print([name for name in %r if name in sys.modules])" % ((*HEAVY, "numpy", "pydantic"),)
+    heavy = (*HEAVY, "numpy", "pydantic")
+    code = f"import sys, fracsim.cli; print([name for name in {heavy!r} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.strip() == "[]"

@@ -15,18 +15,21 @@ from xml.etree import ElementTree
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 import pytest
-import xdmf_reader
-from cases import BAR, STRIP, command, study, write_study
 from mpi4py import MPI
 
+import xdmf_reader
+from cases import BAR, STRIP, command, study, write_study
 from fracsim.run import Run, build_scene
 from fracsim.study import Study
 from fracsim.study_file import load_study
 
-COLUMNS = (
-    "step time dt kinetic elastic dissipated external_work broken_edges split_cells pieces newton_its krylov_its wall_step"
-).split()
+Values = npt.NDArray[Any]
+COLUMNS = [
+    "step", "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
+    "newton_its", "krylov_its", "wall_step",
+]  # fmt: skip
 XDMF_TENSOR = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # of the six components in XDMF's order: xx xy xz yy yz zz
 
 
@@ -48,7 +51,7 @@ def output(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return Output(made, folder, Run(build_scene(MPI.COMM_SELF, made), folder)())
 
 
-def history(folder: Path) -> dict[str, np.ndarray]:
+def history(folder: Path) -> dict[str, Values]:
     with (folder / "history.csv").open(newline="") as file:
         rows = list(csv.reader(file))
     return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
@@ -106,7 +109,7 @@ def test_the_summary_is_complete(output: Output) -> None:
 
 
 def test_the_strip_tears(output: Output) -> None:
-    """So that the fields above are of a body with damage: broken edges, split cells and pieces agree with the fields."""
+    """So that the fields are of a body with damage: broken edges, split cells and pieces agree with them."""
     with h5py.File(output.folder / "fields.h5") as file:
         last = file["frames"][max(file["frames"])]
         if "damage" not in last:
@@ -121,7 +124,7 @@ def test_the_strip_tears(output: Output) -> None:
 # --- fields ---------------------------------------------------------------------------------------------------------
 
 
-def frames_by_hand(folder: Path) -> list[tuple[float, dict[tuple[str, str], np.ndarray]]]:
+def frames_by_hand(folder: Path) -> list[tuple[float, dict[tuple[str, str], Values]]]:
     """(time, (centre, name) -> values) from the XML and what it points at in the HDF5 file."""
     collections = ElementTree.parse(folder / "fields.xdmf").getroot().findall("Domain/Grid")
     assert len(collections) == 1 and collections[0].get("CollectionType") == "Temporal"
@@ -129,7 +132,7 @@ def frames_by_hand(folder: Path) -> list[tuple[float, dict[tuple[str, str], np.n
         return [_frame(grid, file) for grid in collections[0].findall("Grid")]
 
 
-def _frame(grid: ElementTree.Element, file: h5py.File) -> tuple[float, dict[tuple[str, str], np.ndarray]]:
+def _frame(grid: ElementTree.Element, file: h5py.File) -> tuple[float, dict[tuple[str, str], Values]]:
     assert grid.get("GridType") == "Uniform"
     found = {("Mesh", part): _item(grid.find(f"{part}/DataItem"), file) for part in ("Topology", "Geometry")}
     for each in grid.findall("Attribute"):
@@ -137,7 +140,7 @@ def _frame(grid: ElementTree.Element, file: h5py.File) -> tuple[float, dict[tupl
     return float(grid.find("Time").get("Value")), found  # type: ignore[union-attr, arg-type]
 
 
-def _item(element: ElementTree.Element | None, file: h5py.File) -> np.ndarray:
+def _item(element: ElementTree.Element | None, file: h5py.File) -> Values:
     assert element is not None and element.text is not None and element.get("Format") == "HDF"
     name, _, path = element.text.partition(":")
     assert name == Path(file.filename).name
@@ -146,7 +149,8 @@ def _item(element: ElementTree.Element | None, file: h5py.File) -> np.ndarray:
     assert (element.get("NumberType"), element.get("Precision")) == (
         "Int" if data.dtype.kind == "i" else "Float", str(data.dtype.itemsize),
     )  # fmt: skip
-    return data[()]
+    values: Values = data[()]
+    return values
 
 
 def test_one_grid_a_time_carries_all_fields(output: Output) -> None:
@@ -191,7 +195,8 @@ def test_vtk_reads_the_same(output: Output, tmp_path: Path) -> None:
             full = values[:, XDMF_TENSOR] if name == "stress" else values
             assert np.array_equal(read[f"{index}/{centre}/{name}"], full), name
         points = fields["Mesh", "Geometry"]
-        assert np.array_equal(read[f"{index}/points"], points) and read[f"{index}/cells"] == len(fields["Mesh", "Topology"])
+        assert np.array_equal(read[f"{index}/points"], points)
+        assert read[f"{index}/cells"] == len(fields["Mesh", "Topology"])
         warped = points + fields["Node", "displacement"]
         assert np.allclose(read[f"{index}/warped"], warped, rtol=1e-6, atol=1e-7)  # VTK warps in single precision
 

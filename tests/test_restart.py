@@ -14,14 +14,16 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 import pytest
-from cases import BAR, STRIP, changed, command, fracsim, study, write_study
 from mpi4py import MPI
 
+from cases import BAR, STRIP, changed, command, fracsim, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.run import Run, build_scene
 
 Data = dict[str, Any]
+Values = npt.NDArray[Any]
 
 # Tight tolerances: what is left of the difference between two ways to the same state is their solver error.
 SOLVER = {"snes_rtol": 1e-11, "ksp_rtol": 1e-9}
@@ -30,10 +32,10 @@ TEARING: Data = changed(
     output={"fields": ["damage", "chi", "piece"]},
 )  # fmt: skip
 # kept apart from `wall_step`, which is a time, and the iteration counts, which depend on the preconditioner's history
-PHYSICAL = (
-    "time dt kinetic elastic dissipated external_work broken_edges split_cells pieces reaction_grip_x reaction_grip_y "
-    "probe_tip_x probe_tip_y"
-).split()
+PHYSICAL = [
+    "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
+    "reaction_grip_x", "reaction_grip_y", "probe_tip_x", "probe_tip_y",
+]  # fmt: skip
 
 
 def run(data: Data, folder: Path, *, restart: bool = False, wall_limit: float | None = None) -> dict[str, Any]:
@@ -41,13 +43,13 @@ def run(data: Data, folder: Path, *, restart: bool = False, wall_limit: float | 
     return Run(scene, folder, restart=restart, wall_limit=wall_limit)()
 
 
-def history(folder: Path) -> dict[str, np.ndarray]:
+def history(folder: Path) -> dict[str, Values]:
     with (folder / "history.csv").open(newline="") as file:
         rows = list(csv.reader(file))
     return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
 
 
-def last_frame(folder: Path) -> dict[str, np.ndarray]:
+def last_frame(folder: Path) -> dict[str, Values]:
     with h5py.File(folder / "fields.h5") as file:
         frame = file["frames"][max(file["frames"])]
         return {"time": frame.attrs["time"]} | {name: data[()] for name, data in frame.items()}
@@ -95,7 +97,8 @@ def stopped_after(data: Data, folder: Path, steps: int) -> None:
     scene.stepper.advance = counted  # type: ignore[method-assign]
     with pytest.raises(Stopped) as end:
         Run(scene, folder)()
-    assert str(end.value).startswith(f"stopped by signal SIGTERM at t = {steps * scene.study.time.step:g} s after {steps} steps")
+    t = steps * scene.study.time.step
+    assert str(end.value).startswith(f"stopped by signal SIGTERM at t = {t:g} s after {steps} steps")
     assert f"Checkpoint: {folder / 'checkpoint' / 'state.h5'}; go on with --restart" in str(end.value)
 
 
@@ -161,7 +164,7 @@ def test_a_checkpoint_without_fracture_can_go_on_with_it(tmp_path: Path) -> None
     stopped_after(plain, tmp_path / "plain", 2)
     assert run(torn, tmp_path / "plain", restart=True)["broken_edges"] > 0
     stopped_after(torn, tmp_path / "torn", 8)
-    with pytest.raises(InputError, match=r"--restart: the body in .* has broken edges; the study needs its \[fracture\] table"):
+    with pytest.raises(InputError, match=r"the body in .* has broken edges; the study needs its \[fracture\] table"):
         run(plain, tmp_path / "torn", restart=True)
 
 
@@ -190,7 +193,7 @@ def test_a_run_that_does_not_converge(tmp_path: Path) -> None:
     with pytest.raises(NotConverged) as end:
         run(data, tmp_path / "out")
     message = str(end.value)
-    assert message.startswith("no solution at t = 0.01 s with a step of 0.01 s (time.adapt is off). Newton's method stopped")
+    assert message.startswith("no solution at t = 0.01 s with a step of 0.01 s (time.adapt is off). Newton's method")
     assert "Last good time: 0 s." in message
     assert f"Checkpoint: {tmp_path / 'out' / 'checkpoint' / 'state.h5'}; go on with --restart" in message
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["outcome"] == "not converged"
@@ -225,7 +228,8 @@ def test_ending_mpirun_itself_leaves_a_checkpoint(tmp_path: Path) -> None:
 def signalled(folder: Path, name: str, ranks: int) -> tuple[int, str]:
     """Exit code and stderr of a long run that gets a signal after some steps; its checkpoint is there."""
     bar = write_study(folder / "bar.toml", BAR, time={"step": 1e-4, "end": 10.0}, output={"every": 1000})
-    process = subprocess.Popen(command("run", bar, "-o", folder / "out", ranks=ranks), stderr=subprocess.PIPE, text=True)
+    arguments = command("run", bar, "-o", folder / "out", ranks=ranks)
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
     rows = folder / "out" / "history.csv"
     until = time.monotonic() + 40
     while time.monotonic() < until and (not rows.exists() or rows.stat().st_size < 1000):

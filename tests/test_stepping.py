@@ -218,8 +218,8 @@ def test_gravity_on_a_free_body_is_free_fall() -> None:
 def test_damping_does_not_hold_a_rigid_spin_back() -> None:
     """Stiffness damping of a nonlinear body sees strain rates only: a rigidly turning body loses nothing to it.
 
-    The strain rate is taken with F at the start of the step, off by w^2 dt: the loss falls with dt^2 and tends to what the
-    small vibration about the stretched shape loses, a share (w L / c0)^2 of the energy.
+    The strain rate is taken with F at the start of the step, off by w^2 dt: the loss falls with dt^2 to nothing (but for
+    the vibration about the stretched shape, a share (w L / c0)^2 = 2e-5 of the energy).
     """
     losses, stiff = [], 2e5
     for steps in (50, 100, 200):
@@ -234,7 +234,7 @@ def test_damping_does_not_hold_a_rigid_spin_back() -> None:
         march(scene, state)
         losses.append(abs(state.dissipated) / kinetic)
     assert slopes(losses)[-1] == pytest.approx(2, abs=0.2)
-    assert (4 * losses[2] - losses[1]) / 3 < 10 * 3.0 / stiff + 1e-2 * losses[2]
+    assert abs(4 * losses[2] - losses[1]) / 3 < 0.1 * losses[2]
 
 
 def test_step_halving_reaches_the_same_end() -> None:
