@@ -75,6 +75,7 @@ def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equil
         graph.break_edges(graph.flags_of_keys(broken))
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
+    state.elastic = equations.elastic_energy()
 
 
 def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:

@@ -156,15 +156,23 @@ class Equilibrium:
 
     def begin(self, t: float, dt: float, start: Values, v: Values, a: Values) -> None:
         """Set the end time, the loads and the scheme's references; `start`, v, a are the owned state at t - dt."""
-        self.dt = dt
         self.c_a, self.c_v = self.scheme.rates(dt)
-        self._references = self.scheme.references(dt, start, v, a)
+        self._refer(t, start, *self.scheme.references(dt, start, v, a))
+
+    def hold(self, t: float, u: Values, v: Values) -> None:
+        """Put the body at u with velocity v at time t, without acceleration: the state a run starts from."""
+        self.displace(u)
+        self._refer(t, u, u, u - v / self.c_v)
+
+    def _refer(self, t: float, start: Values, u_a: Values, u_v: Values) -> None:
+        self._references = u_a, u_v
         self._prescribed.x.array[self.motion.dofs] = self.motion.at(t)
         self.set_loads(t)
         if self.u_n is not None:
             self.u_n.x.array[: self._owned] = start
-            self.u_v.x.array[: self._owned] = self._references[1]
-            self.u_n.x.scatter_forward(), self.u_v.x.scatter_forward()
+            self.u_v.x.array[: self._owned] = u_v
+            self.u_n.x.scatter_forward()
+            self.u_v.x.scatter_forward()
             self._c_v.value = self.c_v
 
     def set_loads(self, t: float) -> None:

@@ -73,7 +73,7 @@ def _sentence(error: Any) -> str:
         return _PATTERNS[context["pattern"]]
     if context.get("expected") == "'free'":
         return 'must be a number or "free"'
-    text = error["msg"].removeprefix("Input ").replace("should be", "must be")
+    text = str(error["msg"]).removeprefix("Input ").replace("should be", "must be")
     if kind == "literal_error" and isinstance(error["input"], str):
         allowed = context["expected"].replace(" or ", ", ").replace("'", "").split(", ")
         near = difflib.get_close_matches(error["input"], allowed, n=1, cutoff=0.65)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -26,11 +27,11 @@ _HEAD = (
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a frame: rows in input order; `centre` is Node or Cell."""
+    """One field of a frame: an array of rows in input order (None on ranks other than 0); `centre` is Node or Cell."""
 
     name: str
     centre: str
-    values: npt.NDArray[np.generic]
+    values: Any
 
 
 class FieldsFile:

@@ -56,13 +56,15 @@ class Frames:
         if name == "damage":
             return self._broken_share()
         if name == "chi":
+            assert self._equations.chi is not None
             return self._equations.chi.x.array[: self._domain.cell_count]
         values = self._carried(name)
         return values[:, 0] if values.shape[1] == 1 else values
 
     def _broken_share(self) -> Values:
         """Broken edges of a cell over all its edges, 0 to 1."""
-        return self._fracture.graph.broken[self._fracture.graph.cell_edges].mean(axis=1)
+        graph = self._fracture.graph
+        return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
 
     def _carried(self, name: str) -> Values:
         """An expression of the deformation, times chi: what the damaged body really carries."""

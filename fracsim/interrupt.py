@@ -45,4 +45,4 @@ def _max_each(a: tuple[int, bool], b: tuple[int, bool], _: object = None) -> tup
     return max(a[0], b[0]), a[1] or b[1]
 
 
-_WORST = MPI.Op.Create(_max_each, commute=True)
+_WORST = MPI.Op.Create(_max_each, commute=True)  # type: ignore[arg-type]  # Python objects, not buffers

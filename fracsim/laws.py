@@ -47,7 +47,7 @@ def integral_in_time(value: Any, key: str, size: int) -> Law:
         inner = corners[(corners > 0) & (corners < t)]
         knots = np.concatenate([[0.0], inner, [t]])
         rates = np.array([rate(knot) for knot in knots])
-        return np.sum(np.diff(knots)[:, None] * (rates[1:] + rates[:-1]) / 2, axis=0)
+        return np.asarray(np.diff(knots) @ (rates[1:] + rates[:-1]) / 2)
 
     return integrated
 

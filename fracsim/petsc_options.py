@@ -23,6 +23,7 @@ COMMON = (
 )  # fmt: skip
 
 _prefixes = itertools.count()
+PETSc.Options()["options_left"] = "false"  # what PETSc would say at the end is checked here at the start
 _library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptionsUsed
 
 

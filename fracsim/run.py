@@ -82,9 +82,17 @@ def make_scheme(timing: Time) -> Scheme:
 class Run:
     """Steps a scene to its end and writes the output folder."""
 
-    def __init__(self, scene: Scene, folder: Path, *, restart: bool = False, wall_limit: float | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        folder: Path,
+        *,
+        restart: bool = False,
+        wall_limit: float | None = None,
+        began: float | None = None,
+    ) -> None:
+        """Start or resume; makes the output folder. `began`: when the work on the scene began (perf_counter)."""
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
-        self._began = time.perf_counter()
         self._interrupt = Interrupt(self.comm, wall_limit)
         self.state = scene.stepper.start(scene.study.initial)
         if restart:
@@ -92,7 +100,7 @@ class Run:
         self._prepare(restart)
         self._damage = self._count_damage()
         self.output_seconds = 0.0
-        self._setup_seconds = 0.0
+        self._began = time.perf_counter() if began is None else began
 
     @property
     def _graph(self) -> Any:
@@ -126,8 +134,9 @@ class Run:
             with self._interrupt, progress:
                 self._loop(progress)
         except (NotConverged, Stopped) as error:
+            checkpoint = self._checkpoint()
             self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
-            raise type(error)(f"{error}. Checkpoint: {self._checkpoint()}; go on with --restart") from None
+            raise type(error)(f"{error}. Checkpoint: {checkpoint}; go on with --restart") from None
         return self._finish("done")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
@@ -136,6 +145,8 @@ class Run:
         self.history.close()
         if self.comm.rank == 0:
             (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+            if self.scene.study.output.picture:
+                _draw(self.folder)
         return summary
 
     def _loop(self, progress: Progress) -> None:
@@ -259,23 +270,25 @@ def run_study(
     comm: MPI.Comm, study: Study, folder: Path, *, restart: bool = False, wall_limit: float | None = None
 ) -> dict[str, Any]:
     """Build, run, draw the last frame; returns the summary (collective)."""
+    began = time.perf_counter()
     scene = build_scene(comm, study)
     if scene.domain.source is not None:
         for note in scene.domain.source.notes:
             print(f"fracsim: note: {note}", file=sys.stderr)
     try:
-        summary = Run(scene, folder, restart=restart, wall_limit=wall_limit)()
+        return Run(scene, folder, restart=restart, wall_limit=wall_limit, began=began)()
     finally:
         scene.solver.forget_options()
-    if study.output.picture:
-        on_root(comm, lambda: _draw(folder))
-    return summary
 
 
 def _draw(folder: Path) -> None:
+    """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
     from .picture import render_last
 
-    render_last(folder)
+    try:
+        render_last(folder)
+    except (ImportError, OSError, RuntimeError) as error:
+        print(f"fracsim: no picture drawn: {error}", file=sys.stderr)
 
 
 __all__ = ["Report", "Run", "Scene", "build_scene", "run_study"]

@@ -19,6 +19,7 @@ class State:
         u, v, a: (owned dofs,) displacement, velocity, acceleration in m, m/s, m/s^2.
         dissipated: energy lost to fracture and damping, J.    work: external work, J (both summed over ranks).
         easy: steps in a row that went without halving.
+        elastic: elastic energy at t on this rank, J.
     """
 
     u: Values
@@ -30,5 +31,6 @@ class State:
     dissipated: float = 0.0
     work: float = 0.0
     easy: int = 0
+    elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))  # loads and reactions at t, N
     drag: Values | None = None  # damping forces at t, N

@@ -55,11 +55,13 @@ class Stepper:
         return state
 
     def _hold(self, state: State) -> None:
-        """Loads, reactions and accelerations that belong to the state's displacement."""
+        """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
         equations = self.equations
-        equations.begin(state.t, self.timing.step, state.u, state.v, state.a)
-        equations.displace(state.u)
+        equations.hold(state.t, state.u, state.v)
         unbalanced = equations.internal_force() - equations.applied_force()
+        if (drag := equations.viscous_force()) is not None:
+            state.drag = drag
+            unbalanced = unbalanced + drag
         free = np.ones(len(unbalanced), bool)
         free[equations.held] = False
         if equations.scheme.inertia and self.timing.scheme == "newmark":
@@ -120,6 +122,10 @@ class Stepper:
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old)
         broken, released, elastic = self._break(state)
+        if not equations.scheme.inertia:
+            # what is neither stored nor moving is gone: releases, and the body's relaxation after them
+            released, viscous = work - (elastic - state.elastic), 0.0
+        state.elastic = elastic
         kinetic = equations.kinetic_energy(state.v) if equations.scheme.inertia else 0.0
         sums = total(self.comm, np.array([work, viscous + released, kinetic, elastic]))
         state.work += float(sums[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
@@ -54,9 +54,12 @@ def _shape(value: Any) -> str:
     return "<table>" if isinstance(value, dict | TimeTable) else "<constant>"
 
 
-type InTime[Value] = Annotated[
-    Annotated[Value, Tag("<constant>")] | Annotated[TimeTable[Value], Tag("<table>")], Discriminator(_shape)
-]
+if TYPE_CHECKING:
+    type InTime[Value] = Value | TimeTable[Value]
+else:
+    type InTime[Value] = Annotated[
+        Annotated[Value, Tag("<constant>")] | Annotated[TimeTable[Value], Tag("<table>")], Discriminator(_shape)
+    ]
 
 
 class Mesh(BaseModel):

@@ -7,17 +7,20 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from fracsim.edge_stress import edge_vectors, normal_stress
-from fracsim.fracture import hashed
+from fracsim.fracture import FracturePass, hashed
 from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
 from fracsim.graph import local_edges
 from fracsim.kernels import CellExpression
 from fracsim.run import Scene
 from fracsim.state import State
+from fracsim.study import Fracture
 from scipy.stats import kstest, pearsonr
 from support.laws import rotation
+from support.oscillator import slopes
 from support.scenes import Values, cell_corners, deform, displacement, each_step, make_scene, march, positions
 
 EPS = np.finfo(float).eps
@@ -32,12 +35,12 @@ def edge_directions(scene: Scene) -> Values:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def cauchy_of(scene: Scene) -> Values:
-    """(cells, 3 or 6) Cauchy stress of the undegraded energy at the present displacement."""
+def cauchy_of(scene: Scene) -> CellExpression:
+    """(cells, 3 or 6) Cauchy stress of the undegraded energy, evaluated at the displacement of the moment."""
     equations, domain = scene.equations, scene.domain
     rotations = equations.rotation.field if equations.rotation is not None else None
     stress = cauchy_stress(equations.material.energy, deformation_gradient(equations.u), rotations)
-    return CellExpression(domain.comm, domain.mesh, symmetric_components(stress), domain.cell_count)()
+    return CellExpression(domain.comm, domain.mesh, symmetric_components(stress), domain.cell_count)
 
 
 def pulled_bar(dim: int, scheme: str, steps: int, **fracture: Any) -> tuple[Scene, State]:
@@ -127,7 +130,7 @@ def test_quasi_static_energy_balance_through_fracture() -> None:
     The stress stays uniform: edges along the load break at s = 0.065, leaving chi = 1/3, then the diagonals, which carry
     s / 2, at 0.13. Between breaks the force is linear in the pull, and a break at a fixed pull does no work.
     """
-    scene, state = pulled_bar(2, "quasi-static", 20, strength=0.065, tie_break=0.0)
+    scene, state = pulled_bar(2, "quasi-static", 20, strength=0.065 * (1 - SOLVED), tie_break=0.0)
     for report in each_step(scene, state):
         stiffness = 1.0 if state.step < 7 else 1 / 3 if state.step < 13 else 0.0
         assert report.elastic == pytest.approx(stiffness * 0.5 * state.t**2 * 0.5, abs=1e-8 * 0.5)
@@ -163,7 +166,7 @@ def test_eq_28_on_random_damage() -> None:
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, fracture={"strength": 1e9})
     graph, random = scene.fracture.graph, np.random.default_rng(3)
     deform(scene, np.eye(3) + random.uniform(-0.1, 0.1, (3, 3)))
-    stress = cauchy_of(scene)
+    stress = cauchy_of(scene)()
     np.testing.assert_allclose(stress, np.tile(stress[0], (len(stress), 1)), atol=1e-14)
     load = np.abs(normal_stress(stress, edge_vectors(cell_corners(scene))))
     expected = np.ones(len(load))
@@ -191,20 +194,33 @@ def test_an_unstressed_cell_keeps_its_stiffness() -> None:
 # --- rotation ---
 
 
-def stressed_block(dim: int, energy: str, strength: float, radius: float = 0.0) -> Scene:
+def stressed_block(dim: int, energy: str) -> Scene:
     """A block of an energy that bears rotation."""
     return make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0, 1.0][:dim], "h": 0.5, "pattern": "unstructured"},
         material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
-        fracture={"strength": strength, "radius": radius, "tie_break": 0.0},
+        fracture={"strength": 1e9},
     )[0]
 
 
-def current_edge_stress(scene: Scene) -> Values:
+def make_pass(scene: Scene, strength: float, radius: float) -> FracturePass:
+    """A pass of its own on the same body."""
+    return FracturePass(scene.equations, Fracture(strength=strength, radius=radius, tie_break=0.0), scene.study.material)
+
+
+def broken_by(fracture: FracturePass) -> npt.NDArray[np.bool_]:
+    """(edges,) what one pass breaks of the undamaged body, which is undamaged again afterwards."""
+    graph = fracture.graph
+    fracture()
+    broken = graph.broken.copy()
+    graph.broken[:], graph.pattern[:] = False, 0
+    return broken
+
+
+def along_edges(scene: Scene, stress: Values) -> Values:
     """(cells, k) normal stress along the edges of the deformed cells."""
     u = scene.equations.u.x.array.reshape(-1, scene.domain.dim)
-    corners = (scene.domain.nodes + u)[scene.domain.cell_nodes]
-    return normal_stress(cauchy_of(scene), edge_vectors(corners))
+    return normal_stress(stress, edge_vectors((scene.domain.nodes + u)[scene.domain.cell_nodes]))
 
 
 def strain_field(scene: Scene, dim: int) -> Values:
@@ -221,22 +237,18 @@ def test_turning_a_stressed_body_breaks_no_edge(energy: str, dim: int, radius: f
 
     At a strength just above the largest stress nothing breaks before or after the turn; just below it, the same edges do.
     """
-    probe = stressed_block(dim, energy, 1e9)
-    x, X = strain_field(probe, dim), positions(probe)
-    probe.equations.displace((x - X).reshape(-1))
-    before = current_edge_stress(probe)
-    broken = []
+    scene = stressed_block(dim, energy)
+    x, X = strain_field(scene, dim), positions(scene)
+    scene.equations.displace((x - X).reshape(-1))
+    stress, broken = cauchy_of(scene), []
+    before = along_edges(scene, stress()).copy()
+    strong = make_pass(scene, before.max() * (1 + SOLVED), radius)
+    weak = make_pass(scene, 0.4 * before.max(), radius)
     for Q in (np.eye(dim), rotation(dim, 2), rotation(dim, 8)):
-        probe.equations.displace((x @ Q.T - X).reshape(-1))
-        np.testing.assert_allclose(current_edge_stress(probe), before, atol=1e3 * EPS)
-        if radius == 0:
-            strong = stressed_block(dim, energy, before.max() * (1 + 1e-9))
-            strong.equations.displace((x @ Q.T - X).reshape(-1))
-            assert strong.fracture().broken == 0
-        weak = stressed_block(dim, energy, 0.4 * before.max(), radius)
-        weak.equations.displace((x @ Q.T - X).reshape(-1))
-        weak.fracture()
-        broken.append(weak.fracture.graph.broken.copy())
+        scene.equations.displace((x @ Q.T - X).reshape(-1))
+        np.testing.assert_allclose(along_edges(scene, stress()), before, atol=1e3 * EPS)
+        assert not broken_by(strong).any()
+        broken.append(broken_by(weak))
     assert 0 < np.count_nonzero(broken[0]) < len(broken[0])
     assert np.array_equal(broken[0], broken[1])
     assert np.array_equal(broken[0], broken[2])
@@ -307,7 +319,7 @@ def test_energy_balance_of_dynamic_fracture() -> None:
     """Trapezoidal rule: work = kinetic + elastic + dissipated while a bar is torn; the error falls with the step.
 
     A break leaves the acceleration of the step that it ended as it was before, so every break costs an imbalance of the
-    released nodal force times a displacement increment: first order in dt, and no more than a few per cent here.
+    released nodal force times a displacement increment: first order in dt, half a per cent of the work at the last step.
     """
     errors = []
     for dt in (0.04, 0.02, 0.01):
@@ -320,8 +332,8 @@ def test_energy_balance_of_dynamic_fracture() -> None:
         report = march(scene, state)[-1]
         assert scene.fracture.graph.broken_count > 0
         errors.append(abs(state.work - report.kinetic - report.elastic - state.dissipated) / state.work)
-    assert errors[-1] < 0.02
-    assert errors[-1] < 0.7 * errors[0]
+    assert errors[-1] < 0.01
+    assert slopes(errors)[-1] == pytest.approx(1, abs=0.2)
 
 
 @pytest.mark.parametrize("dim", (2, 3))

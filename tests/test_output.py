@@ -79,7 +79,7 @@ def test_history_has_its_columns_and_a_row_a_step(output: Output) -> None:
     probes += [f"probe_tip_{axis}" for axis in axes] if "strip" in output.study.title else []
     rows = history(output.folder)
     assert list(rows) == COLUMNS + probes
-    assert rows["step"].tolist() == list(range(1, output.summary["steps"] + 1))
+    assert np.array_equal(rows["step"], np.arange(1, output.summary["steps"] + 1))
     assert np.allclose(rows["time"], np.cumsum(rows["dt"]))
     assert rows["time"][-1] == pytest.approx(output.study.time.end)
     assert all(np.isfinite(column).all() for column in rows.values())

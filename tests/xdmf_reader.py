@@ -29,7 +29,7 @@ def main(source: str, target: str) -> None:
     for index, t in enumerate(times):
         reader.UpdateTimeStep(t)
         found |= {f"{index}/{key}": value for key, value in fields(reader.GetOutputDataObject(0)).items()}
-    np.savez(target, **found)
+    np.savez(target, **found)  # type: ignore[arg-type]
 
 
 def fields(grid: Any) -> dict[str, Any]:

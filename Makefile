@@ -1,0 +1,38 @@
+# Every target runs inside the environment, which ./env makes on first use.
+ranks := 2
+sources := fracsim forms meshes studies tests
+
+.PHONY: demo test test-all bench lint format clean
+
+# Tear a loaf of bread in two.
+demo:
+	./env mpirun --oversubscribe --timeout 1800 -n $(ranks) fracsim run loaf -o out/loaf
+	@echo
+	@echo "The torn loaf is in out/loaf:"
+	@ls -1 out/loaf
+	@echo "Open out/loaf/fields.xdmf in ParaView (Xdmf3 Reader S), Warp By Vector, and colour by damage."
+
+test:
+	./env pytest -m "not slow"
+
+test-all:
+	./env pytest
+
+bench:
+	./env python3 -m fracsim.studies.bench -o out/bench.json
+
+# mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
+lint:
+	./env ruff check $(sources)
+	./env ruff format --check $(sources)
+	@rm -rf build/types && mkdir -p build/types/fracsim
+	@ln -s ../../../fracsim/*.py ../../../forms ../../../meshes ../../../studies build/types/fracsim/
+	cd build/types && ../../env mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p fracsim
+
+format:
+	./env ruff check --fix $(sources)
+	./env ruff format $(sources)
+
+clean:
+	rm -rf build dist out *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find $(sources) -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,32 @@
+"""Running a module of checks on several ranks, in a process group of its own with a time limit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+TESTS = Path(__file__).resolve().parents[1]
+Arrays = dict[str, npt.NDArray[np.generic]]
+
+
+def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 100) -> Arrays:
+    """Run `module` under mpirun; returns the arrays that its rank 0 saved. AssertionError with its output where it fails.
+
+    mpi4py's runner ends all ranks where one raises. `timeout` ends mpirun in a way that lets it end its children.
+    """
+    target = folder / f"{module.rpartition('.')[2]}-{ranks}.npz"
+    command = [
+        "timeout", "--kill-after=10", str(seconds), "mpirun", "--oversubscribe", "-n", str(ranks),
+        sys.executable, "-m", "mpi4py", "-m", module, str(target),
+    ]  # fmt: skip
+    # os.environ is what this process was started with: MPI's own variables, set when it was initialised here, stay behind
+    done = subprocess.run(command, cwd=TESTS, env=dict(os.environ), capture_output=True, text=True)
+    output = (done.stdout + done.stderr)[-4000:]
+    assert done.returncode == 0, f"{module} on {ranks} ranks ended with {done.returncode}:\n{output}"
+    with np.load(target) as arrays:
+        return dict(arrays)

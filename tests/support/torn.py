@@ -1,0 +1,199 @@
+"""What test_parallel compares: run on any number of ranks, it saves arrays in the order of the input mesh.
+
+    mpirun -n 2 python -m mpi4py -m support.torn OUT.npz
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from fracsim.average import NonlocalAverage
+from fracsim.domain import Domain
+from fracsim.fracture import hashed
+from fracsim.graph import EdgeGraph
+from fracsim.parallel import total
+from fracsim.pieces import find_pieces
+from fracsim.run import Scene
+from fracsim.state import State
+from mpi4py import MPI
+
+from .scenes import Values, each_step, make_scene
+
+Found = dict[str, npt.NDArray[Any]]
+
+MESHES: dict[str, dict[str, Any]] = {
+    "2d": {"builder": "box", "size": [1.0, 0.6], "h": 0.07, "pattern": "unstructured"},
+    "3d": {"builder": "box", "size": [1.0, 0.5, 0.5], "h": 0.14, "pattern": "unstructured"},
+    "comb": {"builder": "box", "size": [1.0, 1.0], "h": 1 / 24},
+    "bar": {"builder": "box", "size": [1.0, 0.25, 0.25], "h": 0.125},
+}
+KERNELS = ("linear", "constant", "gaussian")
+RADIUS = {"2d": 0.2, "3d": 0.3}
+TIGHT = {"snes_rtol": 1e-10, "ksp_rtol": 1e-10}
+
+
+# --- the same definitions on input arrays (in the test) and on distributed ones (here) ---
+
+
+def cell_field(centroids: Values) -> Values:
+    """(cells, 2) a rough field of the place, so that every rank can work it out."""
+    return np.column_stack([np.sin(40 * centroids @ np.arange(1, centroids.shape[1] + 1)), centroids[:, 0]])
+
+
+def is_active(centroids: Values) -> npt.NDArray[np.bool_]:
+    """Two cells in three, in stripes that rank boundaries cut, and none at the right end."""
+    return (np.floor(30 * centroids[:, 0]) % 3 != 0) & (centroids[:, 0] < 0.7)
+
+
+def comb(points: Values) -> npt.NDArray[np.int64]:
+    """Two interlocking combs: each winds through the whole body, so through every rank, more than once."""
+    x, y = points[:, 0], points[:, 1]
+    tooth = np.floor(8 * x).astype(int) % 2
+    return np.where(y < 0.2, 0, np.where(y > 0.8, 1, tooth)).astype(np.int64)
+
+
+def spiral(points: Values) -> npt.NDArray[np.int64]:
+    """A two-armed spiral."""
+    x, y = points[:, 0] - 0.5, points[:, 1] - 0.5
+    turns = np.arctan2(y, x) / (2 * np.pi) + 3 * np.hypot(x, y)
+    return (np.floor(2 * turns) % 2).astype(np.int64)
+
+
+def slabs(points: Values) -> npt.NDArray[np.int64]:
+    """Three cuts between planes of nodes of the bar."""
+    return np.searchsorted([0.2, 0.45, 0.8], points[:, 0])
+
+
+LABELS: dict[str, tuple[str, Callable[[Values], npt.NDArray[np.int64]]]] = {
+    "comb": ("comb", comb), "spiral": ("comb", spiral), "slabs": ("bar", slabs),
+    "whole": ("bar", lambda points: np.zeros(len(points), np.int64)),
+    "dust": ("comb", lambda points: np.round(points @ [24 * 25, 24]).astype(np.int64)),
+}  # fmt: skip
+
+
+# --- checks ---
+
+
+def averages(domain: Domain, name: str) -> Found:
+    """Averages of every kernel, of all cells and of active ones only."""
+    centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
+    values, active = cell_field(centroids), is_active(centroids)
+    found: Found = {}
+    for kernel in KERNELS:
+        average = NonlocalAverage(domain, RADIUS[name], kernel)
+        found[f"average-{name}-{kernel}"] = domain.gather_cells(average(values))
+        found[f"active-{name}-{kernel}"] = domain.gather_cells(average(values, active))
+    return found
+
+
+def pieces(label: str) -> Found:
+    """Pieces and their masses with all edges between unlike nodes broken."""
+    mesh, law = LABELS[label]
+    scene, _ = make_scene(mesh=MESHES[mesh])
+    domain, graph = scene.domain, EdgeGraph(scene.domain)
+    of_node = law(domain.nodes)
+    ends = of_node[graph.edge_nodes]
+    count = graph.break_edges(ends[:, 0] != ends[:, 1])
+    bodies = find_pieces(graph)
+    d = domain.dim
+    masses = bodies.totals(domain, scene.equations.mass[::d])
+    return {
+        f"pieces-{label}": np.array([bodies.count, count]),
+        f"piece-{label}": domain.gather_nodes(bodies.of_node[: domain.node_count]),
+        f"piece-mass-{label}": masses,
+    }
+
+
+def edges(domain: Domain) -> Found:
+    """Edges broken from the side of single cells, and the hashed number of every edge's mid-point."""
+    graph = EdgeGraph(domain)
+    flags = np.zeros(len(graph.broken), bool)
+    flags[graph.cell_edges[domain.cell_input % 7 == 0]] = True
+    count = graph.break_edges(flags)
+    ends = domain.nodes[graph.edge_nodes[: graph.edge_count]]
+    keys = graph.edge_keys(np.arange(graph.edge_count))
+    every = domain.comm.gather((keys, hashed(ends[:, 0] + ends[:, 1])))
+    found = {
+        "edges-broken": graph.broken_keys(),
+        "edges-count": np.array([count, total(domain.comm, graph.broken_count)[0]]),
+        "edges-patterns": domain.gather_cells(graph.pattern.astype(np.int64)),
+    }
+    if every is not None:
+        keys, noise = (np.concatenate(parts) for parts in zip(*every, strict=True))
+        order = np.lexsort(keys.T[::-1])
+        found |= {"edges-keys": keys[order], "edges-noise": noise[order]}
+    return found
+
+
+def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) -> Found:
+    """Everything that must not depend on the partition."""
+    domain, found = scene.domain, {f"{name}-history": np.array(rows)}
+    found[f"{name}-u"] = domain.gather_nodes(state.u.reshape(-1, domain.dim))
+    found[f"{name}-v"] = domain.gather_nodes(state.v.reshape(-1, domain.dim))
+    found[f"{name}-energy"] = np.array([state.work, state.dissipated])
+    found[f"{name}-mass"] = domain.gather_nodes(scene.equations.mass.reshape(-1, domain.dim))
+    if scene.fracture is not None:
+        found[f"{name}-chi"] = domain.gather_cells(scene.equations.chi.x.array[: domain.cell_count])
+        found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
+        found[f"{name}-pieces"] = np.array([find_pieces(scene.fracture.graph).count])
+    return found
+
+
+SOFT = {"young": 1.0, "poisson": 0.3, "density": 1.0}
+RUNS: dict[str, dict[str, Any]] = {
+    # unstructured, finite strain, averaged, torn to pieces
+    "plate": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.1]}],
+        "fracture": {"strength": 0.2, "radius": 0.15}, "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.4},
+        "probe": [{"name": "grip", "on": "right"}, {"name": "tip", "point": [0.5, 0.3]}],
+    },
+    "block": {
+        "mesh": MESHES["3d"], "material": SOFT | {"energy": "corotated"}, "load": {"gravity": [0.0, 0.0, -0.01]},
+        "boundary": [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.4, 0.0, 0.1]}],
+        "fracture": {"strength": 0.15, "radius": 0.25, "kernel": "gaussian"},
+        "damping": {"mass": 0.1, "stiffness": 0.01},
+        "time": {"scheme": "newmark", "step": 0.05, "end": 1.0},
+        "probe": [{"name": "grip", "on": "right"}],
+    },
+    # a symmetric lattice in uniform stress: all aligned edges are tied, and only the hashed noise decides
+    "ties": {
+        "mesh": {"builder": "box", "size": [1.0, 0.5], "h": 0.0625}, "material": SOFT | {"energy": "linear", "poisson": 0.0},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
+            "time": [0.0, 1.0], "value": [[0.0, "free"], [0.2, "free"]]}}],
+        "fracture": {"strength": 0.1, "radius": 0.15, "tie_break": 1e-6},
+        "time": {"scheme": "quasi-static", "step": 0.125, "end": 1.0},
+        "probe": [{"name": "grip", "on": "right"}],
+    },
+}  # fmt: skip
+
+
+def run(name: str) -> Found:
+    """A study to its end; rows of (broken, kinetic, elastic, probes)."""
+    scene, state = make_scene(**RUNS[name], solver=TIGHT)
+    rows = [[r.broken, r.kinetic, r.elastic, *scene.probes()] for r in each_step(scene, state)]
+    return result_of(name, scene, state, rows)
+
+
+def main(path: str) -> None:
+    """All checks; rank 0 saves."""
+    found: Found = {}
+    for name in ("2d", "3d"):
+        scene, _ = make_scene(mesh=MESHES[name])
+        found |= averages(scene.domain, name)
+        if name == "3d":
+            found |= edges(scene.domain)
+    for label in LABELS:
+        found |= pieces(label)
+    for name in RUNS:
+        found |= run(name)
+    if MPI.COMM_WORLD.rank == 0:
+        np.savez(path, **found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
