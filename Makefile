@@ -2,7 +2,7 @@
 ranks := 2
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all bench lint format clean
+.PHONY: demo test test-all readers bench lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -12,11 +12,16 @@ demo:
 	@ls -1 out/loaf
 	@echo "Open out/loaf/fields.xdmf in ParaView (Xdmf3 Reader S), Warp By Vector, and colour by damage."
 
-test:
+test: readers
 	./env pytest -m "not slow"
 
-test-all:
+test-all: readers
 	./env pytest
+
+# Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
+readers:
+	@./env sh -c 'there=$${VIRTUAL_ENV%/*}/vtk-reader; test -e $$there/ready || { echo "fetching a VTK that reads XDMF (once)"; \
+	    pip install --quiet --no-deps --target $$there vtk==9.7.2 && touch $$there/ready; }'
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json

@@ -37,8 +37,8 @@ def viscous_work(
     """Stiffness-proportional damping, int chi b (C : Edot) : sym(F_n^T grad w) dX with Edot = sym(F_n^T grad v).
 
     At small strain this is Rayleigh's b K v (b in s). K of the deformed body would be neither positive nor blind to a
-    rotating stressed body; this form always dissipates, int b Edot : C : Edot. F_n is that of the start of the step, which
-    keeps the term linear in v; a rigid spin w then has a strain rate of about w^2 dt, which vanishes with the step.
+    rotating stressed body; this form always dissipates, int b Edot : C : Edot. F_n is that of the start of the step,
+    which keeps the term linear in v; a rigid spin w then has a strain rate of about w^2 dt, which vanishes with dt.
     """
     F_n = ufl.Identity(u_n.ufl_shape[0]) if energy.linear else deformation_gradient(u_n)
     rate, virtual = (ufl.sym(F_n.T * ufl.grad(field)) for field in (v, w))

@@ -2,7 +2,7 @@
 
 Every energy is a frozen dataclass with Lame's parameters mu and lmbda in Pa (numbers, or UFL coefficients for
 fields) and a method `psi`. It is written on the d x d block of F, so that the same lines serve 3D and plane strain
-(F33 = 1); plane stress is the same again with the reduced lambda* of `plane_stress_lambda`, for the energies that allow it.
+(F33 = 1); plane stress is the same again with the reduced lambda* of `plane_stress_lambda`, for energies that allow it.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def elastic_stress(energy: Energy, strain: Expr) -> Expr:
 
 
 def full_cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
-    """3 x 3 Cauchy stress in Pa of a 2D or 3D body; in 2D with the out-of-plane stress of plane strain or plane stress."""
+    """3 x 3 Cauchy stress in Pa of a 2D or 3D body; in 2D with the stress out of the plane."""
     if F.ufl_shape[0] == 3 or energy.reduced:
         return embed(cauchy_stress(energy, F, rotation), 0.0)
     return cauchy_stress(energy, embed(F, 1.0), embed(rotation, 1.0) if rotation is not None else None)

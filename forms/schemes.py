@@ -4,9 +4,9 @@ Every implicit scheme is written as
 
     a = c_a (u - u_a),    v = c_v (u - u_v),
 
-with numbers c_a (1/s^2), c_v (1/s) that depend on dt and vectors u_a, u_v (m) that depend on the state at the start of the
-step. Differences of displacements, not sums with u / dt^2, keep the digits at small dt. The arrays may be of any kind that
-adds and multiplies.
+with numbers c_a (1/s^2), c_v (1/s) that depend on dt and vectors u_a, u_v (m) that depend on the state at the start of
+the step. Differences of displacements, not sums with u / dt^2, keep the digits at small dt. The arrays may be of any
+kind that adds and multiplies.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class NonlocalAverage:
         self._full = np.asarray(self._weights.sum(axis=1))
 
     def __call__(self, values: Values, active: npt.NDArray[np.bool_] | None = None) -> Values:
-        """Averages (cells, n) of cell values (cells, n); cells that are not `active` enter none. 0 where none is left."""
+        """Averages (cells, n) of cell values (cells, n); cells not `active` enter none. 0 where none is left."""
         if active is None:
             return (self._weights @ self._exchange(values)[self._order]) / self._full
         counted = np.column_stack([np.where(active[:, None], values, 0.0), active])

@@ -83,7 +83,11 @@ class Domain:
     @cached_property
     def nodes(self) -> npt.NDArray[np.float64]:
         """(nodes, d) reference coordinates X of owned and ghost nodes, m."""
-        return self.space.tabulate_dof_coordinates()[:, : self.dim]
+        # the bits of the input: tabulated dof coordinates depend in the last digit on the cell, and so on the partition
+        count = self.node_count + self.space.dofmap.index_map.num_ghosts
+        result = np.empty((count, self.dim))
+        result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+        return result
 
     @cached_property
     def node_input(self) -> npt.NDArray[np.int64]:

@@ -5,8 +5,9 @@ d_ij = x_j - x_i, because d_kl . g_i = delta_il - delta_ik. Hence for every symm
 
     s = - sum_{i<j} (d_ij . s . d_ij) sym(g_i x g_j),
 
-which is M22's T^-1 in closed form: no 6 x 6 matrix is inverted, and triangles and tetrahedra share the line. Leaving broken
-edges out of the sum is T^-1 diag(integrity) T of M22 eqs. 16-18, with the factor 2 on shear terms that M22 eq. 12 lacks.
+which is M22's T^-1 in closed form: no 6 x 6 matrix is inverted, and triangles and tetrahedra share the line. Leaving
+broken edges out of the sum is T^-1 diag(integrity) T of M22 eqs. 16-18, with the factor 2 on shear terms that M22
+eq. 12 lacks.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
     r(u) = f_int(u) + M (c_a (u - u_a) + a c_v (u - u_v)) + f_visc(u) - f_ext
     K(u) = d f_int / d u + (c_a + a c_v) M + ...
 
-M is lumped by vertex quadrature (an option keeps it consistent): a vector added to the diagonal, not a term of the form,
-which would be integrated anew in every tangent.
+M is made once (fracsim.mass) and added; as a term of the form it would be integrated anew in every tangent.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from .forms.balance import elastic_energy, internal_work, pressure_work, tractio
 from .forms.schemes import Scheme
 from .kernels import compile_form
 from .loads import Forces, Motion
+from .mass import ConsistentMass, LumpedMass, Mass
 from .material import MaterialFields, _coefficient
 from .parallel import total
 from .rotation import RotationField
@@ -39,7 +39,7 @@ class Equilibrium:
     Attributes:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
         chi: degradation field, or None where the scene has no fracture.
-        mass: (owned nodes * d,) lumped mass of each dof, kg.
+        inertia: the mass matrix.    mass: (owned dofs,) lumped mass of each dof, kg.
         held: owned dofs whose motion is prescribed.
         unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
         external: (owned dofs,) dead loads, N.
@@ -61,6 +61,8 @@ class Equilibrium:
         self.held = self.motion.dofs[: self.motion.owned]
         self._compile(study, density)
         self._make_vectors()
+        self.inertia = self._make_mass(study, density)
+        self.mass = self.inertia.lumped
         self._references: tuple[Values, Values] = (self.u.x.array[: self._owned],) * 2
 
     # --- set-up ---
@@ -90,9 +92,6 @@ class Equilibrium:
         self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
         self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
         self._dead = self._dead_loads(w, dx)
-        vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
-        ones = fem.Constant(domain.mesh, np.ones(domain.dim))
-        self._mass_form = compile_form(density * ufl.inner(ones, w) * vertex)
 
     def _stiffness_factor(self) -> Any:
         """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
@@ -129,15 +128,18 @@ class Equilibrium:
         self.tangent.setOption(PETSc.Mat.Option.SPD, False)
         self.residual = fem_petsc.create_vector(self._residual)
         self._work = fem_petsc.create_vector(self._residual)
-        self.mass = self._assembled(self._mass_form)
-        self._mass_diagonal = self.tangent.createVecLeft()
         self.external = np.zeros(self._owned)
         self.unbalanced = np.zeros(self._owned)
         self._prescribed = fem.Function(self.domain.space)
         self.bcs = [self._condition()] if self.domain.comm.allreduce(len(self.motion.dofs)) else []
 
+    def _make_mass(self, study: Study, density: Any) -> Mass:
+        if study.time.mass == "consistent":
+            return ConsistentMass(self.domain, density, self.tangent, self.bcs)
+        return LumpedMass(self.domain, density, self.tangent)
+
     def _condition(self) -> fem.DirichletBC:
-        # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the full space.
+        # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
         dofs = self.motion.dofs
         return fem.dirichletbc(self._prescribed, [dofs, dofs], self.domain.space.sub(0))
 
@@ -187,7 +189,7 @@ class Equilibrium:
         return self.c_v * (u - u_v), self.c_a * (u - u_a)
 
     @property
-    def _inertia(self) -> tuple[float, float]:
+    def _mass_factors(self) -> tuple[float, float]:
         """Factors of M in front of (u - u_a) and (u - u_v)."""
         drag = self.damping.mass if self.damping is not None else 0.0
         return self.c_a, drag * self.c_v
@@ -246,24 +248,21 @@ class Equilibrium:
         return np.flatnonzero(touched[self.domain.cell_nodes].any(axis=1)).astype(np.int32)
 
     def _add_inertia(self, b: PETSc.Vec) -> None:
-        c_mass, c_drag = self._inertia
+        c_mass, c_drag = self._mass_factors
         rows = b.array_w
         rows -= self.external
         u, (u_a, u_v) = self.u.x.array[: self._owned], self._references
-        if c_mass:
-            rows += self.mass * (c_mass * (u - u_a))
-        if c_drag:
-            rows += self.mass * (c_drag * (u - u_v))
+        if c_mass or c_drag:
+            rows += self.inertia.times(c_mass * (u - u_a) + c_drag * (u - u_v))
 
     def assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         """K(u) into A, rows and columns of prescribed dofs replaced by the identity's."""
         A.zeroEntries()
         fem_petsc.assemble_matrix_mat(A, self._tangent, bcs=self.bcs)
         A.assemble()
-        c_mass, c_drag = self._inertia
+        c_mass, c_drag = self._mass_factors
         if c_mass or c_drag:
-            self._mass_diagonal.array_w[:] = (c_mass + c_drag) * self.mass
-            A.setDiagonal(self._mass_diagonal, PETSc.InsertMode.ADD)
+            self.inertia.add_to(A, c_mass + c_drag)
 
     def displace(self, u: Values) -> None:
         """Put the owned values of a displacement into u, ghosts included."""
@@ -280,13 +279,13 @@ class Equilibrium:
 
     def kinetic_energy(self, v: Values) -> float:
         """This rank's share of 1/2 v . M v, J."""
-        return 0.5 * float(self.mass @ (v * v))
+        return 0.5 * float(v @ self.inertia.times(v))
 
     def viscous_force(self) -> Values | None:
         """(owned dofs,) damping forces at the current step, N; None where there is no damping."""
         if self.damping is None:
             return None
-        force = self.damping.mass * self.mass * self.rates()[0]
+        force = self.damping.mass * self.inertia.times(self.rates()[0])
         return force + self._assembled(self._viscous_form) if self._viscous_form is not None else force
 
     def internal_force(self) -> Values:
@@ -305,7 +304,7 @@ class Equilibrium:
         Size: reactions, inertia and dead loads, which the residual is the balance of. Round-off: eps times the
         stiffness Y h^(d-2) of a node times the extent of the body, for every dof.
         """
-        c_mass, _ = self._inertia
+        c_mass, _ = self._mass_factors
         inertia = c_mass * self.mass * (self.u.x.array[: self._owned] - self._references[0]) if c_mass else 0.0
         reactions = self.unbalanced[self.held]
         squares = [np.sum(np.square(part)) for part in (inertia, self.external, reactions)]
@@ -317,9 +316,15 @@ class Equilibrium:
         young = float(np.max(self.material.young, initial=0.0))
         dofs = self.domain.space.dofmap.index_map.size_global * self.domain.dim
         stiffest = self.domain.comm.allreduce(young, op=MPI.MAX)
-        return float(np.finfo(float).eps * stiffest * self.domain.mean_edge ** (self.domain.dim - 2) * self.domain.size * np.sqrt(dofs))
+        return float(
+            np.finfo(float).eps
+            * stiffest
+            * self.domain.mean_edge ** (self.domain.dim - 2)
+            * self.domain.size
+            * np.sqrt(dofs)
+        )
 
 
-# Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large enough
-# that the tangent stays regular (condition number 1e16 would not).
+# Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large
+# enough that the tangent stays regular (a condition number of 1e16 would not do).
 RESIDUAL_STIFFNESS = 1e-8

@@ -1,4 +1,4 @@
-"""The pass after a step: which edges break, and what that leaves of the energy of their cells (METHOD sections 3, 4)."""
+"""The pass after a step: which edges break, and what that leaves of the energy of their cells."""
 
 from __future__ import annotations
 

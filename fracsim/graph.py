@@ -131,4 +131,3 @@ class EdgeGraph:
         own = self.edge_keys(np.arange(len(self.broken)))
         factor = int(max(keys.max(initial=0), own.max(initial=0))) + 1
         return np.isin(own @ np.array([factor, 1]), keys @ np.array([factor, 1]))
-

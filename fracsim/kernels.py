@@ -26,7 +26,9 @@ def jit_options() -> dict[str, Any]:
     different machines never hands a kernel to one that cannot run it.
     """
     try:
-        cpu = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features")))
+        cpu = next(
+            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
+        )
     except (OSError, StopIteration):
         cpu = os.uname().machine
     tag = hashlib.sha256(cpu.encode()).hexdigest()[:8]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +11,8 @@ from mpi4py import MPI
 
 from .errors import FracsimError
 
-T = TypeVar("T")
 
-
-def on_root(comm: MPI.Comm, work: Callable[[], T]) -> T | None:
+def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
     """Run `work` on rank 0 and return its result there, None elsewhere; a FracsimError is raised on every rank."""
     result, failure = None, None
     if comm.rank == 0:
@@ -28,7 +26,7 @@ def on_root(comm: MPI.Comm, work: Callable[[], T]) -> T | None:
     return result
 
 
-def from_root(comm: MPI.Comm, work: Callable[[], T]) -> T:
+def from_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T:
     """Run `work` on rank 0 and give its result to every rank; a FracsimError is raised on every rank."""
     result: T = comm.bcast(on_root(comm, work))
     return result

@@ -17,7 +17,7 @@ Options = dict[str, bool | int | float | str]
 COMMON = (
     "snes_type", "snes_rtol", "snes_atol", "snes_stol", "snes_max_it", "snes_max_funcs", "snes_monitor",
     "snes_converged_reason", "snes_linesearch_type", "snes_linesearch_max_it", "snes_linesearch_monitor",
-    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_monitor", "ksp_converged_reason", "ksp_gmres_restart", "ksp_view",
+    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_monitor", "ksp_converged_reason", "ksp_gmres_restart",
     "pc_type", "sub_pc_type", "pc_factor_mat_solver_type", "pc_gamg_threshold", "pc_gamg_agg_nsmooths", "pc_gamg_type",
     "pc_gamg_aggressive_coarsening", "pc_hypre_type", "mg_levels_ksp_type", "mg_levels_ksp_max_it", "mg_levels_pc_type",
 )  # fmt: skip
@@ -28,7 +28,7 @@ _library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptio
 
 
 class OptionSet:
-    """The options of one SNES. They stay in the database while it lives: multigrid reads its levels' at every set-up."""
+    """The options of one SNES, in the database while it lives: multigrid reads its levels' at every set-up."""
 
     def __init__(self, options: Options) -> None:
         self.prefix = f"fracsim{next(_prefixes)}_"
@@ -38,7 +38,7 @@ class OptionSet:
             database[self.prefix + key] = str(value).lower() if isinstance(value, bool) else str(value)
 
     def check(self, given: Options, set_up: Callable[[], None]) -> None:
-        """InputError for a user's option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""
+        """InputError for an option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""
         if not self._unused(given):
             return
         refusing(set_up)

@@ -17,7 +17,7 @@ from .errors import InputError
 
 
 def render_last(folder: Path, png: Path | None = None) -> Path:
-    """Draw the last frame of folder/fields.h5: cells that still hold together, deformed, coloured by damage or stress."""
+    """Draw the last frame of folder/fields.h5: cells that hold together, deformed, coloured by damage or stress."""
     target = png or folder / "last.png"
     grid, field, t = read_frame(folder)
     with display():
@@ -64,11 +64,14 @@ def _add_body(plotter: Any, grid: Any, field: str) -> Any:
         whole = grid.extract_cells(np.flatnonzero(grid.cell_data["damage"] < 0.5))
     if whole.n_cells == 0:
         whole = grid
-    bar = {"title": field.replace("_", " "), "color": "black", "vertical": False, "height": 0.06, "position_y": 0.03}
+    bar = {
+        "title": field.replace("_", " ") + "\n", "color": "black", "vertical": False, "height": 0.08,
+        "position_y": 0.02, "n_labels": 3, "label_font_size": 16, "title_font_size": 18,
+    }  # fmt: skip
     edges = grid.n_cells < 60_000
     plotter.add_mesh(
         whole.extract_surface(), scalars=field, cmap="YlOrBr", show_edges=edges, line_width=0.5, edge_opacity=0.35,
-        scalar_bar_args=bar,
+        scalar_bar_args=bar, lighting=bool(np.ptp(whole.points[:, 2])),
     )  # fmt: skip
     return whole
 

@@ -38,7 +38,7 @@ class Pieces:
 
 
 def find_pieces(graph: EdgeGraph) -> Pieces:
-    """Components within each rank, joined where ranks share nodes: one exchange, however the pieces wind (collective)."""
+    """Components within each rank, joined where ranks share nodes: one exchange, however they wind (collective)."""
     domain = graph.domain
     local_count, local = _components(len(domain.nodes), graph.edge_nodes[~graph.broken])
     first = offset(domain.comm, local_count)
@@ -68,9 +68,7 @@ def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[n
     return vector.array.copy()
 
 
-def _by_lowest(
-    joined: npt.NDArray[np.int64], lowest: npt.NDArray[np.int64], count: int
-) -> npt.NDArray[np.int64]:
+def _by_lowest(joined: npt.NDArray[np.int64], lowest: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
     """Renumber joined components by the lowest input node that each of them has."""
     least = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(least, joined, lowest)

@@ -58,7 +58,9 @@ def _inverse_transpose(R: Tensors) -> Tensors:
         cofactor[:, 0, 0], cofactor[:, 0, 1] = R[:, 1, 1], -R[:, 1, 0]
         cofactor[:, 1, 0], cofactor[:, 1, 1] = -R[:, 0, 1], R[:, 0, 0]
     else:
-        cofactor = np.stack([np.cross(R[:, 1], R[:, 2]), np.cross(R[:, 2], R[:, 0]), np.cross(R[:, 0], R[:, 1])], axis=1)
+        cofactor = np.stack(
+            [np.cross(R[:, 1], R[:, 2]), np.cross(R[:, 2], R[:, 0]), np.cross(R[:, 0], R[:, 1])], axis=1
+        )
     determinant = np.einsum("nj,nj->n", R[:, 0], cofactor[:, 0])
     return cofactor / determinant[:, None, None]
 

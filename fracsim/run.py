@@ -1,82 +1,33 @@
-"""A run: everything is built and checked first, then the output folder is made, then time moves."""
+"""A run: steps a scene to its end and writes the output folder."""
 
 from __future__ import annotations
 
 import json
-import platform
 import resource
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import dolfinx
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from . import __version__
 from .bodies import bodies_of
-from .check import checked_mesh
-from .checkpoint import checkpoint_path, read_checkpoint, write_checkpoint
-from .domain import Domain, distribute
-from .equilibrium import Equilibrium
-from .errors import InputError, NotConverged, Stopped
+from .checkpoint import read_checkpoint, write_checkpoint
+from .errors import NotConverged, Stopped
 from .fields_file import FieldsFile
-from .forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
 from .frames import Frames
-from .history import History, Probes
+from .history import History
 from .interrupt import Interrupt
-from .material import material_fields
+from .output_folder import OutputClock, make_folder, versions
 from .parallel import on_root, total
 from .progress import Progress
-from .solve import Solver
-from .state import State
-from .stepping import Report, Stepper
-from .study import Output, Study, Time
+from .scene import Scene, build_scene
+from .study import Study
 from .study_file import study_text
-from .support import check_supports
 
 if TYPE_CHECKING:
     from .pieces import Pieces
-
-
-@dataclass
-class Scene:
-    """A study bound to its mesh: what a run moves."""
-
-    study: Study
-    domain: Domain
-    equations: Equilibrium
-    solver: Solver
-    stepper: Stepper
-    fracture: Any  # FracturePass | None
-    probes: Probes
-
-
-def build_scene(comm: MPI.Comm, study: Study) -> Scene:
-    """Mesh, equations, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
-    domain = distribute(comm, on_root(comm, lambda: checked_mesh(study)))
-    scheme = make_scheme(study.time)
-    equations = Equilibrium(domain, study, material_fields(domain, study.material), scheme)
-    if not scheme.inertia:
-        check_supports(domain, equations.motion)
-    fracture = None
-    if study.fracture is not None:
-        from .fracture import FracturePass
-
-        fracture = FracturePass(equations, study.fracture, study.material)
-    solver = Solver(equations, study.solver)
-    stepper = Stepper(equations, solver, study.time, fracture)
-    return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
-
-
-def make_scheme(timing: Time) -> Scheme:
-    """The time scheme of a study."""
-    if timing.scheme == "newmark":
-        return Newmark(timing.beta, timing.gamma)
-    return BackwardEuler() if timing.scheme == "backward-euler" else QuasiStatic()
 
 
 class Run:
@@ -209,7 +160,8 @@ class Run:
         seconds = {"setup": self._setup_seconds, **stepper.phases, "output": self.output_seconds}
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
-            "nodes": int(sizes[0]), "cells": int(sizes[1]), "broken_edges": broken, "split_cells": split, "pieces": pieces,
+            "steps_failed": stepper.failed, "nodes": int(sizes[0]), "cells": int(sizes[1]),
+            "broken_edges": broken, "split_cells": split, "pieces": pieces,
             "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
             "seconds": {key: round(value, 4) for key, value in seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "peak_memory_MiB": round(float(memory), 1),
@@ -217,53 +169,9 @@ class Run:
         }  # fmt: skip
 
 
-class OutputClock:
-    """When a frame is due: every so many steps, or so many seconds of simulated time. Default: 50 frames a run."""
-
-    def __init__(self, output: Output, timing: Time) -> None:
-        self._every = output.every
-        self._interval = output.interval or timing.end / 50
-        self._last = 0.0
-
-    def due(self, state: State) -> bool:
-        if self._every is not None:
-            return state.step % self._every == 0
-        return state.t >= self._last + self._interval * (1 - 1e-9)
-
-    def wrote(self, state: State) -> None:
-        # the grid of intervals, not the time of the frame: late frames must not push the others back
-        self._last = np.floor(state.t / self._interval * (1 + 1e-9)) * self._interval
-
-
 def default_fields(study: Study) -> list[str]:
     """Fields of a study that names none."""
     return ["damage", "von_mises"] if study.fracture is not None else ["von_mises"]
-
-
-OWN_FILES = ("study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json", "last.png")
-
-
-def make_folder(folder: Path, study: str, restart: bool) -> None:
-    """Make the output folder and write study.toml; an earlier run's files go, unless it is continued (rank 0)."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not restart:
-            for path in (*(folder / name for name in OWN_FILES), checkpoint_path(folder)):
-                path.unlink(missing_ok=True)
-        (folder / "study.toml").write_text(study)
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot write there: {error.strerror}") from None
-
-
-def versions(comm: MPI.Comm) -> dict[str, str]:
-    """What ran: programs, versions, ranks."""
-    return {
-        "fracsim": __version__,
-        "dolfinx": dolfinx.__version__,
-        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
-        "python": platform.python_version(),
-        "ranks": str(comm.size),
-    }
 
 
 def run_study(
@@ -289,6 +197,3 @@ def _draw(folder: Path) -> None:
         render_last(folder)
     except (ImportError, OSError, RuntimeError) as error:
         print(f"fracsim: no picture drawn: {error}", file=sys.stderr)
-
-
-__all__ = ["Report", "Run", "Scene", "build_scene", "run_study"]

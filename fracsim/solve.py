@@ -64,8 +64,8 @@ class Solver:
     """SNES on an `Equilibrium`, set up once and kept for the whole run.
 
     The preconditioner is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a
-    Newton iteration. It is made anew where CG takes half as many iterations again as when it was fresh, and refreshed (new
-    coarse operators and smoothers on the same coarse spaces) after edges broke.
+    Newton iteration. It is made anew where CG takes half as many iterations again as when it was fresh, and refreshed
+    (new coarse operators and smoothers on the same coarse spaces) after edges broke.
     """
 
     def __init__(self, equations: Equilibrium, given: Options) -> None:

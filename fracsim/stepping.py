@@ -42,6 +42,7 @@ class Stepper:
         self.smallest = timing.smallest or timing.step / 1024
         self.comm = equations.domain.comm
         self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
+        self.failed = 0  # attempts that did not converge
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
 
     def start(self, initial: Initial | None) -> State:
@@ -51,10 +52,10 @@ class Stepper:
         state = State(np.zeros(n), np.zeros(n), np.zeros(n), dt=self.timing.step)
         if initial is not None:
             state.v = initial_velocity(equations, initial)
-        self._hold(state)
+        self.settle(state)
         return state
 
-    def _hold(self, state: State) -> None:
+    def settle(self, state: State) -> None:
         """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
         equations = self.equations
         equations.hold(state.t, state.u, state.v)
@@ -65,7 +66,7 @@ class Stepper:
         free = np.ones(len(unbalanced), bool)
         free[equations.held] = False
         if equations.scheme.inertia and self.timing.scheme == "newmark":
-            state.a = np.where(free, -unbalanced / equations.mass, 0.0)
+            state.a = equations.inertia.solve(-unbalanced, free)
         state.forces = equations.applied_force() + np.where(free, 0.0, unbalanced)
 
     def advance(self, state: State) -> Report:
@@ -76,6 +77,7 @@ class Stepper:
             outcome = self._attempt(state, dt)
             if outcome.converged:
                 break
+            self.failed += 1
             self._halve(state, dt, outcome)
         return self._accept(state, dt, outcome, began)
 

@@ -228,6 +228,7 @@ class Time(Table):
     end: Positive  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
     smallest: Positive | None = None  # s; default step / 1024
+    mass: Literal["lumped", "consistent"] = "lumped"
     beta: Annotated[Finite, Field(gt=0, le=0.5)] = 0.25  # Newmark
     gamma: Annotated[Finite, Field(ge=0.5, le=1)] = 0.5  # Newmark
 

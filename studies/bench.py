@@ -4,8 +4,8 @@
 
 A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
 steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
-solver options and the same policy for the preconditioner (made once: nothing in the body changes), so that the machine's
-moods hit both. Figures are medians over the steps.
+solver options and the same policy for the preconditioner (made once: nothing in the body changes), so that the
+machine's moods hit both. Figures are medians over the steps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ from pathlib import Path
 from typing import Any
 
 STEPS, WARM = 8, 2
-EVENTS = {"residual": "SNESFunctionEval", "tangent": "SNESJacobianEval", "preconditioner": "PCSetUp", "krylov": "KSPSolve"}
+EVENTS = {
+    "residual": "SNESFunctionEval",
+    "tangent": "SNESJacobianEval",
+    "preconditioner": "PCSetUp",
+    "krylov": "KSPSolve",
+}
 OPTIONS: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
 
@@ -48,7 +53,8 @@ def case(n: int, bare: bool) -> dict[str, Any]:
     from mpi4py import MPI
     from petsc4py import PETSc
 
-    from ..run import Run, build_scene
+    from ..run import Run
+    from ..scene import build_scene
     from ..study_file import validate
 
     PETSc.Log.begin()
@@ -198,7 +204,9 @@ class Bare:
 def launch(n: int, ranks: int, bare: bool) -> dict[str, Any]:
     """Run one case in processes of its own."""
     command = ["mpirun", "-n", str(ranks), sys.executable, "-m", "fracsim.studies.bench", "--case", str(n)]
-    output = subprocess.run([*command, *(["--bare"] if bare else [])], check=True, capture_output=True, timeout=1800, text=True)
+    output = subprocess.run(
+        [*command, *(["--bare"] if bare else [])], check=True, capture_output=True, timeout=1800, text=True
+    )
     line = next(line for line in output.stdout.splitlines() if line.startswith("{"))
     result: dict[str, Any] = json.loads(line)
     return result
@@ -207,12 +215,21 @@ def launch(n: int, ranks: int, bare: bool) -> dict[str, Any]:
 def table(cases: list[dict[str, Any]]) -> str:
     """The figures on screen: seconds, then ratios."""
     parts = ("step", "bare", *EVENTS, "fracture", "output", "after_fracture")
-    lines = [f"{'tets':>8} {'ranks':>5} " + " ".join(f"{part[:9]:>9}" for part in parts) + "  step/bare  pass/step  after/before  GiB"]
-    for row in cases:
-        seconds = " ".join(f"{row[part]:9.4f}" for part in parts)
-        ratios = f"{row['step'] / row['bare']:9.3f} {row['fracture'] / row['step']:10.3f} {row['after_fracture'] / row['step']:13.3f}"
-        lines.append(f"{row['tetrahedra']:8d} {row['ranks']:5d} {seconds} {ratios} {row['peak_memory_GiB']:5.2f}")
-    return "\n".join(lines)
+    ratios = {
+        "step/bare": ("step", "bare"),
+        "pass/step": ("fracture", "step"),
+        "after/before": ("after_fracture", "step"),
+    }
+    head = ["tetrahedra", "ranks", *(part.replace("_fracture", "") for part in parts), *ratios, "GiB"]
+    rows = [
+        [str(row["tetrahedra"]), str(row["ranks"])]
+        + [f"{row[part]:.4f}" for part in parts]
+        + [f"{row[a] / row[b]:.3f}" for a, b in ratios.values()]
+        + [f"{row['peak_memory_GiB']:.2f}"]
+        for row in cases
+    ]
+    widths = [max(len(title), 9) for title in head]
+    return "\n".join(" ".join(map(str.rjust, row, widths)) for row in [head, *rows])
 
 
 def main() -> None:

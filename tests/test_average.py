@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fracsim.average import NonlocalAverage
 from scipy.spatial.distance import cdist
+
+from fracsim.average import NonlocalAverage
 from support.scenes import Values, cell_corners, make_scene
 
 EPS = np.finfo(float).eps
@@ -80,8 +81,9 @@ def test_constants_are_reproduced(body: Body, kernel: str) -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(("size", "h"), (([1.0, 1.0], 0.125), ([1.0, 1.0, 1.0], 0.2)), ids=("2d", "3d"))
 def test_linear_fields_are_reproduced_inside(size: list[float], h: float, kernel: str) -> None:
-    """A lattice of simplices is symmetric under inversion, which swaps the cells of a cube in pairs: where no neighbourhood
-    is cut off by the boundary the errors of a pair cancel, and the mean over a cube is exact for a linear field."""
+    """A lattice of simplices is symmetric under inversion, which swaps the cells of a cube in pairs: where no
+    neighbourhood is cut off by the boundary the errors of a pair cancel, and the mean over a cube is exact for a
+    linear field."""
     body = Body({"builder": "box", "size": size, "h": h})
     values = body.centroids @ np.arange(1.0, len(size) + 1)
     error = body.average(1.4 * h, kernel)(values[:, None])[:, 0] - values

@@ -223,7 +223,7 @@ NEEDS_MESH: list[tuple[Data, str]] = [
 
 @pytest.mark.parametrize(("data", "message"), NEEDS_MESH, ids=[message[:50] for _, message in NEEDS_MESH])
 def test_the_scene_refuses(data: Data, message: str) -> None:
-    from fracsim.run import build_scene
+    from fracsim.scene import build_scene
 
     with pytest.raises(InputError) as refusal:
         build_scene(MPI.COMM_SELF, validate(data, "test.toml"))
@@ -241,7 +241,7 @@ def test_the_scene_refuses(data: Data, message: str) -> None:
     ],
 )
 def test_petsc_options_are_refused(option: Data, message: str) -> None:
-    from fracsim.run import build_scene
+    from fracsim.scene import build_scene
 
     with pytest.raises(InputError) as refusal:
         build_scene(MPI.COMM_SELF, study(BAR, solver=option))
@@ -285,7 +285,7 @@ def test_an_unreadable_mesh_is_refused(tmp_path: Path, ending: str, capfd: pytes
 
 
 def test_each_body_must_be_held(tmp_path: Path) -> None:
-    from fracsim.run import build_scene
+    from fracsim.scene import build_scene
 
     data = mesh_file(tmp_path / "two.vtu", TET + APART, [[0, 1, 2, 3], [4, 5, 6, 7]])
     data |= {"boundary": [{"on": {"box": [[0, 0, 0], [2, 1, 1]]}, "fix": "xyz"}], "time": BAR["time"] | QUASI}

@@ -69,7 +69,8 @@ import sys
 from pathlib import Path
 from mpi4py import MPI
 from fracsim.study_file import load_study
-from fracsim.run import Run, build_scene
+from fracsim.run import Run
+from fracsim.scene import build_scene
 scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
 Run(scene, Path({str(tmp_path / "out")!r}))()
 parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")

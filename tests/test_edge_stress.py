@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fracsim.edge_stress import barycentric_gradients, carried_by, edge_vectors, normal_stress
-from fracsim.graph import local_edges
 from hypothesis import given
 from hypothesis import strategies as st
+
+from fracsim.edge_stress import barycentric_gradients, carried_by, edge_vectors, normal_stress
+from fracsim.graph import local_edges
 from support.laws import Tensor, rotation
 
 EPS = np.finfo(float).eps

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import polar
+
 from support.laws import Law, Tensor, law_of, rotation
 
 YOUNG, POISSON = 3.0, 0.3
@@ -99,7 +100,8 @@ def test_neo_hookean_is_indifferent_to_rotation_when_inverted(dim: int, data: st
 
 
 def test_the_linear_energy_is_not_indifferent() -> None:
-    """A quarter turn has sym(F) - I = -I and so the energy (2 mu + 2 lambda) of it: why linear is for small rotations."""
+    """A quarter turn has sym(F) - I = -I and so the energy (2 mu + 2 lambda) of it: why linear is for small
+    rotations."""
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
     expected = MU * 2 + LAMBDA / 2 * 4
     assert law_of(make_energy("linear"), 2).psi(quarter) == pytest.approx(expected, rel=10 * EPS)
@@ -190,7 +192,8 @@ def test_linear_plane_stress_is_uniaxial_tension() -> None:
 
 @given(H=matrices(2))
 def test_stvk_plane_stress_is_3d_without_stress_across(H: Tensor) -> None:
-    """S33 = 0 gives E33 = -lambda/(lambda + 2 mu) tr(E): at that stretch the 3D Cauchy stress is the 2D one and s33 = 0."""
+    """S33 = 0 gives E33 = -lambda/(lambda + 2 mu) tr(E): at that stretch the 3D Cauchy stress is the 2D one and s33 =
+    0."""
     F = np.eye(2) + H / 8
     trace = np.trace(F.T @ F - np.eye(2)) / 2
     F33 = np.sqrt(1 - 2 * LAMBDA / (LAMBDA + 2 * MU) * trace)

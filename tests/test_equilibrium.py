@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fracsim.forms.energies import ENERGIES
-from fracsim.run import Scene
+
+from fracsim.scene import Scene
 from support.laws import rotation
 from support.reference import dense_tangent, lumped_mass, stiffness
 from support.scenes import Values, deform, make_scene, march, positions
@@ -59,7 +60,8 @@ def test_tangent_is_the_derivative_of_the_residual(energy: str, dim: int) -> Non
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_corotated_tangent_holds_the_rotation(dim: int) -> None:
-    """With R kept, r is linear in u and K is its exact derivative. With R following, r differs by the stress's share."""
+    """With R kept, r is linear in u and K is its exact derivative. With R following, r differs by the stress's
+    share."""
     scene = scene_of("corotated", dim)
     equations, u = scene.equations, randomly_deformed(scene)
     h = np.random.default_rng(6).uniform(-1, 1, len(u))

@@ -7,9 +7,10 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.graph import EdgeGraph, is_split, local_edges, node_groups
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+
+from fracsim.graph import EdgeGraph, is_split, local_edges, node_groups
 from support.scenes import make_scene
 
 DIMS = (2, 3)

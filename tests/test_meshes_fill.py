@@ -14,7 +14,7 @@ from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.surface import closed_surface
 from fracsim.meshes.topology import boundary_facets, signed_measures
 
-meshio = pytest.importorskip("meshio")
+import meshio
 
 Shell = tuple[Points, Indices]
 

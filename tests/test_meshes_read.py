@@ -11,7 +11,7 @@ from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.read import read_mesh
 
-meshio = pytest.importorskip("meshio")
+import meshio
 
 
 def sample(dim: int) -> MeshData:

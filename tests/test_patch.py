@@ -1,7 +1,9 @@
-"""Patch test: a linear displacement on the whole boundary of an unstructured mesh is reproduced inside, with uniform stress.
+"""Patch test: a linear displacement on the whole boundary of an unstructured mesh is reproduced inside, with uniform
+stress.
 
-It is an exact solution of every energy, because a uniform P balances itself; P1 contains it; so what is left is the round-off
-of the linear solve, eps times the condition number of K, which is below (size / h)^2 * 1e3 for these shapes of cell.
+It is an exact solution of every energy, because a uniform P balances itself; P1 contains it; so what is left is the
+round-off of the linear solve, eps times the condition number of K, which is below (size / h)^2 * 1e3 for these shapes
+of cell.
 """
 
 from __future__ import annotations
@@ -11,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 from fracsim.forms.energies import ENERGIES
-from fracsim.frames import Frames
 from fracsim.meshes.topology import boundary_facets
-from fracsim.run import Scene
+
+from fracsim.frames import Frames
+from fracsim.scene import Scene
 from fracsim.state import State
 from support.laws import law_of
 from support.scenes import Values, at_nodes, each_step, make_scene, march, mesh_of, positions

@@ -20,7 +20,8 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, command, fracsim, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
-from fracsim.run import Run, build_scene
+from fracsim.run import Run
+from fracsim.scene import build_scene
 
 Data = dict[str, Any]
 Values = npt.NDArray[Any]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fracsim.rotation import polar_rotation
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import polar
+
+from fracsim.rotation import polar_rotation
 from support.laws import Tensor, rotation
 
 EPS = np.finfo(float).eps
@@ -47,9 +48,12 @@ def test_a_rotation_is_its_own(dim: int) -> None:
 
 
 @pytest.mark.parametrize("dim", (2, 3))
-@pytest.mark.parametrize("last", (-1.0, -0.2, -1e-9, 0.0, 1e-9), ids=("reflected", "inverted", "just", "flat", "nearly"))
+@pytest.mark.parametrize(
+    "last", (-1.0, -0.2, -1e-9, 0.0, 1e-9), ids=("reflected", "inverted", "just", "flat", "nearly")
+)
 def test_inverted_and_flat_cells_get_the_closest_rotation(dim: int, last: float) -> None:
-    """R is a rotation, never a reflection, and no other rotation Q has a larger tr(Q^T F), that is a smaller |F - Q|."""
+    """R is a rotation, never a reflection, and no other rotation Q has a larger tr(Q^T F), that is a smaller |F -
+    Q|."""
     F = np.array([stretched(dim, seed, [1.3, 0.7, last] if dim == 3 else [1.3, last]) for seed in range(5)])
     R = polar_rotation(F)
     assert is_rotation(R)

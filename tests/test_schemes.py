@@ -5,13 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fracsim.forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
+
 from support.oscillator import Values, exact, run, slopes
 
 EPS = np.finfo(float).eps
 W, START = 3.0, (0.7, -1.1)
 
 # scheme, order of its global error
-ORDERS: list[tuple[Scheme, int]] = [(BackwardEuler(), 1), (Newmark(), 2), (Newmark(0.3025, 0.6), 1), (Newmark(1 / 6, 0.5), 2)]
+ORDERS: list[tuple[Scheme, int]] = [
+    (BackwardEuler(), 1),
+    (Newmark(), 2),
+    (Newmark(0.3025, 0.6), 1),
+    (Newmark(1 / 6, 0.5), 2),
+]
 
 
 def energy(rows: Values) -> Values:
@@ -19,7 +25,9 @@ def energy(rows: Values) -> Values:
     return 0.5 * rows[:, 1] ** 2 + 0.5 * W**2 * rows[:, 0] ** 2
 
 
-@pytest.mark.parametrize(("scheme", "order"), ORDERS, ids=("euler", "trapezoidal", "dissipative", "linear-acceleration"))
+@pytest.mark.parametrize(
+    ("scheme", "order"), ORDERS, ids=("euler", "trapezoidal", "dissipative", "linear-acceleration")
+)
 @pytest.mark.parametrize("damping", (0.0, 0.4))
 def test_order_of_convergence(scheme: Scheme, order: int, damping: float) -> None:
     """Errors of u and v at a fixed time fall by 2^order where the step is halved."""
@@ -39,7 +47,8 @@ def test_order_of_convergence(scheme: Scheme, order: int, damping: float) -> Non
 def test_trapezoidal_rule_keeps_the_energy(dt: float) -> None:
     """Of a linear system, for every step however large.
 
-    Round-off of 1000 steps: v is a difference of displacements over dt, a another, so eps grows by 1 + 1 / (w dt) or 1 + w dt.
+    Round-off of 1000 steps: v is a difference of displacements over dt, a another, so eps grows by 1 + 1 / (w dt) or 1
+    + w dt.
     """
     E = energy(run(Newmark(), W, dt, 1000, START))
     np.testing.assert_allclose(E, E[0], rtol=1000 * EPS * (1 + W * dt + 1 / (W * dt)) ** 2)
@@ -47,7 +56,8 @@ def test_trapezoidal_rule_keeps_the_energy(dt: float) -> None:
 
 @pytest.mark.parametrize("dt", (0.01, 0.1, 1.0, 100.0))
 def test_backward_euler_loses_a_known_share(dt: float) -> None:
-    """Its amplification is 1 / (1 - i w dt): the energy falls by 1 / (1 + w^2 dt^2) a step, exactly and monotonically."""
+    """Its amplification is 1 / (1 - i w dt): the energy falls by 1 / (1 + w^2 dt^2) a step, exactly and
+    monotonically."""
     E = energy(run(BackwardEuler(), W, dt, 20, START))
     np.testing.assert_allclose(E[1:] / E[:-1], 1 / (1 + (W * dt) ** 2), rtol=1e-9)
 
@@ -94,7 +104,8 @@ def test_quasi_static_has_no_inertia() -> None:
 
 @pytest.mark.parametrize("scheme", (BackwardEuler(), Newmark()))
 def test_small_steps_keep_their_digits(scheme: Scheme) -> None:
-    """A body far from the origin in slow motion: with u / dt^2 summed instead of differences, eps u / dt^2 would swamp a."""
+    """A body far from the origin in slow motion: with u / dt^2 summed instead of differences, eps u / dt^2 would swamp
+    a."""
     dt, u, v = 1e-7, 1.0, 1e-3
     c_a, c_v = scheme.rates(dt)
     u_a, u_v = scheme.references(dt, u, v, 0.0)

@@ -1,8 +1,8 @@
 """Bars: elastic waves, natural frequencies, static bending, against closed forms.
 
-With nu = 0 a bar of equal lattice cells moves as a chain: planes of nodes keep their shape, since nodal forces and lumped
-masses of an inner plane are in the same proportion (not so on an end plane, which has cells on one side only). The chain's
-dispersion is omega = (2 c0 / dx) sin(k dx / 2), c0 = sqrt(E / rho), exactly.
+With nu = 0 a bar of equal lattice cells moves as a chain: planes of nodes keep their shape, since nodal forces and
+lumped masses of an inner plane are in the same proportion (not so on an end plane, which has cells on one side only).
+The chain's dispersion is omega = (2 c0 / dx) sin(k dx / 2), c0 = sqrt(E / rho), exactly.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.run import Scene
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import eigsh
+
+from fracsim.scene import Scene
 from support.scenes import Values, displacement, each_step, make_scene, march, positions
 
 EPS = np.finfo(float).eps
@@ -33,7 +34,9 @@ def bar(boundary: list[dict[str, Any]], end: float, **tables: Any) -> Any:
     """A bar of unit length, wave speed and impedance, pulled by a sudden traction at x = 1 for all t > 0."""
     pull = {"on": "right", "traction": [PULL, 0.0]}
     mesh = {"builder": "box", "size": [1.0, AREA], "h": DX}
-    return make_scene(mesh=mesh, boundary=[*boundary, pull], time={"scheme": "newmark", "step": DT, "end": end}, **tables)
+    return make_scene(
+        mesh=mesh, boundary=[*boundary, pull], time={"scheme": "newmark", "step": DT, "end": end}, **tables
+    )
 
 
 def profile(scene: Scene, values: Values) -> tuple[Values, Values]:
@@ -44,7 +47,8 @@ def profile(scene: Scene, values: Values) -> tuple[Values, Values]:
 
 @pytest.mark.parametrize("energy", ("linear", "corotated"))
 def test_the_front_runs_at_c0(energy: str) -> None:
-    """Behind the front v = sigma / (rho c0); the front, where v is half of that, is at 1 - c0 t within its Airy width."""
+    """Behind the front v = sigma / (rho c0); the front, where v is half of that, is at 1 - c0 t within its Airy
+    width."""
     scene, state = bar([], end=0.6, material={"energy": energy, "young": 1.0, "poisson": 0.0, "density": 1.0})
     for _ in each_step(scene, state):
         if state.t < 0.2:
@@ -122,7 +126,9 @@ def axial_frequency(dim: int, h: float, ends: tuple[str, ...]) -> float:
     """Lowest frequency of a bar that slides along x between smooth walls, so that only axial motion is left."""
     walls = (("bottom", "top", "front", "back"), ("yz"[dim == 3], "yz"[dim == 3], "y", "y"))
     smooth = [{"on": name, "fix": axis} for name, axis in list(zip(*walls, strict=True))[: 2 * (dim - 1)]]
-    return lowest_frequency(cantilever([1.0, 0.25, 0.25][:dim], h, boundary=[{"on": end, "fix": "x"} for end in ends] + smooth))
+    return lowest_frequency(
+        cantilever([1.0, 0.25, 0.25][:dim], h, boundary=[{"on": end, "fix": "x"} for end in ends] + smooth)
+    )
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -151,8 +157,8 @@ def extrapolated(values: list[float]) -> float:
 def test_bending_frequency_of_a_cantilever() -> None:
     """BENCHMARKS: 1 x 0.1 m, E = 210 GPa, rho = 7850: 83.6 Hz by Euler and Bernoulli.
 
-    Shear and rotary inertia take some 0.7 % off at this slenderness (Timoshenko), and P1 triangles are too stiff in bending
-    by O((h / depth)^2): the frequencies fall with h, and their limit is the beam's within 1 %.
+    Shear and rotary inertia take some 0.7 % off at this slenderness (Timoshenko), and P1 triangles are too stiff in
+    bending by O((h / depth)^2): the frequencies fall with h, and their limit is the beam's within 1 %.
     """
     found = [lowest_frequency(cantilever([1.0, 0.1], h)) for h in (0.025, 0.0125, 0.00625)]
     beam = 0.5596 * np.sqrt(STEEL["young"] * 0.1**2 / 12 / STEEL["density"])
@@ -206,7 +212,8 @@ def tip_deflection(h: float) -> float:
 
 
 def test_static_cantilever() -> None:
-    """Timoshenko: w = P L^3 / (3 E I) + P L / (kappa G A), kappa = 10 (1 + nu) / (12 + 11 nu). P1 is too stiff: from below.
+    """Timoshenko: w = P L^3 / (3 E I) + P L / (kappa G A), kappa = 10 (1 + nu) / (12 + 11 nu). P1 is too stiff: from
+    below.
 
     The clamp also stops the section's warping and contraction there, which beam theory leaves free: within 1 %.
     """

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-READERS = Path(os.environ.get("FRACSIM_READERS", Path(sys.prefix) / "readers"))
+# where `make readers` puts it: beside the venvs, made once for all of them
+READERS = Path(os.environ.get("FRACSIM_READERS", Path(sys.prefix).parent / "vtk-reader"))
 NO_READER = 77
 
 

@@ -1,4 +1,5 @@
-"""A damped linear oscillator u'' + a u' + w^2 (u + b u') = 0 moved by the Scheme protocol alone, and its exact motion."""
+"""A damped linear oscillator u'' + a u' + w^2 (u + b u') = 0 moved by the Scheme protocol alone, and its exact
+motion."""
 
 from __future__ import annotations
 
@@ -9,7 +10,9 @@ from fracsim.forms.schemes import Scheme
 Values = npt.NDArray[np.float64]
 
 
-def run(scheme: Scheme, w: float, dt: float, steps: int, start: tuple[float, float], a: float = 0.0, b: float = 0.0) -> Values:
+def run(
+    scheme: Scheme, w: float, dt: float, steps: int, start: tuple[float, float], a: float = 0.0, b: float = 0.0
+) -> Values:
     """(steps + 1, 3) u, v, acceleration from (u, v) at t = 0 with the acceleration of the equation there."""
     u, v = start
     drag = a + b * w**2

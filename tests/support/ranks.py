@@ -15,7 +15,8 @@ Arrays = dict[str, npt.NDArray[np.generic]]
 
 
 def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 100) -> Arrays:
-    """Run `module` under mpirun; returns the arrays that its rank 0 saved. AssertionError with its output where it fails.
+    """Run `module` under mpirun; returns the arrays that its rank 0 saved. AssertionError with its output where it
+    fails.
 
     mpi4py's runner ends all ranks where one raises. `timeout` ends mpirun in a way that lets it end its children.
     """
@@ -24,7 +25,7 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 100) -> A
         "timeout", "--kill-after=10", str(seconds), "mpirun", "--oversubscribe", "-n", str(ranks),
         sys.executable, "-m", "mpi4py", "-m", module, str(target),
     ]  # fmt: skip
-    # os.environ is what this process was started with: MPI's own variables, set when it was initialised here, stay behind
+    # os.environ is what this process was started with: variables that MPI has set since then stay behind
     done = subprocess.run(command, cwd=TESTS, env=dict(os.environ), capture_output=True, text=True)
     output = (done.stdout + done.stderr)[-4000:]
     assert done.returncode == 0, f"{module} on {ranks} ranks ended with {done.returncode}:\n{output}"

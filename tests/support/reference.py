@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from fracsim.run import Scene
 from petsc4py import PETSc
 from scipy.linalg import eigh
+
+from fracsim.scene import Scene
 
 Values = npt.NDArray[np.float64]
 
@@ -17,10 +18,14 @@ def gradients(corners: Values) -> tuple[Values, Values]:
     """((n, d + 1, d) gradients of the hat functions, (n,) volumes): rows of the inverse of [1 x] but for the first."""
     n, k, dim = corners.shape
     homogeneous = np.concatenate([np.ones((n, k, 1)), corners], axis=2)
-    return np.linalg.inv(homogeneous)[:, 1:].transpose(0, 2, 1), np.abs(np.linalg.det(homogeneous)) / math.factorial(dim)
+    return np.linalg.inv(homogeneous)[:, 1:].transpose(0, 2, 1), np.abs(np.linalg.det(homogeneous)) / math.factorial(
+        dim
+    )
 
 
-def stiffness(nodes: Values, cells: npt.NDArray[np.integer], mu: float, lmbda: float, chi: Values | float = 1.0) -> Values:
+def stiffness(
+    nodes: Values, cells: npt.NDArray[np.integer], mu: float, lmbda: float, chi: Values | float = 1.0
+) -> Values:
     """K of int 2 mu eps(u):eps(v) + lambda tr tr: per cell V (mu (g_a.g_b I + g_b x g_a) + lambda g_a x g_b)."""
     dim = nodes.shape[1]
     G, V = gradients(nodes[cells])

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from fracsim.meshes.data import MeshData
-from fracsim.run import Scene, build_scene
+from mpi4py import MPI
+
+from fracsim.scene import Scene, build_scene
 from fracsim.state import State
 from fracsim.stepping import Report
 from fracsim.study import Study
-from mpi4py import MPI
 
 Values = npt.NDArray[np.float64]
 

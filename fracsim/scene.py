@@ -1,0 +1,57 @@
+"""A study bound to its mesh: everything that a run moves, built and checked before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+from .check import checked_mesh
+from .domain import Domain, distribute
+from .equilibrium import Equilibrium
+from .forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
+from .history import Probes
+from .material import material_fields
+from .parallel import on_root
+from .solve import Solver
+from .stepping import Stepper
+from .study import Study, Time
+from .support import check_supports
+
+
+@dataclass
+class Scene:
+    """A study bound to its mesh: what a run moves."""
+
+    study: Study
+    domain: Domain
+    equations: Equilibrium
+    solver: Solver
+    stepper: Stepper
+    fracture: Any  # FracturePass | None
+    probes: Probes
+
+
+def build_scene(comm: MPI.Comm, study: Study) -> Scene:
+    """Mesh, equations, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
+    domain = distribute(comm, on_root(comm, lambda: checked_mesh(study)))
+    scheme = make_scheme(study.time)
+    equations = Equilibrium(domain, study, material_fields(domain, study.material), scheme)
+    if not scheme.inertia:
+        check_supports(domain, equations.motion)
+    fracture = None
+    if study.fracture is not None:
+        from .fracture import FracturePass
+
+        fracture = FracturePass(equations, study.fracture, study.material)
+    solver = Solver(equations, study.solver)
+    stepper = Stepper(equations, solver, study.time, fracture)
+    return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
+
+
+def make_scheme(timing: Time) -> Scheme:
+    """The time scheme of a study."""
+    if timing.scheme == "newmark":
+        return Newmark(timing.beta, timing.gamma)
+    return BackwardEuler() if timing.scheme == "backward-euler" else QuasiStatic()
