@@ -32,12 +32,19 @@ def plane_stress_lambda(mu: float, lmbda: float) -> float:
 class Energy(Protocol):
     """What the solver needs of an energy."""
 
-    mu: Scalar
-    lmbda: Scalar
+    @property
+    def mu(self) -> Scalar: ...
+
+    @property
+    def lmbda(self) -> Scalar: ...
+
+    @property
+    def reduced(self) -> bool:
+        """Whether lmbda is lambda* of plane stress."""
+
     needs_rotation: ClassVar[bool]  # psi takes the polar rotation of F, lagged per iterate
     linear: ClassVar[bool]  # the stress is linear in u: reference and current configuration are not told apart
     plane_stress: ClassVar[bool]  # has the reduced 2D form
-    reduced: bool  # lmbda is lambda* of plane stress
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
 

@@ -9,6 +9,7 @@ within R of its own.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -74,7 +75,7 @@ class _Halo:
 
     def __init__(self, comm: MPI.Comm, centroids: Values, distance: float) -> None:
         self.comm = comm
-        self._send = [np.empty(0, np.int64)] * comm.size
+        self._send: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)] * comm.size
         if comm.size == 1:
             return
         d = centroids.shape[1]
@@ -84,8 +85,8 @@ class _Halo:
         for rank, (low, high) in enumerate(boxes):
             if rank != comm.rank:
                 close = np.all((centroids >= low - distance) & (centroids <= high + distance), axis=1)
-                self._send[rank] = np.flatnonzero(close)
-        sent = np.array([len(part) for part in self._send])
+                self._send[rank] = np.flatnonzero(close).astype(np.int64)
+        sent = np.array([len(part) for part in self._send], np.int64)
         received = np.empty_like(sent)
         comm.Alltoall(sent, received)
         self._sent, self._received = sent, received
@@ -98,5 +99,7 @@ class _Halo:
         width = values.shape[1]
         send = np.ascontiguousarray(values[self._rows], float)
         arrived = np.empty((int(self._received.sum()), width))
-        self.comm.Alltoallv((send, self._sent * width), (arrived, self._received * width))
+        here: Any = (send, self._sent * width)
+        there: Any = (arrived, self._received * width)
+        self.comm.Alltoallv(here, there)
         return np.concatenate([values, arrived])

@@ -108,7 +108,7 @@ class Equilibrium:
         if self.u_n is None:
             space = self.domain.space
             self.u_n, self.u_v = fem.Function(space), fem.Function(space)
-            self._c_v = fem.Constant(self.domain.mesh, 0.0)
+            self._c_v = fem.Constant(self.domain.mesh, np.float64(0.0))
         rate = self._c_v * (self.u - self.u_v)
         return viscous_work(self.material.energy, rate, self.u_n, w, dx, b=self.damping.stiffness, chi=chi)
 
@@ -128,7 +128,7 @@ class Equilibrium:
         self.tangent.setOption(PETSc.Mat.Option.SPD, False)
         self.residual = fem_petsc.create_vector(self._residual)
         self._work = fem_petsc.create_vector(self._residual)
-        self.external = np.zeros(self._owned)
+        self.external: Values = np.zeros(self._owned)
         self.unbalanced = np.zeros(self._owned)
         self._prescribed = fem.Function(self.domain.space)
         self.bcs = [self._condition()] if self.domain.comm.allreduce(len(self.motion.dofs)) else []
@@ -141,7 +141,8 @@ class Equilibrium:
     def _condition(self) -> fem.DirichletBC:
         # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
         dofs = self.motion.dofs
-        return fem.dirichletbc(self._prescribed, [dofs, dofs], self.domain.space.sub(0))
+        pair: Any = [dofs, dofs]
+        return fem.dirichletbc(self._prescribed, pair, self.domain.space.sub(0))
 
     def _assembled(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled linear form."""

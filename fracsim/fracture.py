@@ -53,6 +53,8 @@ class FracturePass:
         stress = symmetric_components(cauchy_stress(energy, F, rotation))
         both = ufl.as_vector([*stress, energy.psi(F, rotation)])  # one kernel: F is worked out once
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
+        assert equations.chi is not None
+        self._chi: Values = equations.chi.x.array
         self._average = _average(domain, fracture)
 
     def __call__(self) -> PassResult:
@@ -60,13 +62,13 @@ class FracturePass:
         values = self._evaluate()
         stress, psi = values[:, :-1], values[:, -1]
         if not np.isfinite(values.sum()):  # a crushed cell: J = 0
-            np.nan_to_num(stress, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+            np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         averaged = self._averaged(stress)
         flags = np.zeros(len(self.graph.broken), bool)
         flags[self._overloaded(averaged)] = True
         broken = self.graph.break_edges(flags)
         released = self._degrade(stress, psi)
-        chi = self.equations.chi.x.array[: self.domain.cell_count]
+        chi = self._chi[: self.domain.cell_count]
         return PassResult(broken, released, float(np.sum(self.domain.volumes * chi * psi)))
 
     def _averaged(self, stress: Values) -> Values:
@@ -108,8 +110,7 @@ class FracturePass:
 
     def _degrade(self, stress: Values, psi: Values) -> float:
         """Lower chi of damaged cells (M22 eq. 28); returns the elastic energy released on this rank."""
-        chi: Any = self.equations.chi
-        values = chi.x.array
+        values = self._chi
         cells = np.flatnonzero(self.graph.damaged & (values[: self.domain.cell_count] > 0))
         if not len(cells):
             return 0.0
@@ -152,8 +153,10 @@ def _average(domain: Domain, fracture: Fracture) -> Any:
 
 def hashed(points: Values) -> Values:
     """Numbers in [-1, 1), one a point, that depend on the bits of its coordinates only (splitmix64's finaliser)."""
-    bits = np.ascontiguousarray(points + 0.0, float).view(np.uint64)  # + 0.0: -0 and 0 are one place
-    state = np.zeros(len(points), np.uint64)
+    bits: npt.NDArray[np.uint64] = np.ascontiguousarray(points + 0.0, float).view(
+        np.uint64
+    )  # + 0.0: -0 and 0 are one place
+    state: npt.NDArray[np.uint64] = np.zeros(len(points), np.uint64)
     for column in bits.T:
         state = _mix(state ^ column)
     return (state >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0

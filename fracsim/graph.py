@@ -33,7 +33,8 @@ def node_groups(dim: int) -> npt.NDArray[np.int8]:
     intact = (patterns[:, None] >> np.arange(len(edges))) & 1 == 0
     label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(patterns), 1))
     for _ in range(dim):  # a path through d + 1 nodes has at most d edges
-        for edge, (i, j) in enumerate(edges):
+        for edge in range(len(edges)):
+            i, j = int(edges[edge, 0]), int(edges[edge, 1])
             lower = np.minimum(label[:, i], label[:, j])
             label[:, i] = np.where(intact[:, edge], lower, label[:, i])
             label[:, j] = np.where(intact[:, edge], lower, label[:, j])

@@ -67,7 +67,7 @@ class Forces:
         return changed
 
     def _constant(self, law: Law, size: int) -> fem.Constant:
-        constant = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.nan)
+        constant = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.float64(np.nan))
         self._moving.append((constant, law))
         return constant
 

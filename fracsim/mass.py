@@ -1,4 +1,4 @@
-"""The mass matrix: lumped to the nodes, or consistent with the shape functions. Made once; the reference mass is constant.
+"""The mass matrix, lumped to the nodes or consistent with the shape functions: made once, for it is constant.
 
 Lumped (vertex quadrature, the default) is a vector: inertia costs one product, and a node of debris keeps its own mass.
 Consistent is a sparse matrix with the pattern of the tangent: higher frequencies come out too high instead of too low.

@@ -62,7 +62,7 @@ def per_cell(domain: Domain, source: Any, key: str, regions: dict[str, Region] |
 
 def _coefficient(domain: Domain, value: PerCell) -> Any:
     if np.ndim(value) == 0:
-        return fem.Constant(domain.mesh, float(value))
+        return fem.Constant(domain.mesh, np.float64(value))
     field = fem.Function(domain.cell_scalar)
     field.x.array[: domain.cell_count] = value
     return field

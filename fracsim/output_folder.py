@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import platform
+from importlib.metadata import version
 from pathlib import Path
 
-import dolfinx
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -35,7 +35,7 @@ def versions(comm: MPI.Comm) -> dict[str, str]:
     """What ran: programs, versions, ranks."""
     return {
         "fracsim": __version__,
-        "dolfinx": dolfinx.__version__,
+        "dolfinx": version("fenics-dolfinx"),
         "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
         "python": platform.python_version(),
         "ranks": str(comm.size),

@@ -47,7 +47,7 @@ def total(comm: MPI.Comm, values: Any) -> npt.NDArray[Any]:
     return result
 
 
-def offset(comm: MPI.Comm, count: int) -> int:
+def offset(comm: MPI.Intracomm, count: int) -> int:
     """Sum of `count` over the lower ranks."""
     before = comm.exscan(count)
     return int(before or 0)
@@ -79,12 +79,13 @@ class Gather:
 
     def _gather(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
         width = int(np.prod(rows.shape[1:], dtype=int)) * rows.itemsize
+        send = rows.view(np.uint8).reshape(-1) if rows.size else np.empty(0, np.uint8)
         if self._counts is None or self._order is None:
-            self.comm.Gatherv(rows.view(np.uint8).reshape(-1) if rows.size else np.empty(0, np.uint8), None)
+            self.comm.Gatherv(send, None)
             return None
         raw = np.empty(sum(self._counts) * width, np.uint8)
-        send = rows.view(np.uint8).reshape(-1) if rows.size else np.empty(0, np.uint8)
-        self.comm.Gatherv(send, (raw, [count * width for count in self._counts]))
+        sizes: Any = [count * width for count in self._counts]
+        self.comm.Gatherv(send, (raw, sizes))
         arrived = raw.view(rows.dtype).reshape((-1, *rows.shape[1:]))
         result = np.empty_like(arrived)
         result[self._order] = arrived

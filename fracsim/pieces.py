@@ -31,7 +31,9 @@ class Pieces:
         """(count, ...) sums over each piece of (owned nodes, ...) values such as mass in kg (collective)."""
         columns = per_node.reshape(domain.node_count, -1)
         owner = self.of_node[: domain.node_count]
-        sums = np.stack([np.bincount(owner, column, minlength=self.count) for column in columns.T], axis=1)
+        sums = np.empty((self.count, columns.shape[1]))
+        for k, column in enumerate(columns.T):
+            sums[:, k] = np.bincount(owner, column, minlength=self.count)
         result = np.empty_like(sums)
         domain.comm.Allreduce(sums, result)
         return result.reshape(self.count, *per_node.shape[1:])

@@ -70,5 +70,5 @@ def _rotation_by_svd(F: Tensors) -> Tensors:
     finite = np.isfinite(F).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], F, np.eye(F.shape[1]))
     U, _, Vt = np.linalg.svd(safe)
-    U[:, :, -1] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    U[:, :, -1] *= np.sign(np.linalg.det(U @ Vt)).reshape(-1, 1)
     return U @ Vt

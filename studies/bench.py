@@ -141,8 +141,7 @@ class Bare:
         V, mesh = domain.space, domain.mesh
         self.dt, self.petsc, self.fem_petsc, self.PETSc = scene["time"]["step"], fem_petsc, fem_petsc, PETSc
         self.u, self.g = fem.Function(V), fem.Function(V)
-        mu, lmbda = lame(1e7, 0.35)
-        energy = NeoHookean(fem.Constant(mesh, mu), fem.Constant(mesh, lmbda))
+        energy = NeoHookean(*(fem.Constant(mesh, np.float64(value)) for value in lame(1e7, 0.35)))
         w, dx = ufl.TestFunction(V), ufl.Measure("dx", domain=mesh)
         residual = internal_work(energy, self.u, w, dx)
         self.R = fem.form(residual, jit_options=jit_options())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fracsim.edge_stress import barycentric_gradients, carried_by, edge_vectors, normal_stress
 from fracsim.graph import local_edges
-from support.laws import Tensor, rotation
+from support.laws import T_stress, Tensor, rotation
 
 EPS = np.finfo(float).eps
 DIMS = (2, 3)
@@ -35,18 +35,6 @@ def as_matrix(components: Tensor) -> Tensor:
         return np.array([[xx, xy], [xy, yy]])
     xx, yy, zz, xy, xz, yz = components
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def T_stress(corners: Tensor) -> Tensor:
-    """Rows turn stress components into normal stress along one edge: n_i^2 on normal, 2 n_i n_j on shear components."""
-    rows = []
-    for i, j in local_edges(corners.shape[1]):
-        n = (corners[j] - corners[i]) / np.linalg.norm(corners[j] - corners[i])
-        if len(n) == 2:
-            rows.append([n[0] ** 2, n[1] ** 2, 2 * n[0] * n[1]])
-        else:
-            rows.append([*(n**2), 2 * n[0] * n[1], 2 * n[0] * n[2], 2 * n[1] * n[2]])
-    return np.array(rows)
 
 
 def flags_of(patterns: Tensor, edges: int) -> Tensor:

@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.forms.energies import ENERGIES, Energy, StVK, lame, plane_stress_lambda
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import polar
 
+from fracsim.forms.energies import ENERGIES, Energy, StVK, lame, plane_stress_lambda
 from support.laws import Law, Tensor, law_of, rotation
 
 YOUNG, POISSON = 3.0, 0.3

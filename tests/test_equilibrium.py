@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fracsim.forms.energies import ENERGIES
 
+from fracsim.forms.energies import ENERGIES
 from fracsim.scene import Scene
 from support.laws import rotation
 from support.reference import dense_tangent, lumped_mass, stiffness
@@ -225,3 +225,23 @@ def test_tractions_on_two_groups() -> None:
     assert scene.equations.external.sum() == pytest.approx(0, abs=10 * EPS * t)
     expected = positions(scene) * [t / YOUNG, 0.0]
     np.testing.assert_allclose(state.u.reshape(-1, 2), expected, atol=1e-9 * t / YOUNG)
+
+
+@pytest.mark.parametrize("energy", ("linear", "neo-hookean"))
+def test_reactions_from_the_cells_at_the_supports(energy: str) -> None:
+    """Assembled over the few cells that touch prescribed dofs they are those of the whole residual, damping
+    included."""
+    scene = scene_of(
+        energy,
+        2,
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.1, 0.0]}, {"on": "top", "pressure": 0.1}],
+        damping={"mass": 0.3, "stiffness": 0.2},
+        fracture={"strength": 1.0},
+    )
+    equations = scene.equations
+    equations.chi.x.array[:] = np.random.default_rng(2).uniform(0, 1, scene.domain.cell_count)
+    residual_at(scene, randomly_deformed(scene))
+    whole = equations.unbalanced.copy()
+    equations.unbalanced[equations.held] = np.nan
+    equations.update_reactions()
+    np.testing.assert_allclose(equations.unbalanced, whole, atol=1e3 * EPS * YOUNG / 0.1)

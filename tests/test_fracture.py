@@ -12,20 +12,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.forms.energies import cauchy_stress
-from fracsim.forms.kinematics import deformation_gradient, symmetric_components
-from fracsim.meshes import BUILDERS
-from fracsim.meshes.write import write_mesh
+from scipy.spatial.distance import cdist
 from scipy.stats import kstest, pearsonr
 
 from fracsim.edge_stress import edge_vectors, normal_stress
+from fracsim.forms.energies import cauchy_stress
+from fracsim.forms.kinematics import deformation_gradient, symmetric_components
 from fracsim.fracture import FracturePass, hashed
 from fracsim.graph import local_edges
 from fracsim.kernels import CellExpression
+from fracsim.meshes import BUILDERS
+from fracsim.meshes.write import write_mesh
 from fracsim.scene import Scene
 from fracsim.state import State
 from fracsim.study import Fracture
-from support.laws import rotation
+from support.laws import T_stress, rotation
 from support.oscillator import slopes
 from support.scenes import Values, cell_corners, deform, displacement, each_step, make_scene, march, positions
 
@@ -252,6 +253,43 @@ def test_an_unstressed_cell_keeps_its_stiffness() -> None:
     graph.break_edges(flags)
     scene.fracture()
     assert np.all(scene.equations.chi.x.array == 1.0)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_pass_breaks_what_the_dense_average_says(dim: int) -> None:
+    """METHOD section 3 in full on a damaged body: stress without the share of broken edges, T^-1 diag(integrity) T s;
+    split cells out of it; volume times hat function over the cells in reach; intact edges at the strength break.
+    """
+    radius, strength = 0.4, 0.05
+    scene, _ = make_scene(
+        mesh={
+            "builder": "box",
+            "size": [1.0, 0.8, 0.6][:dim],
+            "h": 0.16 if dim == 2 else 0.3,
+            "pattern": "unstructured",
+        },
+        fracture={"strength": strength, "radius": radius, "tie_break": 0.0},
+    )
+    graph, random = scene.fracture.graph, np.random.default_rng(1)
+    graph.break_edges(random.random(len(graph.broken)) < 0.25)
+    scene.equations.displace(0.1 * np.sin(3 * positions(scene)[:, ::-1]).reshape(-1))
+    corners, before = cell_corners(scene), graph.broken.copy()
+    intact, active = ~before[graph.cell_edges], ~graph.split
+    assert 0 < np.count_nonzero(active) < len(active)
+    stress = cauchy_of(scene)()
+    carried = np.zeros_like(stress)
+    for cell in np.flatnonzero(active):
+        T = T_stress(corners[cell])
+        carried[cell] = np.linalg.solve(T, intact[cell] * (T @ stress[cell]))
+    q = cdist(corners.mean(axis=1), corners.mean(axis=1)) / radius
+    weights = np.where(q <= 1, 1 - q, 0.0) * scene.domain.volumes * active
+    averaged = weights @ carried / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    along = np.array([T_stress(x) @ s for x, s in zip(corners, averaged, strict=True)])
+    expected = before.copy()
+    expected[graph.cell_edges[along >= strength]] = True
+    scene.fracture()
+    assert np.count_nonzero(before) < np.count_nonzero(expected) < len(expected)
+    assert np.array_equal(graph.broken, expected)
 
 
 # --- rotation ---

@@ -7,8 +7,9 @@ from math import factorial
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.forms.energies import lame
 from scipy.linalg import eigh
+
+from fracsim.forms.energies import lame
 from support.reference import gradients, stiffness
 from support.scenes import make_scene, march
 
@@ -42,7 +43,7 @@ def test_consistent_mass_is_the_integral(dim: int) -> None:
 
 
 def test_a_mode_of_the_consistent_mass_vibrates_at_its_frequency() -> None:
-    """The trapezoidal rule turns the phase of a mode by exactly 2 atan(w dt / 2) a step; w from K phi = w^2 M phi, dense."""
+    """The trapezoidal rule turns a mode's phase by 2 atan(w dt / 2) a step; w from K phi = w^2 M phi, dense."""
     steps, dt = 30, 0.2
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.4, "pattern": "unstructured"},

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.quality import mesh_quality
@@ -268,6 +269,7 @@ def test_importing_builders_loads_neither_gmsh_nor_meshio() -> None:
 
 def test_gmsh_is_ended_after_an_error() -> None:
     import gmsh
+
     from fracsim.meshes.gmsh_session import session
 
     with pytest.raises(MeshError, match=r"gmsh could not make the mesh: .+"), session() as g:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.topology import boundary_facets, edges_of, facets_of, signed_measures
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 SQUARE = MeshData(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]]))
 

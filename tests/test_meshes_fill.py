@@ -5,16 +5,16 @@ from __future__ import annotations
 from math import pi
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
+
 from fracsim.meshes import BUILDERS, MeshError
 from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.fill import fill_surface
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.surface import closed_surface
 from fracsim.meshes.topology import boundary_facets, signed_measures
-
-import meshio
 
 Shell = tuple[Points, Indices]
 

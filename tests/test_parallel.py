@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fracsim.meshes.data import MeshData
-from fracsim.meshes.topology import edges_of
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from fracsim.mesh_source import build_mesh
+from fracsim.meshes.data import MeshData
+from fracsim.meshes.topology import edges_of
 from fracsim.study import Mesh
 from support.ranks import Arrays, run_on_ranks
 from support.reference import gradients, lumped_mass
@@ -170,10 +170,10 @@ def test_same_motion(results: Results, ranks: int, name: str, quantity: str) -> 
     found, serial = results(ranks)[f"{name}-{quantity}"], results(1)[f"{name}-{quantity}"]
     assert found.shape == serial.shape
     assert np.all(np.isfinite(found))
-    columns = range(serial.shape[1]) if quantity == "history" else [slice(None)]
+    # rows of a history: broken edges, kinetic and elastic energy, and probes, of which some components are zero
+    columns = [slice(0, 1), slice(1, 2), slice(2, 3), slice(3, None)] if quantity == "history" else [slice(None)]
     for column in columns:
-        a, b = found[..., column], serial[..., column]
-        np.testing.assert_allclose(a, b, atol=1e-7 * scale(b))
+        np.testing.assert_allclose(found[..., column], serial[..., column], atol=1e-7 * scale(serial[..., column]))
 
 
 def test_the_runs_do_tear() -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fracsim.forms.energies import ENERGIES
-from fracsim.meshes.topology import boundary_facets
 
+from fracsim.forms.energies import ENERGIES
 from fracsim.frames import Frames
+from fracsim.meshes.topology import boundary_facets
 from fracsim.scene import Scene
 from fracsim.state import State
 from support.laws import law_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fracsim.forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
 
+from fracsim.forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
 from support.oscillator import Values, exact, run, slopes
 
 EPS = np.finfo(float).eps

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fracsim.forms.schemes import BackwardEuler, Newmark
 
+from fracsim.forms.schemes import BackwardEuler, Newmark
 from fracsim.scene import Scene, make_scheme
 from fracsim.state import State
 from support.oscillator import exact, run, slopes

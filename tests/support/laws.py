@@ -1,4 +1,4 @@
-"""UFL energies evaluated at a deformation gradient without DOLFINx, and rotations to try them on."""
+"""UFL energies evaluated at a deformation gradient without DOLFINx, rotations to try them on, M22's matrix T."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import basix.ufl
 import numpy as np
 import numpy.typing as npt
 import ufl
-from fracsim.forms.energies import Energy, cauchy_stress, first_piola_kirchhoff, full_cauchy_stress
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.algorithms.expand_indices import expand_indices
 from ufl.algorithms.transformer import strip_variables
+
+from fracsim.forms.energies import Energy, cauchy_stress, first_piola_kirchhoff, full_cauchy_stress
+from fracsim.graph import local_edges
 
 Tensor = npt.NDArray[np.float64]
 
@@ -77,3 +79,15 @@ def rotation(dim: int, seed: int) -> Tensor:
         return Rotation.random(random_state=seed).as_matrix()
     angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def T_stress(corners: Tensor) -> Tensor:
+    """Rows turn stress components into normal stress along one edge: n_i^2 on normal, 2 n_i n_j on shear components."""
+    rows = []
+    for i, j in local_edges(corners.shape[1]):
+        n = (corners[j] - corners[i]) / np.linalg.norm(corners[j] - corners[i])
+        if len(n) == 2:
+            rows.append([n[0] ** 2, n[1] ** 2, 2 * n[0] * n[1]])
+        else:
+            rows.append([*(n**2), 2 * n[0] * n[1], 2 * n[0] * n[2], 2 * n[1] * n[2]])
+    return np.array(rows)

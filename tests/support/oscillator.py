@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+
 from fracsim.forms.schemes import Scheme
 
 Values = npt.NDArray[np.float64]

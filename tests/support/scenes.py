@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from fracsim.meshes.data import MeshData
 from mpi4py import MPI
 
+from fracsim.meshes.data import MeshData
 from fracsim.scene import Scene, build_scene
 from fracsim.state import State
 from fracsim.stepping import Report
