@@ -31,7 +31,7 @@ lint:
 	./env ruff check $(sources)
 	./env ruff format --check $(sources)
 	@rm -rf build/types && mkdir -p build/types/fracsim
-	@cd build/types/fracsim && ln -s ../../../fracsim/*.py ../../../forms ../../../meshes ../../../studies .
+	@cd build/types/fracsim && ln -s ../../../fracsim/[!_]* ../../../fracsim/__init__.py ../../../forms ../../../meshes ../../../studies .
 	cd build/types && ../../env mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p fracsim
 
 format:

@@ -43,8 +43,9 @@ class Domain:
     source: MeshData | None = None
 
     @property
-    def comm(self) -> MPI.Comm:
-        return self.mesh.comm
+    def comm(self) -> MPI.Intracomm:
+        comm: MPI.Intracomm = self.mesh.comm
+        return comm
 
     @property
     def dim(self) -> int:

@@ -133,7 +133,8 @@ def test_every_default_is_written() -> None:
 
     data = tomllib.loads(study_text(study(STRIP)))
     assert data["time"] == {
-        "scheme": "backward-euler", "step": 0.005, "end": 0.05, "adapt": True, "beta": 0.25, "gamma": 0.5
+        "scheme": "backward-euler", "step": 0.005, "end": 0.05, "adapt": True, "mass": "lumped",
+        "beta": 0.25, "gamma": 0.5
     }  # fmt: skip
     chosen = {"strength": 2e4}
     assert data["fracture"] == chosen | {"approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6}

@@ -137,7 +137,8 @@ class _Builder:
             placed = ~np.isnan(self.cut[edges])
             at = np.flatnonzero(placed.sum(axis=1) >= 2)
             weight = placed[at] / placed[at].sum(axis=1, keepdims=True)
-            centre[at] = np.einsum("ne,nei->ni", weight, self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, -1))
+            cuts = self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, self.skeleton.dim)
+            centre[at] = np.einsum("ne,nei->ni", weight, cuts)
         return centre
 
     # --- elements ---
