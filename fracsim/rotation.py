@@ -67,7 +67,7 @@ def _inverse_transpose(R: Tensors) -> Tensors:
 
 def _rotation_by_svd(F: Tensors) -> Tensors:
     """U diag(1, .., det(U V^T)) V^T: the rotation, not the reflection, closest to F. Identity where F is not finite."""
-    finite = np.isfinite(F).all(axis=(1, 2))
+    finite = np.isfinite(F.sum(axis=(1, 2)))
     safe = np.where(finite[:, None, None], F, np.eye(F.shape[1]))
     U, _, Vt = np.linalg.svd(safe)
     U[:, :, -1] *= np.sign(np.linalg.det(U @ Vt)).reshape(-1, 1)
