@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from .forms.kinematics import SYMMETRIC_COMPONENTS
 from .graph import local_edges
+from .small_matrices import inverse_transpose
 
 Values = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def normal_stress(components: Values, vectors: Values) -> Values:
 def barycentric_gradients(corners: Values) -> Values:
     """(n, d + 1, d) gradients g_i of the barycentric coordinates of (n, d + 1, d) corners, 1/m."""
     basis = corners[:, 1:] - corners[:, :1]
-    others = np.linalg.inv(basis).transpose(0, 2, 1)
+    others = inverse_transpose(basis)
     return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
 

@@ -75,14 +75,15 @@ class FracturePass:
         """What intact edges carry, averaged over the neighbourhood; split cells carry nothing and enter no average."""
         graph = self.graph
         damaged = np.flatnonzero(graph.damaged)
-        carried, active = stress, None
-        if self.domain.comm.allreduce(len(damaged)):
-            active = ~graph.split
-            carried = stress.copy()
-            whole = damaged[active[damaged]]
-            carried[whole] = carried_by(stress[whole], self._corners(whole), self._intact(whole))
-            carried[~active] = 0.0
-        return self._average(carried, active) if self._average is not None else carried
+        if not self.domain.comm.allreduce(len(damaged)):
+            return self._average(stress) if self._average is not None else stress
+        active = ~graph.split
+        carried = np.where(active[:, None], stress, 0.0)
+        if self._average is None:
+            return carried  # an intact edge has the same normal stress in the whole tensor: no share to take out
+        whole = damaged[active[damaged]]
+        carried[whole] = carried_by(stress[whole], self._corners(whole), self._intact(whole))
+        return np.asarray(self._average(carried, active))
 
     def _overloaded(self, averaged: Values) -> npt.NDArray[np.int32]:
         """Local edges whose normal stress in some owned cell reaches the strength.

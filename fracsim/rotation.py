@@ -9,6 +9,7 @@ from dolfinx import fem
 from .domain import Domain
 from .forms.kinematics import deformation_gradient
 from .kernels import CellExpression
+from .small_matrices import inverse_transpose
 
 Tensors = npt.NDArray[np.float64]
 
@@ -44,25 +45,11 @@ def polar_rotation(F: Tensors, iterations: int = 20) -> Tensors:
         return result
     R = F.copy()
     for _ in range(iterations):
-        change = _inverse_transpose(R) - R
+        change = inverse_transpose(R) - R
         R += change / 2
         if np.max(np.abs(change), initial=0.0) < 1e-8:  # quadratic: the next one would be at round-off
             break
     return R
-
-
-def _inverse_transpose(R: Tensors) -> Tensors:
-    """R^-T = cofactor(R) / det(R), by cross products of the rows: no LAPACK call per cell."""
-    if R.shape[1] == 2:
-        cofactor = np.empty_like(R)
-        cofactor[:, 0, 0], cofactor[:, 0, 1] = R[:, 1, 1], -R[:, 1, 0]
-        cofactor[:, 1, 0], cofactor[:, 1, 1] = -R[:, 0, 1], R[:, 0, 0]
-    else:
-        cofactor = np.stack(
-            [np.cross(R[:, 1], R[:, 2]), np.cross(R[:, 2], R[:, 0]), np.cross(R[:, 0], R[:, 1])], axis=1
-        )
-    determinant = np.einsum("nj,nj->n", R[:, 0], cofactor[:, 0])
-    return cofactor / determinant[:, None, None]
 
 
 def _rotation_by_svd(F: Tensors) -> Tensors:

@@ -99,8 +99,7 @@ class Rotations:
         ones = np.ones(len(cell))
         self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
         volume = self._sum @ np.abs(np.linalg.det(span))
-        self._lonely = volume == 0
-        self._per_volume = 1.0 / np.where(self._lonely, 1.0, volume)
+        self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # none: the mean is 0 and F the identity
         self._identity = np.eye(d)
 
     def __call__(self, u: Values) -> Values:

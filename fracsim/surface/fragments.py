@@ -1,0 +1,110 @@
+"""The pieces of a body: mass, volume, centre, velocity and spin, and names that stay with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """Figures of p pieces.
+
+    Attributes:
+        name: (p,) number that stays with the piece over time.
+        nodes: (p,) how many.
+        mass: (p,) kg (2D: per metre of thickness), the sum of the lumped nodal masses.
+        volume: (p,) m^3 (2D: m^2) that the split surface encloses in the reference configuration.
+        centre, velocity: (p, d) of mass, m and m/s.
+        spin: (p, 3) rad/s; 2D: (p, 1). The least-squares solution of (tensor of inertia) spin = angular momentum, so 0
+            about axes that a piece of one node, or of nodes in line, has no inertia about.
+    """
+
+    name: Ints
+    nodes: Ints
+    mass: Values
+    volume: Values
+    centre: Values
+    velocity: Values
+    spin: Values
+
+
+def fragments(name: Ints, piece_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values) -> Fragments:
+    """Figures of the pieces from nodal masses (N,) in kg, current places x (N, d) and velocities v (N, d)."""
+    size = len(piece_of_node)
+    total = csr_matrix((np.ones(size), (piece_of_node, np.arange(size))), shape=(len(name), size))
+    weight = total @ mass
+    centre, velocity = ((total @ (mass[:, None] * each)) / weight[:, None] for each in (x, v))
+    spin = _spin(total, mass, x - centre[piece_of_node], v - velocity[piece_of_node])
+    nodes = np.bincount(piece_of_node, minlength=len(name))
+    return Fragments(name, nodes, weight, volume, centre, velocity, spin)
+
+
+def _spin(total: csr_matrix, mass: Values, r: Values, w: Values) -> Values:
+    """Spin of each piece from arms r and velocities w (N, d) about its centre of mass.
+
+    L = sum m r x w,   I = sum m (r.r 1 - r r^T)
+    """
+    if r.shape[1] == 2:
+        momentum = total @ (mass * (r[:, 0] * w[:, 1] - r[:, 1] * w[:, 0]))
+        inertia = total @ (mass * np.einsum("ni,ni->n", r, r))
+        return np.divide(momentum, inertia, out=np.zeros_like(momentum), where=inertia > 0)[:, None]
+    momentum = total @ (mass[:, None] * np.cross(r, w))
+    second = (total @ (mass[:, None] * np.einsum("ni,nj->nij", r, r).reshape(-1, 9))).reshape(-1, 3, 3)
+    inertia = np.einsum("nii->n", second)[:, None, None] * np.eye(3) - second
+    # an axis with less than 1e-9 of the largest moment has none: what is left there is round-off of the sums
+    spin: Values = np.einsum("nij,nj->ni", np.linalg.pinv(inertia, rcond=1e-9, hermitian=True), momentum)
+    return spin
+
+
+def volumes(points: Values, elements: Ints, piece: Ints, count: int) -> Values:
+    """(count,) m^3 (2D: m^2) enclosed by closed surfaces (outlines) of points (n, d): divergence theorem.
+
+    V = 1/6 sum x_0 . (x_1 x x_2) over triangles; 2D: A = 1/2 sum x_0 x x_1 over segments.
+    """
+    x = (points - points.mean(axis=0))[elements]  # near the origin: less cancels
+    if points.shape[1] == 2:
+        each = (x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2
+    else:
+        each = np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2])) / 6
+    return np.bincount(piece, each, minlength=count)
+
+
+class PieceNames:
+    """Numbers that stay with a piece.
+
+    Damage does not heal, so a piece is part of one earlier piece. Of its parts the one with the largest mass keeps the
+    name, the one with the lowest node where masses are equal; the others get new names in the order of their lowest node.
+    """
+
+    def __init__(self) -> None:
+        self._of_node: Ints | None = None
+        self._next = 0
+
+    def update(self, pieces: int, piece_of_node: Ints, mass: Values) -> Ints:
+        """(pieces,) names; the pieces are numbered by their lowest node."""
+        lowest = np.unique(piece_of_node, return_index=True)[1]
+        if self._of_node is None:
+            names, keeps = np.full(pieces, -1), np.zeros(pieces, bool)
+        else:
+            names = self._of_node[lowest]
+            weight = _rounded(np.bincount(piece_of_node, mass, minlength=pieces))
+            order = np.lexsort((np.arange(pieces), -weight, names))
+            keeps = np.zeros(pieces, bool)
+            keeps[order[np.unique(names[order], return_index=True)[1]]] = True
+        fresh = np.flatnonzero(~keeps)
+        names[fresh] = self._next + np.arange(len(fresh))
+        self._next += len(fresh)
+        self._of_node = names[piece_of_node]
+        return names
+
+
+def _rounded(mass: Values) -> Values:
+    """Equal up to the round-off of sums is equal: halves of a symmetric body."""
+    return np.round(mass / mass.sum(), 12)
