@@ -16,7 +16,7 @@ from .forms.energies import cauchy_stress
 from .forms.kinematics import deformation_gradient, symmetric_components
 from .graph import EdgeGraph, local_edges
 from .kernels import CellExpression
-from .material import PerCell, per_cell
+from .strength import Strength
 from .study import Fracture, Material
 
 Values = npt.NDArray[np.float64]
@@ -37,16 +37,14 @@ class FracturePass:
 
     Attributes:
         graph: edges and their damage.
-        strength: (Pa) one number, or (cells,) where regions differ; the edge's own perturbation comes on top.
+        strength: of each edge in each cell.
     """
 
     def __init__(self, equations: Equilibrium, fracture: Fracture, material: Material) -> None:
         domain = equations.domain
         self.domain, self.equations = domain, equations
         self.graph = EdgeGraph(domain)
-        self.strength = _strength(domain, fracture, material)
-        self._weakest = float(np.min(self.strength, initial=np.inf)) * (1 - fracture.tie_break)
-        self._tie_break = fracture.tie_break
+        self.strength = Strength(self.graph, fracture, material)
         self._linear = equations.material.energy.linear
         rotation = equations.rotation.field if equations.rotation is not None else None
         F, energy = deformation_gradient(equations.u), equations.material.energy
@@ -94,20 +92,12 @@ class FracturePass:
         normal = self.domain.dim
         square = np.einsum("ni,ni->n", averaged[:, :normal], averaged[:, :normal])
         square += 2 * np.einsum("ni,ni->n", averaged[:, normal:pairs], averaged[:, normal:pairs])
-        cells = np.flatnonzero(square >= self._weakest**2)
+        cells = np.flatnonzero(square >= self.strength.weakest**2)
         if not len(cells):
             return np.empty(0, np.int32)
         edges = self.graph.cell_edges[cells]
         along = normal_stress(averaged[cells], edge_vectors(self._corners(cells)))
-        strength = self.strength[cells, None] if isinstance(self.strength, np.ndarray) else self.strength
-        limit = strength * (1 + self._tie_break * self._noise(edges)) if self._tie_break else strength
-        return edges[(along >= limit) & ~self.graph.broken[edges]]
-
-    def _noise(self, edges: npt.NDArray[np.int32]) -> Values:
-        """Numbers in [-1, 1) hashed from the edges' reference mid-points."""
-        unique, inverse = np.unique(edges, return_inverse=True)
-        ends = self.domain.nodes[self.graph.edge_nodes[unique]]
-        return hashed(ends[:, 0] + ends[:, 1])[inverse.reshape(edges.shape)]
+        return edges[(along >= self.strength(cells, edges)) & ~self.graph.broken[edges]]
 
     def _degrade(self, stress: Values, psi: Values) -> float:
         """Lower chi of damaged cells (M22 eq. 28); returns the elastic energy released on this rank."""
@@ -140,31 +130,9 @@ class FracturePass:
         return corners + self.equations.u.x.array.reshape(-1, self.domain.dim)[nodes]
 
 
-def _strength(domain: Domain, fracture: Fracture, material: Material) -> PerCell:
-    return per_cell(domain, fracture, "strength", material.regions)
-
-
 def _average(domain: Domain, fracture: Fracture) -> Any:
     if fracture.radius == 0:
         return None
     from .average import NonlocalAverage
 
     return NonlocalAverage(domain, fracture.radius, fracture.kernel)
-
-
-def hashed(points: Values) -> Values:
-    """Numbers in [-1, 1), one a point, that depend on the bits of its coordinates only (splitmix64's finaliser)."""
-    bits: npt.NDArray[np.uint64] = np.ascontiguousarray(points + 0.0, float).view(
-        np.uint64
-    )  # + 0.0: -0 and 0 are one place
-    state: npt.NDArray[np.uint64] = np.zeros(len(points), np.uint64)
-    for column in bits.T:
-        state = _mix(state ^ column)
-    return (state >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0
-
-
-def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    x = x + np.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))

@@ -132,6 +132,27 @@ class Damping(Table):
     stiffness: NonNegative = 0.0  # b, s
 
 
+class Heterogeneity(Table):
+    """Scatter of the strength from edge to edge, Weibull-distributed with mean 1; the same at any number of ranks."""
+
+    modulus: Positive  # Weibull's m: 5 scatters like stone, 50 hardly at all
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Fibre(Table):
+    """Strength that depends on direction: `ratio` times as high along the fibre as across it."""
+
+    direction: Vector
+    ratio: Positive = 1.0
+
+    @field_validator("direction")
+    @classmethod
+    def _has_a_direction(cls, direction: list[float]) -> list[float]:
+        if not any(direction):
+            raise ValueError("a direction must not be zero")
+        return direction
+
+
 class Fracture(Table):
     """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
 
@@ -140,6 +161,8 @@ class Fracture(Table):
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+    heterogeneity: Heterogeneity | None = None
+    fibre: Fibre | None = None
 
 
 class Box(Table):

@@ -18,13 +18,14 @@ from scipy.stats import kstest, pearsonr
 from fracsim.edge_stress import edge_vectors, normal_stress
 from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
-from fracsim.fracture import FracturePass, hashed
+from fracsim.fracture import FracturePass
 from fracsim.graph import local_edges
 from fracsim.kernels import CellExpression
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.scene import Scene
 from fracsim.state import State
+from fracsim.strength import hashed
 from fracsim.study import Fracture
 from support.laws import T_stress, rotation
 from support.oscillator import slopes
@@ -522,7 +523,7 @@ def test_strength_scatters_by_the_edge_not_by_the_cell() -> None:
     """The perturbation of an edge is one number, whichever cell looks at it and from whichever end."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.5}, fracture={"strength": 1.0})
     edges = scene.fracture.graph.cell_edges
-    noise = scene.fracture._noise(edges)
+    noise = scene.fracture.strength.noise(edges)
     values: dict[int, set[float]] = {}
     for edge, value in zip(edges.ravel().tolist(), noise.ravel().tolist(), strict=True):
         values.setdefault(edge, set()).add(value)

@@ -85,11 +85,9 @@ def columns(dim: int) -> list[str]:
 
 def _rows(t: float, pieces: Fragments) -> list[list[str]]:
     values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin])
-    whole = np.column_stack([pieces.name, pieces.nodes])
-    order = np.argsort(pieces.name)
     return [
-        [f"{t:.12g}", *map(str, ints), *(f"{value:.12g}" for value in floats)]
-        for ints, floats in zip(whole[order].tolist(), values[order].tolist(), strict=True)
+        [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
+        for piece in np.argsort(pieces.name)
     ]
 
 

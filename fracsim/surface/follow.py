@@ -107,6 +107,7 @@ class Rotations:
         moved = u[self._cells]
         moved = moved[:, 1:] - moved[:, :1]
         gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
-        mean = (self._sum @ gradient.reshape(len(gradient), -1)) * self._per_volume[:, None]
-        F = mean.reshape(-1, *self._identity.shape) + self._identity
+        d = len(self._identity)
+        mean = (self._sum @ gradient.reshape(-1, d * d)) * self._per_volume[:, None]
+        F = mean.reshape(-1, d, d) + self._identity
         return polar_rotation(F) if len(F) else F

@@ -73,14 +73,19 @@ def volumes(points: Values, elements: Ints, piece: Ints, count: int) -> Values:
         each = (x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2
     else:
         each = np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2])) / 6
-    return np.bincount(piece, each, minlength=count)
+    return sums(piece, each, count)
+
+
+def sums(group: Ints, values: Values, count: int) -> Values:
+    """(count,) sums of the values of each group."""
+    return np.asarray(np.bincount(group, values, minlength=count), float)
 
 
 class PieceNames:
-    """Numbers that stay with a piece.
+    """Numbers that stay with a piece over time.
 
     Damage does not heal, so a piece is part of one earlier piece. Of its parts the one with the largest mass keeps the
-    name, the one with the lowest node where masses are equal; the others get new names in the order of their lowest node.
+    name, where masses are equal the one with the lowest node; others get new names in the order of their lowest node.
     """
 
     def __init__(self) -> None:
@@ -89,22 +94,20 @@ class PieceNames:
 
     def update(self, pieces: int, piece_of_node: Ints, mass: Values) -> Ints:
         """(pieces,) names; the pieces are numbered by their lowest node."""
-        lowest = np.unique(piece_of_node, return_index=True)[1]
-        if self._of_node is None:
-            names, keeps = np.full(pieces, -1), np.zeros(pieces, bool)
-        else:
-            names = self._of_node[lowest]
-            weight = _rounded(np.bincount(piece_of_node, mass, minlength=pieces))
-            order = np.lexsort((np.arange(pieces), -weight, names))
-            keeps = np.zeros(pieces, bool)
-            keeps[order[np.unique(names[order], return_index=True)[1]]] = True
-        fresh = np.flatnonzero(~keeps)
+        names: Ints = np.zeros(pieces, np.int64)
+        fresh: Ints = np.arange(pieces)
+        if self._of_node is not None:
+            names[:] = self._of_node[np.unique(piece_of_node, return_index=True)[1]]
+            fresh = _not_heaviest(names, sums(piece_of_node, mass, pieces))
         names[fresh] = self._next + np.arange(len(fresh))
         self._next += len(fresh)
         self._of_node = names[piece_of_node]
         return names
 
 
-def _rounded(mass: Values) -> Values:
-    """Equal up to the round-off of sums is equal: halves of a symmetric body."""
-    return np.round(mass / mass.sum(), 12)
+def _not_heaviest(names: Ints, mass: Values) -> Ints:
+    """Pieces that are not the heaviest of their name, ascending."""
+    rounded = np.round(mass / mass.sum(), 12)  # halves of a symmetric body are equal
+    order = np.lexsort((np.arange(len(names)), -rounded, names))
+    first = np.unique(names[order], return_index=True)[1]
+    return np.sort(np.delete(order, first))

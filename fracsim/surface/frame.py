@@ -14,11 +14,12 @@ from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from .build import Split, split
 from .follow import Rotations
-from .fragments import Fragments, PieceNames, fragments, volumes
+from .fragments import Fragments, PieceNames, fragments, sums, volumes
 from .skeleton import BODY, Skeleton
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Arrays = dict[str, npt.NDArray[np.generic]]
 FARTHEST = float(np.finfo(np.float32).max)  # viewers draw in single precision
 
 
@@ -39,8 +40,8 @@ class Frame:
     points: Values
     triangles: Ints
     segments: Ints
-    at_points: dict[str, npt.NDArray[np.generic]]
-    at_elements: dict[str, npt.NDArray[np.generic]]
+    at_points: Arrays
+    at_elements: Arrays
     origins: list[str]
     pieces: Fragments
 
@@ -62,9 +63,9 @@ class Surface:
         self.skeleton = Skeleton(mesh)
         volume = signed_measures(mesh.points, mesh.cells)
         share = np.broadcast_to((density * volume / (mesh.dim + 1))[:, None], mesh.cells.shape)
-        self.mass: Values = np.bincount(mesh.cells.ravel(), share.ravel(), minlength=len(mesh.points))
+        self.mass = sums(mesh.cells.ravel(), share.ravel(), len(mesh.points))
         self._names = PieceNames()
-        self._pattern = np.zeros(len(mesh.cells), np.uint8)
+        self._pattern: npt.NDArray[np.integer] = np.zeros(len(mesh.cells), np.uint8)
         self.builds = 0
         self._build(None)
 
@@ -79,8 +80,7 @@ class Surface:
     def replay(self, broken_at: Values, times: Iterable[float]) -> None:
         """Name the pieces as frames at earlier times did, from the times (E,) at which edges broke (restart)."""
         for t in times:
-            with np.errstate(invalid="ignore"):
-                count, piece = self.skeleton.pieces(broken_at <= t * (1 + 1e-12))
+            count, piece = self.skeleton.pieces(broken_at <= t * (1 + 1e-12))
             self._names.update(count, piece, self.mass)
 
     def _build(self, cut: Values | None) -> None:
@@ -98,15 +98,15 @@ class Surface:
     ) -> Frame:
         """The surface at time t (s) for nodal displacement u (N, d) in m and velocity v (N, d) in m/s.
 
-        Point velocity is the mean of the parents', without their turning. `fields` come along: nodal ones as the mean of
-        the parents, cell ones as they are in the cell behind the element. `broken_at`: (E,) s, for the age of the crack.
+        Point velocity is the mean of the parents', without their turning. `fields` come along: nodal ones as the mean
+        of the parents, cell ones as in the cell behind the element. `broken_at`: (E,) s, for the age of the crack.
         NotConverged, naming piece and cell, where a node has gone astray.
         """
         self._check(t, u, v)
         made, follow = self.split, self.split.follow
         moved = follow.displacement(u, self._rotations(u))
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
-        at_points = {"displacement": moved, "velocity": follow.mean(v), "piece": self._piece.astype(np.int32)}
+        at_points: Arrays = {"displacement": moved, "velocity": follow.mean(v), "piece": self._piece.astype(np.int32)}
         at_points |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
         triangles, segments, cell, at_elements = self._elements()
         at_elements["age"] = self._ages(t, broken_at)
@@ -115,7 +115,7 @@ class Surface:
         points, origins = made.points + moved, self.skeleton.origins
         return Frame(t, points, triangles, segments, at_points, at_elements, origins, figures)
 
-    def _elements(self) -> tuple[Ints, Ints, Ints, dict[str, npt.NDArray[np.generic]]]:
+    def _elements(self) -> tuple[Ints, Ints, Ints, Arrays]:
         """Triangles, segments, the cell of each, and the fields that do not move."""
         made, flat = self.split, self.skeleton.dim == 2
         triangles, segments = (made.fill, made.elements) if flat else (made.elements, made.elements[:0, :2])
@@ -141,6 +141,7 @@ class Surface:
                 cell = int(np.argmax(np.any(self.skeleton.cells == node, axis=1)))
                 piece = self.names[self.split.piece_of_node[node]]
                 raise NotConverged(
-                    f"the surface at t = {t:g} s was not written: node {node} of piece {piece} (cell {cell}) has {what} "
-                    f"{values[node]}, and {len(lost)} nodes in all are beyond {FARTHEST:.1e}; choose a smaller time.step"
+                    f"the surface at t = {t:g} s was not written: node {node} of piece {piece} (cell {cell}) has the "
+                    f"{what} {values[node]}; {len(lost)} nodes are not numbers below {FARTHEST:.0e}; "
+                    "choose a smaller time.step"
                 )

@@ -55,7 +55,7 @@ class EdgeRecord:
 def cut_by_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:
     """(edges,) cuts whose sections are in inverse proportion to the nodal forces (M22 section 4.1, fig. 12).
 
-    length_i / length_j = |f_j| / |f_i|, so the cut is at |f_j| / (|f_i| + |f_j|) from i; in the middle where both are 0.
+    length_i / length_j = |f_j| / |f_i|, so the cut is at |f_j| / (|f_i| + |f_j|) from i, the middle where both are 0.
     `force`: (nodes, d) N; `ends`: (edges, 2) from the lower input node. Held within 0.1 to 0.9: no needles.
     """
     size = np.linalg.norm(force, axis=1)[ends]

@@ -5,10 +5,10 @@ Every node owns a part of its cell. Between the parts of i and j stands one wall
     3D: the quad (m, G_ijk, T, G_ijl)        2D: the segment (m, T)
 
 with m the point of the edge, G of a facet, T of the cell. An open wall is there twice, once with the copies of i and
-once, turned round and cut along the same diagonal m-T, with those of j. (The other diagonal G-G would be an edge of four
-triangles where both facets stay whole.) A copy of m belongs to its end node; a copy of G or T belongs to a connected
-group of the nodes of the facet or cell, under the intact edges *of that facet or cell alone*. So a copy is known from its
-entity, neighbours agree on it without asking, and every group lies in one piece of the body.
+once, turned round and cut along the same diagonal m-T, with those of j. (The other diagonal G-G would be an edge of
+four triangles where both facets stay whole.) A copy of m belongs to its end node; a copy of G or T belongs to a
+connected group of the nodes of the facet or cell, under the intact edges *of that facet or cell alone*. So neighbours
+agree on a copy without asking, and every group lies in one piece of the body.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Copies(Rows):
-    """Copies of each pattern: kind (rows,), entity (rows,), lead: lowest local node of the group, group (rows, d + 1)."""
+    """Copies of each pattern: kind, entity, lead (lowest local node of the group): (rows,); group (rows, d + 1)."""
 
     kind: Ints
     entity: Ints
@@ -106,7 +106,8 @@ class _Cell:
 
     def __init__(self, dim: int, pattern: int) -> None:
         self.dim, self.pattern = dim, pattern
-        self.edge = {frozenset(pair): k for k, pair in enumerate(local_edges(dim).tolist())}
+        pairs: list[list[int]] = local_edges(dim).tolist()  # type: ignore[assignment]
+        self.edge = {frozenset(pair): k for k, pair in enumerate(pairs)}
         self.walls = [element for i, j, *rest in _turned(dim) for element in self._wall(i, j, rest)]
         used = {corner for corners, _ in self.walls for corner in corners if isinstance(corner, Copy)}
         self.copies = sorted(used)

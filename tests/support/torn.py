@@ -15,12 +15,12 @@ from mpi4py import MPI
 
 from fracsim.average import NonlocalAverage
 from fracsim.domain import Domain
-from fracsim.fracture import hashed
 from fracsim.graph import EdgeGraph
 from fracsim.parallel import total
 from fracsim.pieces import find_pieces
 from fracsim.scene import Scene
 from fracsim.state import State
+from fracsim.strength import hashed
 
 from .scenes import Values, each_step, make_scene
 

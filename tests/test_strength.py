@@ -1,0 +1,74 @@
+"""Scatter and direction of the strength against their distributions and a bar that is pulled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fracsim.strength import along_fibre, weibull
+from fracsim.study import Fibre, Heterogeneity
+from support.scenes import make_scene, march
+
+
+@pytest.mark.parametrize("modulus", (2.0, 8.0, 50.0))
+def test_scatter_is_weibull_with_mean_one(modulus: float) -> None:
+    """P(w < x) = 1 - exp(-(x/s)^m), s = 1 / Gamma(1 + 1/m): Kolmogorov-Smirnov, and the mean within 4 errors."""
+    points = np.random.default_rng(1).uniform(-1, 1, (20_000, 3))
+    sample = weibull(points, Heterogeneity(modulus=modulus, seed=3))
+    law = stats.weibull_min(modulus, scale=1 / stats.weibull_min(modulus).mean())
+    assert stats.kstest(sample, law.cdf).pvalue > 1e-3
+    assert abs(sample.mean() - 1) < 4 * law.std() / np.sqrt(len(sample))
+
+
+def test_the_seed_decides() -> None:
+    """The same seed gives the same numbers in any order of the places, another seed other and uncorrelated ones."""
+    points = np.random.default_rng(2).uniform(-1, 1, (5_000, 2))
+    order = np.random.default_rng(3).permutation(len(points))
+    first, again, other = (weibull(points, Heterogeneity(modulus=5.0, seed=seed)) for seed in (7, 7, 8))
+    assert np.array_equal(first, again)
+    assert np.array_equal(weibull(points[order], Heterogeneity(modulus=5.0, seed=7)), first[order])
+    assert abs(np.corrcoef(first, other)[0, 1]) < 4 / np.sqrt(len(points))
+
+
+def test_direction() -> None:
+    """ratio along the fibre, 1 across, in between by the square of the cosine, whatever the lengths."""
+    fibre = Fibre(direction=[3.0, 0.0, 4.0], ratio=2.5)
+    vectors = np.array([[6.0, 0.0, 8.0], [0.0, 5.0, 0.0], [-4.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
+    assert along_fibre(vectors, fibre) == pytest.approx([2.5, 1.0, 1.0, 1 + 1.5 * 0.36], rel=1e-14)
+
+
+def pulled(**fracture: Any) -> int:
+    """Steps until a unit square breaks that is strained by 0.1 % a step along x (E = 1, nu = 0: stress = strain)."""
+    scene, state = make_scene(
+        time={"scheme": "quasi-static", "step": 1.0, "end": 40.0},
+        boundary=[
+            {"on": "left", "fix": "xy"},
+            {"on": "right", "displacement": {"time": [0, 40], "value": [[0.0, 0.0], [0.04, 0.0]]}},
+        ],
+        fracture={"strength": 0.0095, **fracture},
+    )
+    for step in range(1, 41):
+        if march(scene, state, 1)[0].broken:
+            return step
+    return 0
+
+
+def test_a_fibre_along_the_load_strengthens() -> None:
+    """Strength 0.0095 breaks at 0.010, the tenth step; twice that along the load in the step that reaches 0.019."""
+    assert pulled() == 10
+    assert pulled(fibre={"direction": [1.0, 0.0], "ratio": 2.0}) in (19, 20)
+    assert pulled(fibre={"direction": [0.0, 1.0], "ratio": 2.0}) == 10
+
+
+def test_ratio_one_is_isotropic() -> None:
+    """A fibre of ratio 1 changes nothing."""
+    directions = np.random.default_rng(5).normal(size=(100, 3))
+    assert np.array_equal(along_fibre(directions, Fibre(direction=[1.0, 2.0, 3.0], ratio=1.0)), np.ones(100))
+
+
+def test_scatter_breaks_the_weakest_first() -> None:
+    """With a modulus of 3 some edge is far below the mean: the square breaks before the tenth step."""
+    assert 0 < pulled(heterogeneity={"modulus": 3.0, "seed": 1}) < 10
