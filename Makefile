@@ -20,14 +20,16 @@ test-all: readers
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:
-	@./env sh -c 'there=$${VIRTUAL_ENV%/*}/vtk-reader; test -e $$there/ready || { echo "fetching a VTK that reads XDMF (once)"; \
-	    pip install --quiet --no-deps --target $$there vtk==9.7.2 && touch $$there/ready; }'
+	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>vtk-reader.lock && flock 8 && test -e vtk-reader/ready || { \
+	    echo "fetching a VTK that reads XDMF (once)" && rm -rf vtk-reader && \
+	    pip install --quiet --no-deps --target vtk-reader vtk==9.7.2 && touch vtk-reader/ready; }'
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json
 
 # mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
 lint:
+	@./env sh -c 'command -v ruff >/dev/null || pip install --quiet --no-deps --requirement tools.txt'
 	./env ruff check $(sources)
 	./env ruff format --check $(sources)
 	@rm -rf build/types && mkdir -p build/types/fracsim

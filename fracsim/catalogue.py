@@ -16,6 +16,8 @@ ENERGIES = {
 SCHEMES = {
     "backward-euler": "first order, damps vibrations (default)",
     "newmark": "second order; the trapezoidal rule unless beta and gamma say otherwise",
+    "generalized-alpha": "second order; rho sets how much of the fastest modes is left after a step",
+    "explicit": "central differences, no system to solve; the step is cut to what the fastest cell allows",
     "quasi-static": "load stepping without inertia",
 }
 

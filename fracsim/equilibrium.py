@@ -90,7 +90,8 @@ class Equilibrium:
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
         at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
         self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
-        self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
+        if self.scheme.implicit:
+            self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
         self._dead = self._dead_loads(w, dx)
 
     def _stiffness_factor(self) -> Any:
@@ -124,8 +125,8 @@ class Equilibrium:
         return compile_form(sum(terms)) if terms else None
 
     def _make_vectors(self) -> None:
-        self.tangent = fem_petsc.create_matrix(self._tangent)
-        self.tangent.setOption(PETSc.Mat.Option.SPD, False)
+        if self.scheme.implicit:
+            self.tangent = fem_petsc.create_matrix(self._tangent)
         self.residual = fem_petsc.create_vector(self._residual)
         self._work = fem_petsc.create_vector(self._residual)
         self.external: Values = np.zeros(self._owned)
@@ -135,8 +136,8 @@ class Equilibrium:
 
     def _make_mass(self, study: Study, density: Any) -> Mass:
         if study.time.mass == "consistent":
-            return ConsistentMass(self.domain, density, self.tangent, self.bcs)
-        return LumpedMass(self.domain, density, self.tangent)
+            return ConsistentMass(self.domain, density, self.residual, self.bcs)
+        return LumpedMass(self.domain, density, self.residual)
 
     def _condition(self) -> fem.DirichletBC:
         # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
@@ -160,16 +161,19 @@ class Equilibrium:
     def begin(self, t: float, dt: float, start: Values, v: Values, a: Values) -> None:
         """Set the end time, the loads and the scheme's references; `start`, v, a are the owned state at t - dt."""
         self.c_a, self.c_v = self.scheme.rates(dt)
-        self._refer(t, start, *self.scheme.references(dt, start, v, a))
+        late = self.scheme.alpha_f
+        held = (1 - late) * self.motion.at(t) + late * self.motion.at(t - dt)
+        self._refer(t - late * dt, held, start, *self.scheme.references(dt, start, v, a))
 
-    def hold(self, t: float, u: Values, v: Values) -> None:
-        """Put the body at u with velocity v at time t, without acceleration: the state a run starts from."""
+    def hold(self, t: float, u: Values, v: Values, a: Values | None = None) -> None:
+        """Put the body at u with velocity v and acceleration a (none where not given) at time t."""
         self.displace(u)
-        self._refer(t, u, u, u - v / self.c_v)
+        u_a = u - a / self.c_a if a is not None and self.c_a else u
+        self._refer(t, self.motion.at(t), u, u_a, u - v / self.c_v)
 
-    def _refer(self, t: float, start: Values, u_a: Values, u_v: Values) -> None:
+    def _refer(self, t: float, held: Values, start: Values, u_a: Values, u_v: Values) -> None:
         self._references = u_a, u_v
-        self._prescribed.x.array[self.motion.dofs] = self.motion.at(t)
+        self._prescribed.x.array[self.motion.dofs] = held
         self.set_loads(t)
         if self.u_n is not None:
             self.u_n.x.array[: self._owned] = start
@@ -235,6 +239,13 @@ class Equilibrium:
             return 0.0
         gap = np.max(np.abs(u[self.held] - self._prescribed.x.array[self.held]), initial=0.0)
         return float(self.domain.comm.allreduce(gap, op=MPI.MAX)) / self.domain.mean_edge
+
+    def forces_in_balance(self) -> Values:
+        """(owned dofs,) f_int + f_visc - f_ext at the current u, kept as `unbalanced` (explicit steps)."""
+        self._assemble_into(self._work, self._residual)
+        self._add_inertia(self._work)
+        np.copyto(self.unbalanced, self._work.array_r)
+        return self.unbalanced
 
     def update_reactions(self) -> None:
         """Refresh `unbalanced` on prescribed dofs alone: a residual over the few cells that touch them."""

@@ -39,9 +39,9 @@ class Mass(Protocol):
 class LumpedMass:
     """M as a diagonal: int rho w at the vertices."""
 
-    def __init__(self, domain: Domain, density: Any, tangent: PETSc.Mat) -> None:
+    def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec) -> None:
         self.lumped = lumped_mass(domain, density)
-        self._diagonal = tangent.createVecLeft()
+        self._diagonal = vector.duplicate()
 
     def times(self, values: Values) -> Values:
         """M a."""
@@ -60,7 +60,7 @@ class LumpedMass:
 class ConsistentMass:
     """M = int rho u . w as a matrix."""
 
-    def __init__(self, domain: Domain, density: Any, tangent: PETSc.Mat, bcs: list[fem.DirichletBC]) -> None:
+    def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec, bcs: list[fem.DirichletBC]) -> None:
         self.lumped = lumped_mass(domain, density)
         u, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         form = compile_form(density * ufl.inner(u, w) * ufl.dx(domain=domain.mesh))
@@ -68,7 +68,7 @@ class ConsistentMass:
         self._whole.assemble()
         self._free = fem_petsc.assemble_matrix(form, bcs=bcs, diagonal=0.0)
         self._free.assemble()
-        self._x, self._y = tangent.createVecRight(), tangent.createVecLeft()
+        self._x, self._y = vector.duplicate(), vector.duplicate()
 
     def times(self, values: Values) -> Values:
         """M a."""

@@ -19,11 +19,13 @@ PerCell = npt.NDArray[np.float64] | float
 
 @dataclass(frozen=True)
 class MaterialFields:
-    """The energy with its coefficients, and density (kg/m^3), wave speed (m/s) per cell or as one number."""
+    """The energy with its coefficients, and density (kg/m^3) and moduli (Pa) per cell or as one number."""
 
     energy: Energy
     density: PerCell
     young: PerCell
+    mu: PerCell
+    lmbda: PerCell
 
 
 def material_fields(domain: Domain, material: Material) -> MaterialFields:
@@ -35,8 +37,8 @@ def material_fields(domain: Domain, material: Material) -> MaterialFields:
     if domain.dim == 2 and material.plane == "stress":
         lmbda = plane_stress_lambda(mu, lmbda)
         options = {"reduced": True}
-    kind = ENERGIES[material.energy]
-    return MaterialFields(kind(_coefficient(domain, mu), _coefficient(domain, lmbda), **options), density, young)
+    energy = ENERGIES[material.energy](_coefficient(domain, mu), _coefficient(domain, lmbda), **options)
+    return MaterialFields(energy, density, young, mu, lmbda)
 
 
 def check_regions(material: Material, known: list[str]) -> None:

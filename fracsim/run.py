@@ -186,7 +186,8 @@ def run_study(
     try:
         return Run(scene, folder, restart=restart, wall_limit=wall_limit, began=began)()
     finally:
-        scene.solver.forget_options()
+        if scene.solver is not None:
+            scene.solver.forget_options()
 
 
 def _draw(folder: Path) -> None:

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from .check import checked_mesh
 from .domain import Domain, distribute
 from .equilibrium import Equilibrium
-from .forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
+from .forms.schemes import BackwardEuler, CentralDifference, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
 from .history import Probes
 from .material import material_fields
 from .parallel import on_root
@@ -27,7 +27,7 @@ class Scene:
     study: Study
     domain: Domain
     equations: Equilibrium
-    solver: Solver
+    solver: Solver | None  # None: explicit
     stepper: Stepper
     fracture: Any  # FracturePass | None
     probes: Probes
@@ -45,8 +45,8 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
         from .fracture import FracturePass
 
         fracture = FracturePass(equations, study.fracture, study.material)
-    solver = Solver(equations, study.solver)
-    stepper = Stepper(equations, solver, study.time, fracture)
+    solver = Solver(equations, study.solver) if scheme.implicit else None
+    stepper = make_stepper(equations, solver, study.time, fracture)
     return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
 
 
@@ -54,4 +54,20 @@ def make_scheme(timing: Time) -> Scheme:
     """The time scheme of a study."""
     if timing.scheme == "newmark":
         return Newmark(timing.beta, timing.gamma)
-    return BackwardEuler() if timing.scheme == "backward-euler" else QuasiStatic()
+    if timing.scheme == "generalized-alpha":
+        return GeneralizedAlpha(timing.rho)
+    others: dict[str, type[Scheme]] = {
+        "backward-euler": BackwardEuler,
+        "explicit": CentralDifference,
+        "quasi-static": QuasiStatic,
+    }
+    return others[timing.scheme]()
+
+
+def make_stepper(equations: Equilibrium, solver: Solver | None, timing: Time, fracture: Any) -> Stepper:
+    """The stepper of an implicit or explicit scheme."""
+    if solver is not None:
+        return Stepper(equations, solver, timing, fracture)
+    from .explicit import ExplicitStepper
+
+    return ExplicitStepper(equations, None, timing, fracture)

@@ -37,7 +37,7 @@ class Report:
 class Stepper:
     """Moves a `State` forward by one step of the study's scheme, with the fracture pass at its end."""
 
-    def __init__(self, equations: Equilibrium, solver: Solver, timing: Time, fracture: Any = None) -> None:
+    def __init__(self, equations: Equilibrium, solver: Solver | None, timing: Time, fracture: Any = None) -> None:
         self.equations, self.solver, self.timing, self.fracture = equations, solver, timing, fracture
         self.smallest = timing.smallest or timing.step / 1024
         self.comm = equations.domain.comm
@@ -65,7 +65,7 @@ class Stepper:
             unbalanced = unbalanced + drag
         free = np.ones(len(unbalanced), bool)
         free[equations.held] = False
-        if equations.scheme.inertia and self.timing.scheme == "newmark":
+        if equations.scheme.inertia and self.timing.scheme != "backward-euler":
             state.a = equations.inertia.solve(-unbalanced, free)
         state.forces = equations.applied_force() + np.where(free, 0.0, unbalanced)
 
@@ -90,6 +90,7 @@ class Stepper:
         began = time.perf_counter()
         equations = self.equations
         equations.begin(state.t + dt, dt, state.u, state.v, state.a)
+        assert self.solver is not None
         outcome = self.solver.solve(self._guess(state, dt))
         self.phases["solve"] += time.perf_counter() - began
         return outcome
@@ -97,7 +98,7 @@ class Stepper:
     def _guess(self, state: State, dt: float) -> Values:
         """Where the body would go by itself; in a quasi-static study the last increment once more."""
         if self.equations.scheme.inertia:
-            return state.u + dt * state.v
+            return state.u + (1 - self.equations.scheme.alpha_f) * dt * state.v
         if self._before is None:
             return state.u
         return state.u + (state.u - self._before) * (dt / self._last_dt)
@@ -118,8 +119,7 @@ class Stepper:
     def _accept(self, state: State, dt: float, outcome: Outcome, began: float) -> Report:
         equations = self.equations
         old = state.u
-        state.u = equations.u.x.array[: len(old)].copy()
-        state.v, state.a = equations.rates()
+        state.u, state.v, state.a = self._arrive(state, dt)
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old)
@@ -134,6 +134,16 @@ class Stepper:
         state.dissipated += float(sums[1])
         self._grow(state)
         return Report(dt, outcome, broken, float(sums[2]), float(sums[3]), time.perf_counter() - began)
+
+    def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
+        """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
+        equations = self.equations
+        x = equations.u.x.array[: len(state.u)].copy()
+        u, v, a = equations.scheme.finish(dt, x, state.u, state.v, state.a)
+        if equations.scheme.alpha_f:
+            equations.hold(state.t + dt, u, v, a)
+            equations.update_reactions()
+        return u, v, a
 
     def _work(self, state: State, increment: Values) -> tuple[float, float]:
         """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in it."""
@@ -167,7 +177,8 @@ class Stepper:
         equations, held = self.equations, self.equations.held
         state.forces[held] -= equations.unbalanced[held]
         equations.update_reactions()
-        self.solver.damage_changed()
+        if self.solver is not None:
+            self.solver.damage_changed()
         state.forces[held] += equations.unbalanced[held]
 
     def _grow(self, state: State) -> None:

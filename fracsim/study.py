@@ -246,7 +246,7 @@ class Initial(Table):
 class Time(Table):
     """[time]: scheme and steps."""
 
-    scheme: Literal["backward-euler", "newmark", "quasi-static"] = "backward-euler"
+    scheme: Literal["backward-euler", "newmark", "generalized-alpha", "explicit", "quasi-static"] = "backward-euler"
     step: Positive  # s
     end: Positive  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
@@ -254,6 +254,7 @@ class Time(Table):
     mass: Literal["lumped", "consistent"] = "lumped"
     beta: Annotated[Finite, Field(gt=0, le=0.5)] = 0.25  # Newmark
     gamma: Annotated[Finite, Field(ge=0.5, le=1)] = 0.5  # Newmark
+    rho: Annotated[Finite, Field(ge=0, le=1)] = 0.8  # generalized-alpha: what is left of the fastest modes after a step
 
     @model_validator(mode="after")
     def _order(self) -> Time:
@@ -263,6 +264,8 @@ class Time(Table):
             raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.step:g} s")
         if self.scheme == "newmark" and 4 * self.beta < self.gamma + 0.5 - 1e-12:
             raise ValueError("newmark is stable for every step where beta >= (gamma + 1/2) / 4; raise beta")
+        if self.scheme == "explicit" and self.mass == "consistent":
+            raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.forms.schemes import BackwardEuler, Newmark, QuasiStatic, Scheme
+from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
 from support.oscillator import Values, exact, run, slopes
 
 EPS = np.finfo(float).eps
@@ -17,6 +17,8 @@ ORDERS: list[tuple[Scheme, int]] = [
     (Newmark(), 2),
     (Newmark(0.3025, 0.6), 1),
     (Newmark(1 / 6, 0.5), 2),
+    (GeneralizedAlpha(0.5), 2),
+    (GeneralizedAlpha(0.0), 2),
 ]
 
 
@@ -26,7 +28,9 @@ def energy(rows: Values) -> Values:
 
 
 @pytest.mark.parametrize(
-    ("scheme", "order"), ORDERS, ids=("euler", "trapezoidal", "dissipative", "linear-acceleration")
+    ("scheme", "order"),
+    ORDERS,
+    ids=("euler", "trapezoidal", "dissipative", "linear-acceleration", "alpha", "annihilating"),
 )
 @pytest.mark.parametrize("damping", (0.0, 0.4))
 def test_order_of_convergence(scheme: Scheme, order: int, damping: float) -> None:
@@ -112,3 +116,13 @@ def test_small_steps_keep_their_digits(scheme: Scheme) -> None:
     new = u + dt * v
     assert c_v * (new - u_v) == pytest.approx(v, abs=4 * EPS * c_v)
     assert c_a * (new - u_a) == pytest.approx(0.0, abs=4 * EPS * c_a)
+
+
+@pytest.mark.parametrize("rho", (0.2, 0.5, 0.8, 1.0))
+def test_generalized_alpha_leaves_rho_of_the_fastest_modes(rho: float) -> None:
+    """As w dt grows its amplification matrix gets the triple eigenvalue -rho: the state shrinks by rho a step."""
+    rows = run(GeneralizedAlpha(rho), W, 1e6 / W, 200, START)
+    size = np.linalg.norm(rows * [1, 1 / W / 1e6, 1 / (W * 1e6) ** 2], axis=1)
+    growth = (size[200] / size[100]) ** (1 / 100)
+    # a triple eigenvalue lets the state fall as n^2 rho^n only: by (200/100)^(2/100) = 1.014 above rho
+    assert rho * 0.99 <= growth <= rho * 1.016

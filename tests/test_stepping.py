@@ -20,7 +20,7 @@ MATERIAL = {"energy": "linear", "young": 2.0, "poisson": 0.3, "density": 3.0}
 MU, LAMBDA = 2.0 / 2.6, 2.0 * 0.3 / (1.3 * 0.4)
 MESH = {"builder": "box", "size": [1.0, 0.5], "h": 0.25}
 CLAMP = [{"on": "left", "fix": "xy"}]
-SCHEMES = {"backward-euler": 1, "newmark": 2}
+SCHEMES = {"backward-euler": 1, "newmark": 2, "generalized-alpha": 2}
 # Newton on a linear body leaves rounding errors only: 1e-13 of the forces a step
 SOLVED = 1e-10
 

@@ -28,6 +28,7 @@ class SurfaceOutput:
 
     Attributes:
         record: when and where edges broke; None where the study has no fracture.
+        made: the surface and its files on rank 0, None elsewhere.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class SurfaceOutput:
                 surface.replay(surface.skeleton.of_edges(broken[0], broken[1][:, 0]), files.times)
             return surface, files
 
-        self._made = on_root(domain.comm, begin)
+        self.made = on_root(domain.comm, begin)
 
     def note(self, t: float) -> None:
         """To be called after every step in which edges broke."""
@@ -69,8 +70,8 @@ class SurfaceOutput:
         broken = self.record.gathered() if self.record is not None else None
 
         def work() -> None:
-            assert self._made is not None
-            surface, files = self._made
+            assert self.made is not None
+            surface, files = self.made
             if state.t in files.times:
                 return
             at = cut = None

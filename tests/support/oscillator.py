@@ -21,8 +21,8 @@ def run(
     c_a, c_v = scheme.rates(dt)
     for _ in range(steps):
         u_a, u_v = scheme.references(dt, *rows[-1])
-        u = (c_a * u_a + drag * c_v * u_v) / (c_a + drag * c_v + w**2)
-        rows.append((u, c_v * (u - u_v), c_a * (u - u_a)))
+        x = (c_a * u_a + drag * c_v * u_v) / (c_a + drag * c_v + w**2)
+        rows.append(scheme.finish(dt, x, *rows[-1]))
     return np.array(rows)
 
 

@@ -1,0 +1,95 @@
+"""Explicit steps: no system, lumped mass, and a step that the body's fastest cell allows."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from .edge_stress import barycentric_gradients
+from .equilibrium import Equilibrium
+from .solve import Outcome
+from .state import State
+from .stepping import Stepper
+
+Values = npt.NDArray[np.float64]
+
+SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on the current shape
+REFRESH = 20  # steps between two looks at the shape of the cells
+
+
+class ExplicitStepper(Stepper):
+    """Central differences (forms.schemes.CentralDifference); the study's step is an upper bound."""
+
+    _frequencies: Values | None = None
+    _arrival: tuple[Values, Values, Values]
+
+    def _fit(self, state: State) -> float:
+        """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
+        if self._frequencies is None or state.step % REFRESH == 0:
+            self._frequencies = cell_frequencies(self.equations)
+        chi = self.equations.chi
+        squares = self._frequencies if chi is None else self._frequencies * chi.x.array[: len(self._frequencies)]
+        highest = float(np.sqrt(self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)))
+        stable = SAFETY * stable_step(highest, self.equations)
+        left = self.timing.end - state.t
+        # equal steps to the end rather than a sliver: rounding up never exceeds the bound
+        dt = min(state.dt, stable)
+        return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
+
+    def _attempt(self, state: State, dt: float) -> Outcome:
+        """u by v and a of the start, then a from the forces there."""
+        began = time.perf_counter()
+        equations, held = self.equations, self.equations.held
+        half = state.v + dt / 2 * state.a
+        u = state.u + dt * half
+        u[held] = equations.motion.at(state.t + dt)[: len(held)]
+        half[held] = (u[held] - state.u[held]) / dt
+        equations.c_a, equations.c_v = equations.scheme.rates(dt)
+        equations.hold(state.t + dt, u, half)
+        unbalanced = equations.forces_in_balance()
+        drag = equations.damping.mass if equations.damping is not None else 0.0
+        a = (
+            -unbalanced / equations.mass / (1 + drag * dt / 2)
+        )  # mass damping at the velocity of the end, not of half-way
+        a[held] = 0.0
+        self._arrival = u, half + dt / 2 * a, a
+        self.phases["solve"] += time.perf_counter() - began
+        finite = self.comm.allreduce(bool(np.isfinite(unbalanced).all()), op=MPI.LAND)
+        return Outcome(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
+
+    def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
+        return self._arrival
+
+
+def cell_frequencies(equations: Equilibrium) -> Values:
+    """(cells,) upper bounds of omega^2 of each cell on its own, 1/s^2, undamaged and in its current shape.
+
+    A P1 simplex has lumped mass rho V / (d + 1) a node and energy V (mu |sym H|^2 + lambda/2 (tr H)^2), H = grad u.
+    With L = sum_i g_i x g_i a nodal motion with gradient H has sum |u_i|^2 >= H : H L^-1 >= (tr H)^2 / tr L,
+    hence omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L). No assembled body is faster than its fastest cell
+    (Irons and Treharne 1971).
+    """
+    domain, d = equations.domain, equations.domain.dim
+    corners = domain.nodes[domain.cell_nodes]
+    if not equations.material.energy.linear:
+        corners = corners + equations.u.x.array.reshape(-1, d)[domain.cell_nodes]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gradients = barycentric_gradients(corners)
+        spread = np.einsum("nai,naj->nij", gradients, gradients)
+    flat = ~np.isfinite(spread).all(axis=(1, 2))
+    spread[flat] = 0.0  # a cell without volume has forces, but no bound; the others set the step
+    largest, trace = np.linalg.eigvalsh(spread)[:, -1], np.trace(spread, axis1=1, axis2=2)
+    material = equations.material
+    return np.asarray((d + 1) / material.density * (2 * material.mu * largest + material.lmbda * trace))
+
+
+def stable_step(highest: float, equations: Equilibrium) -> float:
+    """2/omega (sqrt(1 + xi^2) - xi) in s, xi = (a/omega + b omega)/2 of Rayleigh damping taken half a step late."""
+    if highest == 0:
+        return float("inf")
+    damping = equations.damping
+    xi = 0.0 if damping is None else (damping.mass / highest + damping.stiffness * highest) / 2
+    return float(2 / highest * (np.sqrt(1 + xi**2) - xi))
