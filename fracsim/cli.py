@@ -86,14 +86,19 @@ def mesh(
 @app.command()
 def render(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
-    png: Annotated[Path | None, typer.Option("-o", "--out", help="picture (default OUT/last.png)")] = None,
+    png: Annotated[Path | None, typer.Option("-o", "--out", help=".png, or .gif of all frames (OUT/last.png)")] = None,
+    colour: Annotated[str, typer.Option(help="crack, piece, age, von_mises, or another field of the run")] = "crack",
+    explode: Annotated[float, typer.Option(min=0, help="move pieces apart by this share of their distance")] = 0.0,
+    view: Annotated[str, typer.Option(help="iso, front, back, left, right, top, or x,y,z to look from")] = "iso",
+    zoom: Annotated[float, typer.Option(min=0.01, help="above 1 is nearer")] = 1.0,
+    frame: Annotated[int, typer.Option(help="which frame, from 0; -1 is the last")] = -1,
 ) -> None:
-    """Draw the last frame of a run, off-screen."""
+    """Draw the split surface of a run off-screen: a picture, or an animation where the name ends in .gif."""
     if not _is_root():
         return
-    from .picture import render_last
+    from .picture import Look, render
 
-    print(f"saved {render_last(out, png)}")
+    print(f"saved {render(out, png, Look(colour, explode, view, zoom), frame=frame)}")
 
 
 @app.command(name="list")

@@ -192,9 +192,9 @@ def run_study(
 
 def _draw(folder: Path) -> None:
     """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
-    from .picture import render_last
+    from .picture import render
 
     try:
-        render_last(folder)
+        render(folder)
     except (ImportError, OSError, RuntimeError) as error:
         print(f"fracsim: no picture drawn: {error}", file=sys.stderr)

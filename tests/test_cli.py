@@ -115,7 +115,10 @@ def test_render_needs_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert called(monkeypatch, "render", tmp_path) == Exit.BAD_INPUT
-    assert capsys.readouterr().err == f"fracsim: {tmp_path} has no fields.h5: it is not the output folder of a run\n"
+    assert (
+        capsys.readouterr().err
+        == f"fracsim: {tmp_path} has no surface.pvd and no fields.h5: it is not the output folder of a run\n"
+    )
 
 
 # --- usage ----------------------------------------------------------------------------------------------------------

@@ -228,9 +228,9 @@ def test_a_killed_run_leaves_whole_files(tmp_path: Path) -> None:
 def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    from fracsim.picture import render_last
+    from fracsim.picture import render
 
-    pixels = imread(render_last(output.folder, tmp_path / "shot.png"))[..., :3]
+    pixels = imread(render(output.folder, tmp_path / "shot.png"))[..., :3]
     assert pixels.shape == (900, 1400, 3)
     body = np.abs(pixels - pixels[0, 0]).max(axis=2) > 0.05
     assert 0.03 < body.mean() < 0.9
