@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -22,6 +22,9 @@ from .meshes.data import MeshData
 from .parallel import Gather, on_root
 from .state import State
 
+if TYPE_CHECKING:
+    from .surface.record import EdgeRecord
+
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
 
@@ -30,15 +33,20 @@ def checkpoint_path(folder: Path) -> Path:
     return folder / "checkpoint" / "state.h5"
 
 
-def write_checkpoint(folder: Path, domain: Domain, state: State, equations: Equilibrium, graph: Any = None) -> Path:
-    """Write folder/checkpoint/state.h5, the old one in place until the new one is whole (collective)."""
+def write_checkpoint(
+    folder: Path, domain: Domain, state: State, equations: Equilibrium, record: EdgeRecord | None = None
+) -> Path:
+    """Write folder/checkpoint/state.h5, the old one in place until the new one is whole (collective).
+
+    `record`: what is remembered of broken edges, in a study with fracture.
+    """
     d = domain.dim
     arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
     if state.drag is not None:
         arrays["drag"] = domain.gather_nodes(state.drag.reshape(-1, d))
-    if equations.chi is not None:
+    if equations.chi is not None and record is not None:
         arrays["chi"] = domain.gather_cells(equations.chi.x.array[: domain.cell_count])
-        arrays["broken"] = graph.broken_keys()
+        arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
     path = checkpoint_path(folder)
     on_root(domain.comm, lambda: _write(path, arrays, state, domain))
     return path
@@ -56,12 +64,19 @@ def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain) -> 
     os.replace(new, path)
 
 
-def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equilibrium, graph: Any = None) -> None:
-    """Bring a checkpoint into the state, chi and the graph (collective). InputError where there is none that fits."""
+def read_checkpoint(
+    folder: Path, domain: Domain, state: State, equations: Equilibrium, record: EdgeRecord | None = None
+) -> None:
+    """Bring a checkpoint into the state, chi and the record with its graph (collective).
+
+    InputError where there is no checkpoint that fits.
+    """
     path, comm = checkpoint_path(folder), domain.comm
     arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=equations.chi is not None))
-    head = (arrays.pop("clock"), list(arrays), arrays.get("broken")) if arrays is not None else None
-    clock, names, broken = comm.bcast(head)
+    head = None
+    if arrays is not None:
+        head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks")
+    clock, names, broken, breaks = comm.bcast(head)
     for name in _CLOCK:
         setattr(state, name, clock[name])
 
@@ -71,8 +86,9 @@ def read_checkpoint(folder: Path, domain: Domain, state: State, equations: Equil
     for name in (*_NODAL, "drag"):
         if name in names:
             setattr(state, name, scattered(domain.gather_nodes, name).reshape(-1))
-    if equations.chi is not None and broken is not None:
-        graph.break_edges(graph.flags_of_keys(broken))
+    if equations.chi is not None and record is not None and broken is not None:
+        record.graph.break_edges(record.graph.flags_of_keys(broken))
+        record.restore(broken, breaks)
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
     state.elastic = equations.elastic_energy()

@@ -304,6 +304,13 @@ class Equilibrium:
         """(owned dofs,) forces of the stress at the current u, without damping or pressure, N."""
         return self._assembled(self._internal_form)
 
+    def nodal_forces(self) -> Values:
+        """(owned and ghost dofs,) forces of the stress at the current u, N."""
+        result = fem.Function(self.domain.space)
+        result.x.array[: self._owned] = self.internal_force()
+        result.x.scatter_forward()
+        return np.asarray(result.x.array)
+
     def applied_force(self) -> Values:
         """(owned dofs,) dead loads and pressures on the current shape, N."""
         if self._pressure_form is None:

@@ -65,6 +65,8 @@ class FracturePass:
         flags = np.zeros(len(self.graph.broken), bool)
         flags[self._overloaded(averaged)] = True
         broken = self.graph.break_edges(flags)
+        if broken:
+            broken += self.graph.break_idle()
         released = self._degrade(stress, psi)
         chi = self._chi[: self.domain.cell_count]
         return PassResult(broken, released, float(np.sum(self.domain.volumes * chi * psi)))

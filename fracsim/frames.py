@@ -13,7 +13,7 @@ from ufl.core.expr import Expr
 from .equilibrium import Equilibrium
 from .fields_file import Field
 from .forms.energies import full_cauchy_stress, von_mises
-from .forms.kinematics import deformation_gradient
+from .forms.kinematics import deformation_gradient, embed, green_strain
 from .kernels import CellExpression
 from .state import State
 
@@ -67,14 +67,14 @@ class Frames:
         return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
 
     def _carried(self, name: str) -> Values:
-        """An expression of the deformation, times chi: what the damaged body really carries."""
+        """An expression of the deformation; stress and energy times chi: what the damaged body really carries."""
         if name not in self._compiled:
             expression = _EXPRESSIONS[name](self._equations)
             self._compiled[name] = CellExpression(
                 self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
             )
         values = self._compiled[name]()
-        if self._equations.chi is not None:
+        if self._equations.chi is not None and name != "strain":
             values *= self._equations.chi.x.array[: self._domain.cell_count, None]
         return np.nan_to_num(values)
 
@@ -98,8 +98,15 @@ def _energy_density(equations: Equilibrium) -> Expr:
     return energy.psi(F, rotation)
 
 
+def _strain(equations: Equilibrium) -> Expr:
+    """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (the strain profile of M22 fig. 2)."""
+    E = green_strain(embed(deformation_gradient(equations.u), 1.0))
+    return ufl.sqrt(2 / 3 * ufl.inner(ufl.dev(E), ufl.dev(E)))
+
+
 _EXPRESSIONS: dict[str, Callable[[Equilibrium], Expr]] = {
     "stress": _stress,
     "von_mises": _von_mises,
     "energy_density": _energy_density,
+    "strain": _strain,
 }

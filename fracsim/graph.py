@@ -99,6 +99,16 @@ class EdgeGraph:
             self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
         return count
 
+    def break_idle(self) -> int:
+        """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
+
+        Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
+        apart. Mechanics do not change: chi of its cells is 0 and they enter no average.
+        """
+        carried = np.zeros(len(self.broken), bool)
+        carried[self.cell_edges[~self.split]] = True
+        return self.break_edges(~self.on_any_rank(carried))
+
     @property
     def broken_count(self) -> int:
         """Broken edges that this rank owns."""

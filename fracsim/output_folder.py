@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
+import shutil
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from .errors import InputError
 from .state import State
 from .study import Output, Time
 
-OWN_FILES = ("study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json", "last.png")
+OWN_FILES = (
+    "study.toml", "history.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json", "last.png",
+)  # fmt: skip
 
 
 def make_folder(folder: Path, study: str, restart: bool) -> None:
@@ -26,6 +29,7 @@ def make_folder(folder: Path, study: str, restart: bool) -> None:
         if not restart:
             for path in (*(folder / name for name in OWN_FILES), checkpoint_path(folder)):
                 path.unlink(missing_ok=True)
+            shutil.rmtree(folder / "surface", ignore_errors=True)
         (folder / "study.toml").write_text(study)
     except OSError as error:
         raise InputError(f"--out {folder}: cannot write there: {error.strerror}") from None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 from mpi4py import MPI
 
 from .bodies import bodies_of
@@ -28,6 +29,8 @@ from .study_file import study_text
 
 if TYPE_CHECKING:
     from .pieces import Pieces
+    from .surface.output import SurfaceOutput
+    from .surface.record import EdgeRecord
 
 
 class Run:
@@ -46,8 +49,9 @@ class Run:
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
         self._interrupt = Interrupt(self.comm, wall_limit)
         self.state = scene.stepper.start(scene.study.initial)
+        self.record = self._make_record()
         if restart:
-            read_checkpoint(folder, scene.domain, self.state, scene.equations, self._graph)
+            read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record)
         self._prepare(restart)
         self._damage = self._count_damage()
         self.output_seconds = 0.0
@@ -68,9 +72,48 @@ class Run:
         self.frames = Frames(self.scene.equations, names, self.scene.fracture)
         source = self.scene.domain.source
         self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
+        self._open_surface(restart)
         self._clock = OutputClock(study.output, study.time)
         self._clock.wrote(self.state)
         self._bodies = int(self.comm.bcast(bodies_of(source)[0] if source is not None else None))
+
+    def _open_surface(self, restart: bool) -> None:
+        """The split surface, where the study wants it: imported, built and kept only then."""
+        self.surface: SurfaceOutput | None = None
+        study, scene = self.scene.study, self.scene
+        if study.output.surface is False or (study.output.surface is None and study.fracture is None):
+            return
+        from .surface.output import SurfaceOutput
+
+        density = scene.equations.material.density
+        resume_at = self.state.t if restart else None
+        self.surface = SurfaceOutput(
+            self.folder, scene.domain, density, self._graph, record=self.record, resume_at=resume_at
+        )
+
+    def _make_record(self) -> EdgeRecord | None:
+        if self._graph is None:
+            return None
+        from .surface.record import EdgeRecord
+
+        return EdgeRecord(self._graph)
+
+    def _note_breaks(self) -> None:
+        """Remember when and where the edges of this step broke."""
+        if self.record is None:
+            return
+        by_forces = self.scene.study.output.cut == "forces"
+        self.record.note(self.state.t, self._cuts() if by_forces else None)
+
+    def _cuts(self) -> npt.NDArray[np.float64]:
+        """(edges,) cuts in inverse proportion to the nodal forces at the step's end (M22 fig. 12)."""
+        from .surface.record import cut_by_forces
+
+        equations, domain, graph = self.scene.equations, self.scene.domain, self._graph
+        force = equations.nodal_forces().reshape(-1, domain.dim)
+        ends = graph.edge_nodes
+        swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
+        return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 
     def _resolved(self) -> str:
         return study_text(self.scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
@@ -110,6 +153,7 @@ class Run:
             report = self.scene.stepper.advance(state)
             if report.broken:
                 self._damage = self._count_damage()
+                self._note_breaks()
             self.history.append(state, report, self._figures(), self.scene.probes())
             done = state.t >= end * (1 - 1e-12)
             if done or self._clock.due(state):
@@ -127,12 +171,14 @@ class Run:
         fields = self.frames(self.state, self._damage[2])
         if self.fields is not None and self.state.t not in self.fields.times:
             self.fields.write(self.state.t, fields)
+        if self.surface is not None:
+            self.surface.write(self.state, fields)
         self._clock.wrote(self.state)
         self.output_seconds += time.perf_counter() - began
 
     def _checkpoint(self) -> Path:
         began = time.perf_counter()
-        path = write_checkpoint(self.folder, self.scene.domain, self.state, self.scene.equations, self._graph)
+        path = write_checkpoint(self.folder, self.scene.domain, self.state, self.scene.equations, self.record)
         self.output_seconds += time.perf_counter() - began
         return path
 

@@ -95,6 +95,21 @@ def test_damage_only_grows(graph: EdgeGraph) -> None:
     assert graph.break_edges(np.zeros(len(graph.broken), bool)) == 0
 
 
+def test_idle_edges_break_and_part_the_graph() -> None:
+    """Two triangles on either side of a shared edge: with all other edges broken both cells have come apart,
+    and what is left between the shared nodes carries nothing. Edges of a cell that holds together stay."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 1.0}, fracture={"strength": 1.0})
+    graph = scene.fracture.graph
+    cells = np.bincount(graph.cell_edges.ravel())
+    shared = np.flatnonzero(cells == 2)
+    assert graph.break_idle() == 0
+    graph.break_edges(cells == 1)
+    assert graph.broken[shared].sum() == 0
+    assert graph.break_idle() == 1
+    assert graph.broken.all()
+    assert graph.break_idle() == 0
+
+
 def test_keys_name_edges(graph: EdgeGraph) -> None:
     """Edges found again from their pairs of input nodes."""
     keys = graph.broken_keys()

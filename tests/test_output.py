@@ -63,7 +63,8 @@ def history(folder: Path) -> dict[str, Values]:
 
 def test_the_files_are_there_and_no_others(output: Output) -> None:
     names = {path.name for path in output.folder.iterdir()}
-    assert names == {"study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json"}
+    surface = {"surface.pvd", "surface", "pieces.csv"} if output.study.fracture is not None else set()
+    assert names == {"study.toml", "history.csv", "fields.xdmf", "fields.h5", "summary.json"} | surface
 
 
 def test_the_study_as_run(output: Output) -> None:

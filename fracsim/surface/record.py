@@ -15,25 +15,26 @@ class EdgeRecord:
     """Time and place of the breaks of the edges that a rank has, owned and ghost.
 
     Attributes:
+        graph: the edges and their damage.
         at: (edges,) s at which each broke, NaN while it is whole.
         cut: (edges,) where, from the end that comes first in the input mesh (0) to the other (1); NaN: in the middle.
     """
 
     def __init__(self, graph: EdgeGraph) -> None:
-        self._graph = graph
+        self.graph = graph
         self.at = np.full(len(graph.broken), np.nan)
         self.cut = np.full(len(graph.broken), np.nan)
 
     def note(self, t: float, cut: Values | None = None) -> None:
         """Edges that broke since the last call did so at t (s), at `cut` (edges,) where it is given."""
-        new = self._graph.broken & np.isnan(self.at)
+        new = self.graph.broken & np.isnan(self.at)
         self.at[new] = t
         if cut is not None:
             self.cut[new] = cut[new]
 
     def gathered(self) -> tuple[Ints, Values] | None:
         """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
-        graph = self._graph
+        graph = self.graph
         own = np.flatnonzero(graph.broken[: graph.edge_count])
         parts = graph.domain.comm.gather((graph.edge_keys(own), np.column_stack([self.at[own], self.cut[own]])))
         if parts is None:
@@ -44,7 +45,7 @@ class EdgeRecord:
 
     def restore(self, keys: Ints, values: Values) -> None:
         """Take up what `gathered` gave, on every rank."""
-        own = self._graph.edge_keys(np.arange(len(self.at)))
+        own = self.graph.edge_keys(np.arange(len(self.at)))
         factor = np.array([int(max(keys.max(initial=0), own.max(initial=0))) + 1, 1])
         known, wanted = keys @ factor, own @ factor
         place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
