@@ -51,9 +51,8 @@ class ExplicitStepper(Stepper):
         equations.hold(state.t + dt, u, half)
         unbalanced = equations.forces_in_balance()
         drag = equations.damping.mass if equations.damping is not None else 0.0
-        a = (
-            -unbalanced / equations.mass / (1 + drag * dt / 2)
-        )  # mass damping at the velocity of the end, not of half-way
+        # mass damping at the velocity of the end, not of half-way: second order
+        a: Values = np.asarray(-unbalanced / (equations.mass * (1 + drag * dt / 2)), np.float64)
         a[held] = 0.0
         self._arrival = u, half + dt / 2 * a, a
         self.phases["solve"] += time.perf_counter() - began

@@ -25,7 +25,8 @@ VIEWS = {
     "right": (1.0, 0.0, 0.0),
     "top": (0.0, -0.001, 1.0),
 }
-CRUST, CRUMB = "#b5652a", "#f3e3bd"  # the old boundary and the crack, where no field colours them
+OLD, CRACK = "#b4bac4", "#e0762b"  # the old boundary and the crack, where no field colours them
+LINE = 3  # VTK's number of a segment
 AMBIENT = 0.25  # light in the shade, so that the side away from the lamp shows its crack too
 
 
@@ -146,25 +147,41 @@ def _draw(plotter: Any, shot: Shot, look: Look) -> Values:
 
 
 def _add(plotter: Any, grid: Any, look: Look, *, lighting: bool) -> None:
-    lines = grid.n_cells and "origin" in grid.cell_data and grid.celltypes.min() == 3
-    if lines:
-        outline = grid.extract_cells(np.flatnonzero(grid.celltypes == 3))
-        plotter.add_mesh(outline, color="black", line_width=1.5)
-        grid = grid.extract_cells(np.flatnonzero(grid.celltypes != 3))
+    outline, grid = _parted(grid)
     body = _whole(grid)
-    if look.colour == "crack":
-        _add_two_tone(plotter, body, lighting)
-        return
-    if look.colour not in {*body.cell_data, *body.point_data}:
+    if look.colour != "crack" and look.colour not in {*body.cell_data, *body.point_data}:
         known = ", ".join(sorted({"crack", *body.cell_data, *body.point_data} - {"origin", "cell"}))
         raise InputError(f"--colour {look.colour}: this run has: {known}")
+    if look.colour == "crack":
+        _add_two_tone(plotter, body, lighting)
+    elif np.isfinite(np.asarray(body[look.colour], float)).any():
+        _add_coloured(plotter, body, look.colour, lighting=lighting)
+    else:  # what only the crack has, in a body without crack or on the lines of a 2D one
+        plotter.add_mesh(body, color=OLD, lighting=lighting, ambient=AMBIENT)
+    if outline is None:
+        return
+    if look.colour in outline.cell_data and look.colour == "age" and np.isfinite(outline.cell_data["age"]).any():
+        _add_coloured(plotter, outline, "age", lighting=False)
+    else:
+        plotter.add_mesh(outline, color="black", line_width=1.5)
+
+
+def _parted(grid: Any) -> tuple[Any, Any]:
+    """(lines or None, the rest) of the surface of a 2D body."""
+    if "origin" not in grid.cell_data or not np.any(grid.celltypes == LINE):
+        return None, grid
+    lines, rest = (grid.extract_cells(np.flatnonzero(grid.celltypes == LINE)), grid.celltypes != LINE)
+    return lines, grid.extract_cells(np.flatnonzero(rest))
+
+
+def _add_coloured(plotter: Any, mesh: Any, field: str, *, lighting: bool) -> None:
     bar = {
-        "title": look.colour.replace("_", " ") + "\n", "color": "black", "vertical": False, "height": 0.08,
+        "title": field.replace("_", " ") + "\n", "color": "black", "vertical": False, "height": 0.08,
         "position_y": 0.02, "n_labels": 3, "label_font_size": 16, "title_font_size": 18,
     }  # fmt: skip
-    many = look.colour == "piece"
+    many = field == "piece"
     plotter.add_mesh(
-        body, scalars=look.colour, cmap="tab20" if many else "viridis", nan_color=CRUMB, lighting=lighting,
+        mesh, scalars=field, cmap="tab20" if many else "viridis", nan_color=OLD, lighting=lighting, line_width=3,
         ambient=AMBIENT, scalar_bar_args=bar, show_scalar_bar=not many,
     )  # fmt: skip
 
@@ -182,20 +199,20 @@ def _whole(grid: Any) -> Any:
 def _add_two_tone(plotter: Any, body: Any, lighting: bool) -> None:
     names = list(body.field_data["origins"]) if "origins" in body.field_data else []
     if "crack" not in names:
-        plotter.add_mesh(body, color=CRUST, lighting=lighting, ambient=AMBIENT)
+        plotter.add_mesh(body, color=OLD, lighting=lighting, ambient=AMBIENT)
         return
     crack = np.asarray(body.cell_data["origin"]) == names.index("crack")
-    for part, colour in ((~crack, CRUST), (crack, CRUMB)):
+    for part, colour in ((~crack, OLD), (crack, CRACK)):
         if part.any():
             plotter.add_mesh(body.extract_cells(np.flatnonzero(part)), color=colour, lighting=lighting, ambient=AMBIENT)
 
 
 def _worth_seeing(grid: Any) -> Values:
-    """(6,) bounds of the large pieces: those with a hundredth or more of the points."""
+    """(6,) bounds of the large pieces: those with a five-hundredth or more of the points."""
     points = np.asarray(grid.points, float)
     if "piece" in grid.point_data:
         _, of_point, count = np.unique(grid.point_data["piece"], return_inverse=True, return_counts=True)
-        points = points[count[of_point] >= min(0.01 * len(points), count.max())]
+        points = points[count[of_point] >= min(0.002 * len(points), count.max())]
     return np.stack([points.min(axis=0), points.max(axis=0)], axis=1).reshape(-1)
 
 
@@ -206,7 +223,7 @@ def _aim(plotter: Any, bounds: Values, look: Look) -> None:
     else:
         plotter.camera_position = [look.direction(), (0, 0, 0), (0, 0, 1)]
     plotter.reset_camera(bounds=bounds)
-    plotter.camera.zoom(1.3 * look.zoom)
+    plotter.camera.zoom((1.3 if flat else 1.1) * look.zoom)
 
 
 def _animate(plotter: Any, frames: list[Shot], look: Look, target: Path) -> None:

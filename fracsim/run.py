@@ -128,10 +128,18 @@ class Run:
             with self._interrupt, progress:
                 self._loop(progress)
         except (NotConverged, Stopped) as error:
-            checkpoint = self._checkpoint()
+            saved = self._saved()
             self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
-            raise type(error)(f"{error}. Checkpoint: {checkpoint}; go on with --restart") from None
+            raise type(error)(f"{error}. {saved}") from None
         return self._finish("done")
+
+    def _saved(self) -> str:
+        """Write a checkpoint on the way out and say where; one of a body that went astray would spoil the last good."""
+        state = self.state
+        finite = bool(np.isfinite(state.u).all() and np.isfinite(state.v).all())
+        if not self.comm.allreduce(finite, op=MPI.LAND):
+            return "No checkpoint was written: the state is not finite"
+        return f"Checkpoint: {self._checkpoint()}; go on with --restart"
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         """summary.json; only on ways out that all ranks take, since it sums over them."""

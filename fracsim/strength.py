@@ -70,7 +70,7 @@ def weibull(points: Values, heterogeneity: Heterogeneity) -> Values:
     """Weibull numbers of mean 1 and the given modulus, one a place."""
     m = heterogeneity.modulus
     survival = (1 - hashed(points, heterogeneity.seed)) / 2  # 1 - U, in (0, 1]
-    return (-np.log(survival)) ** (1 / m) / math.gamma(1 + 1 / m)
+    return np.asarray((-np.log(survival)) ** (1 / m) / math.gamma(1 + 1 / m), np.float64)
 
 
 def along_fibre(vectors: Values, fibre: Fibre) -> Values:
