@@ -208,11 +208,11 @@ def _add_two_tone(plotter: Any, body: Any, lighting: bool) -> None:
 
 
 def _worth_seeing(grid: Any) -> Values:
-    """(6,) bounds of the large pieces: those with a five-hundredth or more of the points."""
+    """(6,) bounds of the large pieces: those with half a hundredth or more of the points."""
     points = np.asarray(grid.points, float)
     if "piece" in grid.point_data:
         _, of_point, count = np.unique(grid.point_data["piece"], return_inverse=True, return_counts=True)
-        points = points[count[of_point] >= min(0.002 * len(points), count.max())]
+        points = points[count[of_point] >= min(0.005 * len(points), count.max())]
     return np.stack([points.min(axis=0), points.max(axis=0)], axis=1).reshape(-1)
 
 
