@@ -29,6 +29,11 @@ def plane_stress_lambda(mu: float, lmbda: float) -> float:
     return 2 * lmbda * mu / (lmbda + 2 * mu)
 
 
+def hooke(moduli: Any, strain: Expr) -> Expr:
+    """mu strain:strain + lambda/2 tr(strain)^2 in J/m^3, whichever measure of strain it is given."""
+    return moduli.mu * ufl.inner(strain, strain) + moduli.lmbda / 2 * ufl.tr(strain) ** 2
+
+
 class Energy(Protocol):
     """What the solver needs of an energy."""
 
@@ -42,9 +47,13 @@ class Energy(Protocol):
     def reduced(self) -> bool:
         """Whether lmbda is lambda* of plane stress."""
 
-    needs_rotation: ClassVar[bool]  # psi takes the polar rotation of F, lagged per iterate
-    linear: ClassVar[bool]  # the stress is linear in u: reference and current configuration are not told apart
-    plane_stress: ClassVar[bool]  # has the reduced 2D form
+    @property
+    def needs_rotation(self) -> bool:
+        """Whether psi takes the polar rotation of F, lagged per iterate."""
+
+    @property
+    def linear(self) -> bool:
+        """Whether the stress is linear in u: reference and current configuration are not told apart."""
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
 
@@ -60,7 +69,6 @@ class _PlaneStrain:
     reduced: bool = False
     needs_rotation: ClassVar[bool] = False
     linear: ClassVar[bool] = False
-    plane_stress: ClassVar[bool] = False
 
     def thickness_stretch(self, F: Expr) -> Expr | float:
         """F33, dimensionless."""
@@ -72,12 +80,14 @@ class Linear(_PlaneStrain):
     """Hooke's law: psi = mu eps:eps + lambda/2 tr(eps)^2. Small strains and rotations only."""
 
     linear: ClassVar[bool] = True
-    plane_stress: ClassVar[bool] = True
+
+    def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
+        """eps = sym(F) - I."""
+        return small_strain(F)
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
-        strain = small_strain(F)
-        return self.mu * ufl.inner(strain, strain) + self.lmbda / 2 * ufl.tr(strain) ** 2
+        return hooke(self, self.strain(F))
 
 
 @dataclass(frozen=True)
@@ -93,9 +103,13 @@ class Corotated(_PlaneStrain):
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3; `rotation` is R (d x d)."""
+        return hooke(self, self.strain(F, rotation))
+
+    def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
+        """eps = sym(R^T F) - I."""
         if rotation is None:
             raise ValueError("the corotated energy needs the polar rotation of F")
-        return Linear(self.mu, self.lmbda).psi(rotation.T * F)
+        return small_strain(rotation.T * F)
 
 
 @dataclass(frozen=True)
@@ -106,12 +120,9 @@ class StVK(_PlaneStrain):
     Source: M22 eq. 26; M22s eq. 29 prints P without the leading F.
     """
 
-    plane_stress: ClassVar[bool] = True
-
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
-        strain = green_strain(F)
-        return self.mu * ufl.inner(strain, strain) + self.lmbda / 2 * ufl.tr(strain) ** 2
+        return hooke(self, green_strain(F))
 
     def thickness_stretch(self, F: Expr) -> Expr | float:
         """F33 = sqrt(1 + 2 E33), E33 = -lambda*/(2 mu) tr(E) in plane stress; 1 in plane strain."""

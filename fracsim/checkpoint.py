@@ -44,8 +44,9 @@ def write_checkpoint(
     arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
     if state.drag is not None:
         arrays["drag"] = domain.gather_nodes(state.drag.reshape(-1, d))
-    if equations.chi is not None and record is not None:
+    if equations.chi is not None:
         arrays["chi"] = domain.gather_cells(equations.chi.x.array[: domain.cell_count])
+    if record is not None:
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
     path = checkpoint_path(folder)
     on_root(domain.comm, lambda: _write(path, arrays, state, domain))
@@ -72,7 +73,7 @@ def read_checkpoint(
     InputError where there is no checkpoint that fits.
     """
     path, comm = checkpoint_path(folder), domain.comm
-    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=equations.chi is not None))
+    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=record is not None))
     head = None
     if arrays is not None:
         head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks")
@@ -86,9 +87,10 @@ def read_checkpoint(
     for name in (*_NODAL, "drag"):
         if name in names:
             setattr(state, name, scattered(domain.gather_nodes, name).reshape(-1))
-    if equations.chi is not None and record is not None and broken is not None:
+    if record is not None and broken is not None:
         record.graph.break_edges(record.graph.flags_of_keys(broken))
         record.restore(broken, breaks)
+    if equations.chi is not None and "chi" in names:
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
     state.elastic = equations.elastic_energy()

@@ -71,6 +71,10 @@ class Domain:
         """DG0 scalar; its dof i is cell i."""
         return fem.functionspace(self.mesh, ("DG", 0))
 
+    def cell_vector(self, components: int) -> fem.FunctionSpace:
+        """DG0 vectors; dofs i * components + k are those of cell i."""
+        return fem.functionspace(self.mesh, ("DG", 0, (components,)))
+
     @property
     def cell_nodes(self) -> Ints:
         """(cells, d + 1) node (blocked dof) indices of the owned cells."""

@@ -21,6 +21,7 @@ from petsc4py import PETSc
 
 from .domain import Domain
 from .forms.balance import elastic_energy, internal_work, pressure_work, traction_work, viscous_work
+from .forms.energies import Energy
 from .forms.schemes import Scheme
 from .kernels import compile_form
 from .loads import Forces, Motion
@@ -38,7 +39,9 @@ class Equilibrium:
 
     Attributes:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
-        chi: degradation field, or None where the scene has no fracture.
+        chi: degradation field of the approach "chi", None otherwise.
+        integrity: 1 or 0 for each edge of each cell in the approach "edge", None otherwise.
+        energy: the energy that is assembled; material.energy is that of the undamaged body.
         inertia: the mass matrix.    mass: (owned dofs,) lumped mass of each dof, kg.
         held: owned dofs whose motion is prescribed.
         unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
@@ -49,7 +52,10 @@ class Equilibrium:
         self.domain, self.material, self.scheme = domain, material, scheme
         self.u = fem.Function(domain.space, name="displacement")
         self.c_a, self.c_v = scheme.rates(study.time.step)
-        self.chi = self._degradation(study)
+        approach = study.fracture.approach if study.fracture is not None else ""
+        self.chi = self._whole_cells("chi", 1) if approach == "chi" else None
+        self.integrity: fem.Function | None = None
+        self.energy: Energy = self._projected() if approach == "edge" else material.energy
         self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
         self.damping = study.damping
         self.u_n: Any = None
@@ -67,15 +73,25 @@ class Equilibrium:
 
     # --- set-up ---
 
-    def _degradation(self, study: Study) -> fem.Function | None:
-        if study.fracture is None:
-            return None
-        chi = fem.Function(self.domain.cell_scalar, name="chi")
-        chi.x.array[:] = 1.0
-        return chi
+    def _whole_cells(self, name: str, components: int) -> fem.Function:
+        """A DG0 field of ones: nothing is broken yet."""
+        space = self.domain.cell_scalar if components == 1 else self.domain.cell_vector(components)
+        field = fem.Function(space, name=name)
+        field.x.array[:] = 1.0
+        return field
+
+    def _projected(self) -> Energy:
+        from .forms.damage import EdgeProjected
+        from .graph import local_edges
+
+        residual = 0.0 if self.scheme.inertia else RESIDUAL_STIFFNESS
+        edges: list[Any] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
+        self.integrity = self._whole_cells("integrity", len(edges))
+        whole: Any = self.material.energy
+        return EdgeProjected(whole, self.integrity, edges, residual)
 
     def _compile(self, study: Study, density: Any) -> None:
-        domain, energy = self.domain, self.material.energy
+        domain, energy = self.domain, self.energy
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
         chi = self._stiffness_factor()
         rotation = self.rotation.field if self.rotation is not None else None
@@ -303,6 +319,12 @@ class Equilibrium:
     def internal_force(self) -> Values:
         """(owned dofs,) forces of the stress at the current u, without damping or pressure, N."""
         return self._assembled(self._internal_form)
+
+    def corners(self, cells: npt.NDArray[np.integer]) -> Values:
+        """(n, d + 1, d) corners of cells in the configuration that the energy's stress belongs to, m."""
+        nodes, d = self.domain.cell_nodes[cells], self.domain.dim
+        corners = self.domain.nodes[nodes]
+        return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d)[nodes]
 
     def nodal_forces(self) -> Values:
         """(owned and ghost dofs,) forces of the stress at the current u, N."""

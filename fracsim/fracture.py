@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
+from .degrade import Chi, Degradation, Projection
 from .domain import Domain
 from .edge_stress import carried_by, edge_vectors, normal_stress
 from .equilibrium import Equilibrium
 from .forms.energies import cauchy_stress
 from .forms.kinematics import deformation_gradient, symmetric_components
-from .graph import EdgeGraph, local_edges
+from .graph import EdgeGraph
 from .kernels import CellExpression
 from .strength import Strength
 from .study import Fracture, Material
 
 Values = npt.NDArray[np.float64]
-Cells = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,12 @@ class PassResult:
 
 
 class FracturePass:
-    """Breaks edges where the averaged normal stress reaches the strength, and lowers chi.
+    """Breaks edges where the averaged normal stress reaches the strength, and weakens their cells.
 
     Attributes:
         graph: edges and their damage.
         strength: of each edge in each cell.
+        degradation: what broken edges take out of the energy.
     """
 
     def __init__(self, equations: Equilibrium, fracture: Fracture, material: Material) -> None:
@@ -45,14 +46,12 @@ class FracturePass:
         self.domain, self.equations = domain, equations
         self.graph = EdgeGraph(domain)
         self.strength = Strength(self.graph, fracture, material)
-        self._linear = equations.material.energy.linear
         rotation = equations.rotation.field if equations.rotation is not None else None
         F, energy = deformation_gradient(equations.u), equations.material.energy
         stress = symmetric_components(cauchy_stress(energy, F, rotation))
         both = ufl.as_vector([*stress, energy.psi(F, rotation)])  # one kernel: F is worked out once
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
-        assert equations.chi is not None
-        self._chi: Values = equations.chi.x.array
+        self.degradation: Degradation = (Chi if equations.chi is not None else Projection)(equations, self.graph)
         self._average = _average(domain, fracture)
 
     def __call__(self) -> PassResult:
@@ -65,11 +64,10 @@ class FracturePass:
         flags = np.zeros(len(self.graph.broken), bool)
         flags[self._overloaded(averaged)] = True
         broken = self.graph.break_edges(flags)
-        if broken:
+        if broken and self.degradation.idle:
             broken += self.graph.break_idle()
-        released = self._degrade(stress, psi)
-        chi = self._chi[: self.domain.cell_count]
-        return PassResult(broken, released, float(np.sum(self.domain.volumes * chi * psi)))
+        released, elastic = self.degradation(broken > 0, stress, psi)
+        return PassResult(broken, released, elastic)
 
     def _averaged(self, stress: Values) -> Values:
         """What intact edges carry, averaged over the neighbourhood; split cells carry nothing and enter no average."""
@@ -82,7 +80,7 @@ class FracturePass:
         if self._average is None:
             return carried  # an intact edge has the same normal stress in the whole tensor: no share to take out
         whole = damaged[active[damaged]]
-        carried[whole] = carried_by(stress[whole], self._corners(whole), self._intact(whole))
+        carried[whole] = carried_by(stress[whole], self.equations.corners(whole), self.graph.intact(whole))
         return np.asarray(self._average(carried, active))
 
     def _overloaded(self, averaged: Values) -> npt.NDArray[np.int32]:
@@ -98,38 +96,8 @@ class FracturePass:
         if not len(cells):
             return np.empty(0, np.int32)
         edges = self.graph.cell_edges[cells]
-        along = normal_stress(averaged[cells], edge_vectors(self._corners(cells)))
+        along = normal_stress(averaged[cells], edge_vectors(self.equations.corners(cells)))
         return edges[(along >= self.strength(cells, edges)) & ~self.graph.broken[edges]]
-
-    def _degrade(self, stress: Values, psi: Values) -> float:
-        """Lower chi of damaged cells (M22 eq. 28); returns the elastic energy released on this rank."""
-        values = self._chi
-        cells = np.flatnonzero(self.graph.damaged & (values[: self.domain.cell_count] > 0))
-        if not len(cells):
-            return 0.0
-        load = np.abs(normal_stress(stress[cells], edge_vectors(self._corners(cells))))
-        whole, kept = load.sum(axis=1), np.where(self._intact(cells), load, 0.0).sum(axis=1)
-        share = np.divide(kept, whole, out=np.ones_like(kept), where=whole > 0)
-        share[self.graph.split[cells]] = 0.0
-        lost = np.maximum(values[cells] - share, 0.0)
-        changed = lost > 0
-        cells, lost = cells[changed], lost[changed]
-        values[cells] -= lost
-        values[cells[self.graph.split[cells]]] = 0.0
-        return float(np.sum(self.domain.volumes[cells] * lost * psi[cells]))
-
-    def _intact(self, cells: Cells) -> npt.NDArray[np.bool_]:
-        """(n, k) whether each local edge of the cells is intact."""
-        bits = np.arange(len(local_edges(self.domain.dim)))
-        return (self.graph.pattern[cells, None] >> bits) & 1 == 0
-
-    def _corners(self, cells: Cells) -> Values:
-        """(n, d + 1, d) corners in the configuration that the energy's stress belongs to, m."""
-        nodes = self.graph.cell_nodes[cells]
-        corners = self.domain.nodes[nodes]
-        if self._linear:
-            return corners
-        return corners + self.equations.u.x.array.reshape(-1, self.domain.dim)[nodes]
 
 
 def _average(domain: Domain, fracture: Fracture) -> Any:

@@ -81,7 +81,7 @@ class Frames:
 
 def _kinematics(equations: Equilibrium) -> tuple[Any, Expr, Expr | None]:
     rotation = equations.rotation.field if equations.rotation is not None else None
-    return equations.material.energy, deformation_gradient(equations.u), rotation
+    return equations.energy, deformation_gradient(equations.u), rotation
 
 
 def _stress(equations: Equilibrium) -> Expr:

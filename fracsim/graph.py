@@ -124,6 +124,11 @@ class EdgeGraph:
         """(cells,) whether the cell has come apart."""
         return is_split(self.domain.dim)[self.pattern]
 
+    def intact(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """(n, k) whether each local edge of the cells is intact."""
+        bits = np.arange(self.cell_edges.shape[1])
+        return np.asarray((self.pattern[cells, None] >> bits) & 1 == 0)
+
     def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
         return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)

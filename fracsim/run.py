@@ -52,6 +52,9 @@ class Run:
         self.record = self._make_record()
         if restart:
             read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record)
+            if scene.fracture is not None:
+                scene.fracture.degradation.restore()
+                self.state.elastic = scene.equations.elastic_energy()
         self._prepare(restart)
         self._damage = self._count_damage()
         self.output_seconds = 0.0

@@ -157,7 +157,7 @@ class Fracture(Table):
     """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
 
     strength: Strength
-    approach: Literal["chi"] = "chi"
+    approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
@@ -358,6 +358,19 @@ class Study(Table):
         special = [name for name, region in self.material.regions.items() if region.strength is not None]
         if special and self.fracture is None:
             raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
+        return self
+
+    @model_validator(mode="after")
+    def _projection_is_of_small_strains(self) -> Study:
+        if self.fracture is None or self.fracture.approach != "edge":
+            return self
+        if self.material.energy not in ("linear", "corotated"):
+            raise ValueError(
+                f'fracture.approach = "edge" is for the energies linear and corotated, not {self.material.energy}: '
+                'with a nonlinear strain split cells blow up; choose approach = "chi" or energy = "corotated"'
+            )
+        if "chi" in (self.output.fields or []):
+            raise ValueError('output.fields has "chi", which fracture.approach = "edge" does not have; remove it')
         return self
 
     @model_validator(mode="after")

@@ -1,0 +1,102 @@
+"""What broken edges take out of the elastic energy: the two approaches of METHOD section 4.
+
+chi     psi_frac = chi psi, chi the share of the edges' stress that intact ones carry (M22 eq. 28), never rising
+edge    psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22 eqs. 21-22, forms.damage)
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from .edge_stress import edge_vectors, normal_stress
+from .equilibrium import Equilibrium
+from .forms.kinematics import deformation_gradient
+from .graph import EdgeGraph
+from .kernels import CellExpression
+
+Values = npt.NDArray[np.float64]
+
+
+class Degradation(Protocol):
+    """One way to weaken damaged cells."""
+
+    idle: bool  # an edge whose cells have all come apart carries nothing
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+        """(energy released, elastic energy left) on this rank, J, after a pass that `broke` edges or did not.
+
+        `stress` (cells, 3 or 6) and `psi` (cells,) are those of the undamaged material.
+        """
+
+    def restore(self) -> None:
+        """Take up the damage of a graph that was read from a checkpoint."""
+
+
+class Chi:
+    """chi of the damaged cells, from the normal stress along their edges."""
+
+    idle = True
+
+    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
+        assert equations.chi is not None
+        self._equations, self._graph = equations, graph
+        self._chi: Values = equations.chi.x.array
+        self._volumes = equations.domain.volumes
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+        """Released and left: sums of V psi times what chi lost and what it is."""
+        released = self._lower(stress, psi)
+        return released, float(np.sum(self._volumes * self._chi[: len(psi)] * psi))
+
+    def _lower(self, stress: Values, psi: Values) -> float:
+        graph, chi = self._graph, self._chi
+        cells = np.flatnonzero(graph.damaged & (chi[: len(psi)] > 0))
+        if not len(cells):
+            return 0.0
+        load = np.abs(normal_stress(stress[cells], edge_vectors(self._equations.corners(cells))))
+        whole, kept = load.sum(axis=1), np.where(graph.intact(cells), load, 0.0).sum(axis=1)
+        share = np.divide(kept, whole, out=np.ones_like(kept), where=whole > 0)
+        share[graph.split[cells]] = 0.0
+        lost = np.maximum(chi[cells] - share, 0.0)
+        changed = lost > 0
+        cells, lost = cells[changed], lost[changed]
+        chi[cells] -= lost
+        chi[cells[graph.split[cells]]] = 0.0
+        return float(np.sum(self._volumes[cells] * lost * psi[cells]))
+
+    def restore(self) -> None:
+        """chi itself is in the checkpoint."""
+
+
+class Projection:
+    """Integrity of each edge of each cell; split cells keep the forces of their intact edges."""
+
+    idle = False
+
+    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
+        assert equations.integrity is not None
+        domain = equations.domain
+        self._graph, self._volumes = graph, domain.volumes
+        self._integrity = equations.integrity.x.array.reshape(-1, graph.cell_edges.shape[1])
+        rotation = equations.rotation.field if equations.rotation is not None else None
+        density = equations.energy.psi(deformation_gradient(equations.u), rotation)
+        self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count)
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+        """Released: what the projected energy lost at this displacement as edges broke."""
+        before = self._energy()
+        if not broke:
+            return 0.0, before
+        self.restore()
+        after = self._energy()
+        return before - after, after
+
+    def _energy(self) -> float:
+        return float(self._volumes @ self._density()[:, 0])
+
+    def restore(self) -> None:
+        """Integrity from the patterns of the cells."""
+        self._integrity[: len(self._volumes)] = self._graph.intact(np.arange(len(self._volumes)))
