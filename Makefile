@@ -10,7 +10,7 @@ demo:
 	@echo
 	@echo "The torn loaf is in out/loaf:"
 	@ls -1 out/loaf
-	@echo "Open out/loaf/fields.xdmf in ParaView (Xdmf3 Reader S), Warp By Vector, and colour by damage."
+	@echo "In ParaView open out/loaf/surface.pvd: the torn loaf in time, to be coloured by piece, origin or age."
 
 test: readers
 	./env pytest -m "not slow"
