@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,8 @@ class FracturePass:
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
         self.degradation: Degradation = (Chi if equations.chi is not None else Projection)(equations, self.graph)
         self._average = _average(domain, fracture)
+        self.passes = fracture.passes
+        self._most = None if fracture.cap is None else math.ceil(fracture.cap * self.graph.index_map.size_global)
 
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
@@ -61,8 +64,11 @@ class FracturePass:
         if not np.isfinite(values.sum()):  # a crushed cell: J = 0
             np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         averaged = self._averaged(stress)
+        edges, load = self._overloaded(averaged)
+        if self._most is not None:
+            edges = self._strongest(edges, load, self._most)
         flags = np.zeros(len(self.graph.broken), bool)
-        flags[self._overloaded(averaged)] = True
+        flags[edges] = True
         broken = self.graph.break_edges(flags)
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
@@ -83,8 +89,8 @@ class FracturePass:
         carried[whole] = carried_by(stress[whole], self.equations.corners(whole), self.graph.intact(whole))
         return np.asarray(self._average(carried, active))
 
-    def _overloaded(self, averaged: Values) -> npt.NDArray[np.int32]:
-        """Local edges whose normal stress in some owned cell reaches the strength.
+    def _overloaded(self, averaged: Values) -> tuple[npt.NDArray[np.int32], Values]:
+        """Local edges whose normal stress in some owned cell reaches the strength, and the ratio of the two.
 
         No normal stress exceeds the Frobenius norm of its tensor, so most cells are passed over after one product.
         """
@@ -94,10 +100,22 @@ class FracturePass:
         square += 2 * np.einsum("ni,ni->n", averaged[:, normal:pairs], averaged[:, normal:pairs])
         cells = np.flatnonzero(square >= self.strength.weakest**2)
         if not len(cells):
-            return np.empty(0, np.int32)
+            return np.empty(0, np.int32), np.empty(0)
         edges = self.graph.cell_edges[cells]
         along = normal_stress(averaged[cells], edge_vectors(self.equations.corners(cells)))
-        return edges[(along >= self.strength(cells, edges)) & ~self.graph.broken[edges]]
+        strength = self.strength(cells, edges)
+        over = (along >= strength) & ~self.graph.broken[edges]
+        return edges[over], along[over] / strength[over]
+
+    def _strongest(self, edges: npt.NDArray[np.int32], load: Values, most: int) -> npt.NDArray[np.int32]:
+        """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
+        keys = self.graph.edge_keys(edges.astype(np.int64))
+        every = np.concatenate(self.domain.comm.allgather(np.column_stack([keys, -load])))
+        order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
+        _, first = np.unique(every[order, :2], axis=0, return_index=True)
+        chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)
+        wanted = self.graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self.graph.broken), bool)
+        return edges[wanted[edges]]
 
 
 def _average(domain: Domain, fracture: Fracture) -> Any:

@@ -40,6 +40,7 @@ class Stepper:
     def __init__(self, equations: Equilibrium, solver: Solver | None, timing: Time, fracture: Any = None) -> None:
         self.equations, self.solver, self.timing, self.fracture = equations, solver, timing, fracture
         self.smallest = timing.smallest or timing.step / 1024
+        self.passes = fracture.passes if fracture is not None else 1
         self.comm = equations.domain.comm
         self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
         self.failed = 0  # attempts that did not converge
@@ -79,7 +80,40 @@ class Stepper:
                 break
             self.failed += 1
             self._halve(state, dt, outcome)
-        return self._accept(state, dt, outcome, began)
+        outcome, broken, released = self._break_and_solve_again(state, dt, outcome)
+        return self._accept(state, dt, outcome, began, broken, released)
+
+    def _break_and_solve_again(self, state: State, dt: float, outcome: Outcome) -> tuple[Outcome, int, float]:
+        """All passes of a step but its last: break, solve the step again from its start, until nothing new breaks.
+
+        Returns the solve with all iterations counted, the edges broken and the energy released on this rank, J. Where
+        the weakened body does not converge, the last solution stands and the next step takes up what is out of balance.
+        """
+        broken, released = 0, 0.0
+        for _ in range(self.passes - 1):
+            x = self.equations.u.x.array[: len(state.u)].copy()
+            self._arrive(state, dt)
+            result = self.fracture()
+            if not result.broken:
+                self._return_to(x, state, dt)
+                break
+            broken, released = broken + result.broken, released + result.released
+            assert self.solver is not None
+            self.solver.damage_changed()
+            again = self._attempt(state, dt)
+            outcome = Outcome(True, outcome.newton + again.newton, outcome.krylov + again.krylov, "")
+            if not again.converged:
+                self.failed += 1
+                self._return_to(x, state, dt)
+                break
+        return outcome, broken, released
+
+    def _return_to(self, x: Values, state: State, dt: float) -> None:
+        """The solved x of the step once more."""
+        equations = self.equations
+        equations.begin(state.t + dt, dt, state.u, state.v, state.a)
+        equations.displace(x)
+        equations.update_reactions()
 
     def _fit(self, state: State) -> float:
         """The step to take: no further than the end, and no sliver left over before it."""
@@ -116,7 +150,9 @@ class Stepper:
             )
         state.dt = dt / 2
 
-    def _accept(self, state: State, dt: float, outcome: Outcome, began: float) -> Report:
+    def _accept(
+        self, state: State, dt: float, outcome: Outcome, began: float, broken_before: int, released_before: float
+    ) -> Report:
         equations = self.equations
         old = state.u
         state.u, state.v, state.a = self._arrive(state, dt)
@@ -124,6 +160,7 @@ class Stepper:
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old)
         broken, released, elastic = self._break(state)
+        broken, released = broken + broken_before, released + released_before
         if not equations.scheme.inertia:
             # what is neither stored nor moving is gone: releases, and the body's relaxation after them
             released, viscous = work - (elastic - state.elastic), 0.0

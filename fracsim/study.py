@@ -161,6 +161,8 @@ class Fracture(Table):
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+    passes: Annotated[int, Field(ge=1, strict=True)] = 1  # solve and break again within a step until nothing new breaks
+    cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None
 
@@ -371,6 +373,12 @@ class Study(Table):
             )
         if "chi" in (self.output.fields or []):
             raise ValueError('output.fields has "chi", which fracture.approach = "edge" does not have; remove it')
+        return self
+
+    @model_validator(mode="after")
+    def _explicit_steps_once(self) -> Study:
+        if self.time.scheme == "explicit" and self.fracture is not None and self.fracture.passes > 1:
+            raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 
     @model_validator(mode="after")
