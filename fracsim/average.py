@@ -33,6 +33,7 @@ class NonlocalAverage:
     """The averaging matrix of a mesh for one radius (m) and kernel."""
 
     def __init__(self, domain: Domain, radius: float, kernel: str) -> None:
+        self._comm = domain.comm
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._exchange = _Halo(domain.comm, centroids, radius)
         near = self._exchange(centroids)
@@ -51,6 +52,24 @@ class NonlocalAverage:
         sums = self._weights @ self._exchange(counted)[self._order]
         weight = sums[:, -1:]
         return np.divide(sums[:, :-1], weight, out=np.zeros_like(sums[:, :-1]), where=weight > 0)
+
+    def reaching(
+        self, values: Values, size: Values, bound: float, active: npt.NDArray[np.bool_] | None = None
+    ) -> tuple[npt.NDArray[np.int64], Values]:
+        """(m,) cells whose average may reach `bound` in size, and those averages (m, n) (collective).
+
+        `size` (cells,) is a norm of `values`: the norm of an average is at most the average of norms, which takes one
+        column where the values have six. `values` and `size` are 0 on cells that are not active.
+        """
+        n = values.shape[1]
+        if self._comm.allreduce(float(np.max(size, initial=0.0)), op=MPI.MAX) < bound:
+            return np.empty(0, np.int64), np.empty((0, n))
+        columns = [values, size[:, None]] + ([active[:, None]] if active is not None else [])
+        near = self._exchange(np.hstack(columns))[self._order]
+        weight = self._full[:, 0] if active is None else self._weights @ near[:, -1]
+        # a hair below the bound: the sums are rounded
+        rows = np.flatnonzero((self._weights @ near[:, n] >= bound * (1 - 1e-12) * weight) & (weight > 0))
+        return rows, np.asarray(self._weights[rows] @ near[:, :n]) / weight[rows, None]
 
     @property
     def entries(self) -> int:

@@ -38,6 +38,13 @@ def quadratic_form(components: Values, vectors: Values) -> Values:
     return result
 
 
+def frobenius_norm(components: Values, dim: int) -> Values:
+    """(n,) sqrt(s : s) of symmetric tensors given by their components; no normal stress is larger."""
+    normal, shear = components[:, :dim], components[:, dim:]
+    square = np.einsum("ni,ni->n", normal, normal) + 2 * np.einsum("ni,ni->n", shear, shear)
+    return np.asarray(np.sqrt(square))
+
+
 def normal_stress(components: Values, vectors: Values) -> Values:
     """(n, k) normal stress n . s . n along each edge, in the unit of s; n is the unit vector of the edge."""
     length2 = np.einsum("nki,nki->nk", vectors, vectors)

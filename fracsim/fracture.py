@@ -12,7 +12,7 @@ import ufl
 
 from .degrade import Chi, Degradation, Projection
 from .domain import Domain
-from .edge_stress import carried_by, edge_vectors, normal_stress
+from .edge_stress import carried_by, edge_vectors, frobenius_norm, normal_stress
 from .equilibrium import Equilibrium
 from .forms.energies import cauchy_stress
 from .forms.kinematics import deformation_gradient, symmetric_components
@@ -63,8 +63,7 @@ class FracturePass:
         stress, psi = values[:, :-1], values[:, -1]
         if not np.isfinite(values.sum()):  # a crushed cell: J = 0
             np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        averaged = self._averaged(stress)
-        edges, load = self._overloaded(averaged)
+        edges, load = self._overloaded(*self._candidates(stress))
         if self._most is not None:
             edges = self._strongest(edges, load, self._most)
         flags = np.zeros(len(self.graph.broken), bool)
@@ -75,34 +74,36 @@ class FracturePass:
         released, elastic = self.degradation(broken > 0, stress, psi)
         return PassResult(broken, released, elastic)
 
-    def _averaged(self, stress: Values) -> Values:
-        """What intact edges carry, averaged over the neighbourhood; split cells carry nothing and enter no average."""
+    def _candidates(self, stress: Values) -> tuple[npt.NDArray[np.int64], Values]:
+        """Cells whose averaged stress may break an edge, and that stress.
+
+        No normal stress exceeds the Frobenius norm of its tensor, and no average exceeds the average of the norms:
+        most cells are passed over after one product.
+        """
+        carried, active = self._carried(stress)
+        size = frobenius_norm(carried, self.domain.dim)
+        if self._average is not None:
+            return self._average.reaching(carried, size, self.strength.weakest, active)
+        cells = np.flatnonzero(size >= self.strength.weakest)
+        return cells, carried[cells]
+
+    def _carried(self, stress: Values) -> tuple[Values, npt.NDArray[np.bool_] | None]:
+        """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
         graph = self.graph
         damaged = np.flatnonzero(graph.damaged)
         if not self.domain.comm.allreduce(len(damaged)):
-            return self._average(stress) if self._average is not None else stress
+            return stress, None
         active = ~graph.split
         carried = np.where(active[:, None], stress, 0.0)
-        if self._average is None:
-            return carried  # an intact edge has the same normal stress in the whole tensor: no share to take out
-        whole = damaged[active[damaged]]
-        carried[whole] = carried_by(stress[whole], self.equations.corners(whole), self.graph.intact(whole))
-        return np.asarray(self._average(carried, active))
+        if self._average is not None:  # else: an intact edge has the same normal stress in the whole tensor
+            whole = damaged[active[damaged]]
+            carried[whole] = carried_by(stress[whole], self.equations.corners(whole), graph.intact(whole))
+        return carried, active
 
-    def _overloaded(self, averaged: Values) -> tuple[npt.NDArray[np.int32], Values]:
-        """Local edges whose normal stress in some owned cell reaches the strength, and the ratio of the two.
-
-        No normal stress exceeds the Frobenius norm of its tensor, so most cells are passed over after one product.
-        """
-        pairs = averaged.shape[1]
-        normal = self.domain.dim
-        square = np.einsum("ni,ni->n", averaged[:, :normal], averaged[:, :normal])
-        square += 2 * np.einsum("ni,ni->n", averaged[:, normal:pairs], averaged[:, normal:pairs])
-        cells = np.flatnonzero(square >= self.strength.weakest**2)
-        if not len(cells):
-            return np.empty(0, np.int32), np.empty(0)
+    def _overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[npt.NDArray[np.int32], Values]:
+        """Local edges whose normal stress in one of the cells reaches the strength, and the ratio of the two."""
         edges = self.graph.cell_edges[cells]
-        along = normal_stress(averaged[cells], edge_vectors(self.equations.corners(cells)))
+        along = normal_stress(averaged, edge_vectors(self.equations.corners(cells)))
         strength = self.strength(cells, edges)
         over = (along >= strength) & ~self.graph.broken[edges]
         return edges[over], along[over] / strength[over]

@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from .graph import EdgeGraph
 from .laws import of_size
@@ -31,7 +32,8 @@ class Strength:
         self._factor = self._edge_factors(fracture)
         smallest = float(np.min(self._factor, initial=np.inf)) if self._factor is not None else 1.0
         self._tie_break = fracture.tie_break
-        self.weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - fracture.tie_break)
+        weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - fracture.tie_break)
+        self.weakest = graph.domain.comm.allreduce(weakest, op=MPI.MIN)  # no edge of the body is weaker
 
     def __call__(self, cells: npt.NDArray[np.int64], edges: npt.NDArray[np.int32]) -> Values:
         """(n, k) strengths of the (n, k) local edges of n cells."""

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from fracsim.average import NonlocalAverage
+from fracsim.edge_stress import frobenius_norm
 from support.scenes import Values, cell_corners, make_scene
 
 EPS = np.finfo(float).eps
@@ -113,3 +114,22 @@ def test_radius_zero_builds_no_average() -> None:
     """R = 0 is local: there is no matrix."""
     scene, _ = make_scene(fracture={"strength": 1.0, "radius": 0.0})
     assert scene.fracture._average is None
+
+
+def test_cells_that_may_reach_a_bound_are_found_with_their_averages() -> None:
+    """None is missed: every cell whose average is as large as the bound is among them, with the same average."""
+    scene, _ = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"},
+        fracture={"strength": 1.0, "radius": 0.25},
+    )
+    average, n = scene.fracture._average, scene.domain.cell_count
+    rng = np.random.default_rng(4)
+    for active in (None, rng.uniform(size=n) < 0.7):
+        values = rng.normal(size=(n, 3)) * (1.0 if active is None else active[:, None])
+        size = frobenius_norm(values, 2)
+        whole = average(values, active)
+        bound = float(np.quantile(frobenius_norm(whole, 2), 0.8))
+        cells, found = average.reaching(values, size, bound, active)
+        np.testing.assert_allclose(found, whole[cells], rtol=1e-12, atol=1e-14)
+        assert set(np.flatnonzero(frobenius_norm(whole, 2) >= bound)) <= set(cells)
+        assert len(average.reaching(values, size, 1.01 * size.max(), active)[0]) == 0

@@ -87,8 +87,8 @@ def test_the_cap_lets_the_strongest_loaded_break() -> None:
     loads: dict[int, float] = {}
     original = scene.fracture._overloaded
 
-    def watched(averaged: Any) -> Any:
-        found, load = original(averaged)
+    def watched(cells: Any, averaged: Any) -> Any:
+        found, load = original(cells, averaged)
         loads.clear()
         for edge, ratio in zip(found.tolist(), load.tolist(), strict=True):
             loads[edge] = max(ratio, loads.get(edge, 0.0))
