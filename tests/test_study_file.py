@@ -136,8 +136,9 @@ def test_every_default_is_written() -> None:
         "scheme": "backward-euler", "step": 0.005, "end": 0.05, "adapt": True, "mass": "lumped",
         "beta": 0.25, "gamma": 0.5, "rho": 0.8
     }  # fmt: skip
-    chosen = {"strength": 2e4}
-    assert data["fracture"] == chosen | {"approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6}
+    assert data["fracture"] == {
+        "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6, "passes": 1
+    }  # fmt: skip
     assert data["mesh"]["pattern"] == "structured"
     assert data["material"]["plane"] == "strain"
 
