@@ -8,26 +8,11 @@ from typing import Any, Protocol
 import ufl
 from ufl.core.expr import Expr
 
-from .energies import Scalar, hooke
+from .energies import Energy, Scalar, hooke
 
 
-class Strained(Protocol):
+class Strained(Energy, Protocol):
     """An energy that is Hooke's law of some strain: linear or corotated."""
-
-    @property
-    def mu(self) -> Scalar: ...
-
-    @property
-    def lmbda(self) -> Scalar: ...
-
-    @property
-    def reduced(self) -> bool: ...
-
-    @property
-    def needs_rotation(self) -> bool: ...
-
-    @property
-    def linear(self) -> bool: ...
 
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
 

@@ -93,7 +93,6 @@ def read_checkpoint(
     if equations.chi is not None and "chi" in names:
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     equations.displace(state.u)
-    state.elastic = equations.elastic_energy()
 
 
 def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from .errors import InputError
 from .screen import display
+from .surface.files import read_collection
 
 Values = npt.NDArray[np.float64]
 
@@ -98,9 +98,9 @@ def find_frames(folder: Path) -> list[Shot]:
     """Frames of surface.pvd, or else of fields.h5. InputError where there are none."""
     pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
     if pvd.exists():
-        entries = re.findall(r'timestep="([^"]+)" file="([^"]+)"', pvd.read_text())
-        if entries:
-            return [Shot(float(t), folder / name, -1) for t, name in entries]
+        shots = [Shot(t, folder / name, -1) for t, name in read_collection(pvd)]
+        if shots:
+            return shots
     if not h5.exists():
         raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
     with h5py.File(h5) as file:

@@ -18,7 +18,7 @@ class Progress:
     def __init__(self, comm: MPI.Comm, study: Study) -> None:
         self._on = comm.rank == 0 and sys.stderr.isatty()
         self._end = study.time.end
-        self._start = self._began = None if not self._on else time.monotonic()
+        self._began = time.monotonic()
         self._from: float | None = None
 
     def __enter__(self) -> Progress:
@@ -32,7 +32,6 @@ class Progress:
         """After each step."""
         if not self._on:
             return
-        assert self._began is not None
         if self._from is None:
             self._from = state.t - report.dt
         done = (state.t - self._from) / (self._end - self._from)

@@ -54,7 +54,7 @@ class Run:
             read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record)
             if scene.fracture is not None:
                 scene.fracture.degradation.restore()
-                self.state.elastic = scene.equations.elastic_energy()
+            self.state.elastic = scene.equations.elastic_energy()
         self._prepare(restart)
         self._damage = self._count_damage()
         self.output_seconds = 0.0
@@ -88,11 +88,8 @@ class Run:
             return
         from .surface.output import SurfaceOutput
 
-        density = scene.equations.material.density
-        resume_at = self.state.t if restart else None
-        self.surface = SurfaceOutput(
-            self.folder, scene.domain, density, self._graph, record=self.record, resume_at=resume_at
-        )
+        density, resume_at = scene.equations.material.density, self.state.t if restart else None
+        self.surface = SurfaceOutput(self.folder, scene.domain, density, self.record, resume_at=resume_at)
 
     def _make_record(self) -> EdgeRecord | None:
         if self._graph is None:

@@ -64,7 +64,7 @@ class SurfaceFiles:
         os.replace(new, self._pvd)
 
     def _kept(self, until: float) -> list[tuple[float, str]]:
-        entries = [(float(t), name) for t, name in _ENTRY.findall(self._pvd.read_text())]
+        entries = read_collection(self._pvd)
         return [(t, name) for t, name in entries if t <= until * (1 + 1e-9) and (self._folder / name).exists()]
 
     def _kept_rows(self, until: float) -> list[list[str]]:
@@ -73,6 +73,11 @@ class SurfaceFiles:
         with self._csv.open(newline="") as file:
             rows = list(csv.reader(file))[1:]
         return [row for row in rows if row and float(row[0]) <= until * (1 + 1e-9)]
+
+
+def read_collection(pvd: Path) -> list[tuple[float, str]]:
+    """(time in s, file relative to the folder) of every frame of a surface.pvd."""
+    return [(float(t), name) for t, name in _ENTRY.findall(pvd.read_text())]
 
 
 def columns(dim: int) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,6 @@ from ..state import State
 from .files import SurfaceFiles
 from .frame import Surface
 from .record import EdgeRecord
-
-if TYPE_CHECKING:
-    from ..graph import EdgeGraph
 
 Values = npt.NDArray[np.float64]
 
@@ -36,14 +33,12 @@ class SurfaceOutput:
         folder: Path,
         domain: Domain,
         density: PerCell,
-        graph: EdgeGraph | None,
+        record: EdgeRecord | None,
         *,
-        record: EdgeRecord | None = None,
         resume_at: float | None = None,
     ) -> None:
-        """Open the files (collective). On a restart the record comes from the checkpoint."""
-        self._domain, self._graph = domain, graph
-        self.record = record if record is not None or graph is None else EdgeRecord(graph)
+        """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint."""
+        self._domain, self.record = domain, record
         everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         broken = self.record.gathered() if self.record is not None else None
 
@@ -57,16 +52,11 @@ class SurfaceOutput:
 
         self.made = on_root(domain.comm, begin)
 
-    def note(self, t: float) -> None:
-        """To be called after every step in which edges broke."""
-        if self.record is not None:
-            self.record.note(t)
-
     def write(self, state: State, fields: list[Field]) -> None:
         """A frame at the time of the state, with the gathered fields of fields.xdmf (collective)."""
         domain, d = self._domain, self._domain.dim
         gathered: list[Any] = [domain.gather_nodes(each.reshape(-1, d)) for each in (state.u, state.v)]
-        pattern = domain.gather_cells(self._graph.pattern) if self._graph is not None else None
+        pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
         broken = self.record.gathered() if self.record is not None else None
 
         def work() -> None:

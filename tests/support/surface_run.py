@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from fracsim.pieces import find_pieces
 from fracsim.surface.output import SurfaceOutput
+from fracsim.surface.record import EdgeRecord
 
 from .scenes import each_step, make_scene
 from .torn import RUNS, TIGHT, Found
@@ -22,11 +23,12 @@ def run(name: str, folder: Path) -> Found:
     """A study to its end with a frame at every tenth step; the last frame."""
     scene, state = make_scene(**RUNS[name], solver=TIGHT)
     domain, graph = scene.domain, scene.fracture.graph
-    output = SurfaceOutput(folder, domain, scene.equations.material.density, graph)
+    record = EdgeRecord(graph)
+    output = SurfaceOutput(folder, domain, scene.equations.material.density, record)
     output.write(state, [])
     for number, report in enumerate(each_step(scene, state), start=1):
         if report.broken:
-            output.note(state.t)
+            record.note(state.t)
         if number % 10 == 0:
             output.write(state, [])
     of_node = domain.gather_nodes(find_pieces(graph).of_node[: domain.node_count])
