@@ -1,0 +1,116 @@
+"""Running trials: each in processes of its own with a time limit, recorded in record.json, and not run twice."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from .trial import Trial
+
+OUTCOMES = {0: "done", 2: "refused", 3: "not converged", 4: "stopped"}
+
+
+def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
+    """The record of a trial; taken from OUT/group/case/name/record.json where the same trial has been run before."""
+    folder = out / trial.group / trial.case / trial.name
+    path = folder / "record.json"
+    digest = fingerprint(trial)
+    if path.exists() and (record := json.loads(path.read_text()))["digest"] == digest:
+        return dict(record)
+    folder.mkdir(parents=True, exist_ok=True)
+    command = _command(trial, folder)
+    runs = [_once(command, folder, trial.limit) for _ in range(trial.repeats)]
+    record = {**_about(trial, command), "digest": digest, **_joined(runs)}
+    _measure(trial, folder, record)
+    path.write_text(json.dumps(record, indent=1) + "\n")
+    return record
+
+
+def fingerprint(trial: Trial) -> str:
+    """Name of what a trial is: it changes with any part of it."""
+    return hashlib.sha256(json.dumps(asdict(trial), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _about(trial: Trial, command: list[str]) -> dict[str, Any]:
+    keys = ("group", "case", "name", "settings", "ranks", "repeats", "limit")
+    return {key: getattr(trial, key) for key in keys} | {"command": shlex.join(command)}
+
+
+def _command(trial: Trial, folder: Path) -> list[str]:
+    """What is run, inside `folder`; also what a reader of the report runs again."""
+    if trial.study is not None:
+        (folder / "trial.toml").write_text(tomli_w.dumps(trial.study))
+        work = ["fracsim", "run", "trial.toml", "-o", "run"]
+    else:
+        work = ["python3", "-m", *trial.script, "-o", "figures.json"]
+    if trial.ranks == 1:
+        return work
+    return ["mpirun", "--oversubscribe", "--timeout", str(int(trial.limit) + 5), "-n", str(trial.ranks), *work]
+
+
+def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
+    """One run: outcome, wall time in s, the last thing it said, and summary.json where there is one."""
+    for name in ("figures.json", "run/summary.json"):  # those of an earlier run would be taken for this one's
+        (folder / name).unlink(missing_ok=True)
+    began = time.perf_counter()
+    with (folder / "log.txt").open("w") as log:
+        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, start_new_session=True)
+        try:
+            code = process.wait(limit + 10)
+            outcome = OUTCOMES.get(code, f"failed ({code})")
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            outcome = "out of time"
+    said = [line for line in (folder / "log.txt").read_text(errors="replace").splitlines() if line.strip()]
+    messages = [line for line in said if line.startswith("fracsim:")] or said[-1:]
+    summary = folder / "run" / "summary.json"
+    return {
+        "outcome": outcome,
+        "wall": time.perf_counter() - began,
+        "message": messages[-1] if messages else "",
+        "summary": json.loads(summary.read_text()) if summary.exists() else None,
+    }
+
+
+def _joined(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Worst outcome, last summary, and the times of all runs, s: `wall` of the process, `stepping` inside it."""
+    summaries = [run["summary"] for run in runs if run["summary"] is not None]
+    phases = ("solve", "fracture", "energies")
+    return {
+        "outcome": next((run["outcome"] for run in runs if run["outcome"] != "done"), "done"),
+        "message": runs[-1]["message"],
+        "wall": [run["wall"] for run in runs],
+        "stepping": [sum(summary["seconds"].get(key, 0.0) for key in phases) for summary in summaries],
+        "summary": runs[-1]["summary"],
+    }
+
+
+def _measure(trial: Trial, folder: Path, record: dict[str, Any]) -> None:
+    """Figures of the run into the record; a measurement that fails makes the trial a failed one, not a hole."""
+    record["figures"] = {}
+    if record["outcome"] != "done" and not trial.always:
+        return
+    try:
+        if (script := folder / "figures.json").exists():
+            record["figures"] = json.loads(script.read_text())
+        if trial.measure:
+            module, _, function = trial.measure.partition(":")
+            measured = getattr(importlib.import_module(f".{module}", __package__), function)(folder / "run")
+            record["figures"] |= measured
+    except Exception as error:
+        record["outcome"] = "not measured"
+        record["message"] = f"{type(error).__name__}: {error}"
+        print(f"{trial.group}/{trial.case}/{trial.name}: {record['message']}", file=sys.stderr)
