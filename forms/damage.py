@@ -1,4 +1,9 @@
-"""What broken edges do to the strain of a simplex: the edge-projected energy (M22 sections 3.5.2 and 3.6.1)."""
+"""What broken edges do to the strain of a simplex: the edge-projected energy (M22 sections 3.5.2 and 3.6.1).
+
+A strain is a sum over the edges ij of the reference cell, eps = - sum (d_ij . eps . d_ij) sym(g_i x g_j), with
+d_ij = X_j - X_i and barycentric gradients g_i (see fracsim.edge_stress for the identity): T_strain^-1 without a matrix
+inverse. Broken edges are left out of the sum.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ import ufl
 from ufl.core.expr import Expr
 
 from .energies import Energy, Scalar, hooke
+from .kinematics import embed
 
 
 class Strained(Energy, Protocol):
@@ -17,26 +23,42 @@ class Strained(Energy, Protocol):
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
 
 
-def edge_projected(strain: Expr, integrity: Expr, edges: Any) -> Expr:
-    """D eps = - sum over edges ij of integrity_ij (d_ij . eps . d_ij) sym(g_i x g_j).
-
-    With d_ij = x_j - x_i and barycentric gradients g_i of the reference cell this is T_strain^-1 diag(integrity)
-    T_strain eps without a matrix inverse (see fracsim.edge_stress for the identity). `integrity` is 1 for an intact
-    edge and 0 for a broken one, in the order of `edges`, the (k, 2) local nodes of each edge.
-    """
-    d = strain.ufl_shape[0]
-    mesh = ufl.domain.extract_unique_domain(integrity)
-    J, K = ufl.Jacobian(mesh), ufl.JacobianInverse(mesh)
-    zero = ufl.as_vector([0] * d)
-    corners = [zero, *(ufl.as_vector([J[i, k] for i in range(d)]) for k in range(d))]  # x_i - x_0
+def edge_dyads(cell: Expr, edges: Any) -> list[tuple[Expr, Expr]]:
+    """(d_ij, -sym(g_i x g_j)) of the edges of the cell that `cell`, a coefficient, lives on."""
+    mesh = ufl.domain.extract_unique_domain(cell)
+    K = ufl.JacobianInverse(mesh)
+    d = K.ufl_shape[0]
     others = [ufl.as_vector([K[k, i] for i in range(d)]) for k in range(d)]
     gradients = [-sum(others[1:], others[0]), *others]
-    parts = []
-    for number, (i, j) in enumerate(edges):
-        edge = corners[j] - corners[i]
-        along = ufl.dot(edge, strain * edge)
-        parts.append(-integrity[number] * along * ufl.sym(ufl.outer(gradients[i], gradients[j])))
+    dyads = [-ufl.sym(ufl.outer(gradients[i], gradients[j])) for i, j in edges]
+    return list(zip(edge_vectors(cell, edges), dyads, strict=True))
+
+
+def edge_vectors(cell: Expr, edges: Any) -> list[Expr]:
+    """d_ij = X_j - X_i of the edges of the cell, m."""
+    J = ufl.Jacobian(ufl.domain.extract_unique_domain(cell))
+    d = J.ufl_shape[0]
+    corners = [ufl.as_vector([0] * d), *(ufl.as_vector([J[i, k] for i in range(d)]) for k in range(d))]  # X_i - X_0
+    return [corners[j] - corners[i] for i, j in edges]
+
+
+def edge_projected(strain: Expr, integrity: Expr, edges: Any) -> Expr:
+    """D eps: the part of the strain along edges with `integrity` 1 (0: broken), in the order of `edges`.
+
+    `edges`: (k, 2) local nodes.
+    """
+    parts = [
+        integrity[number] * ufl.dot(edge, strain * edge) * dyad
+        for number, (edge, dyad) in enumerate(edge_dyads(integrity, edges))
+    ]
     return sum(parts[1:], parts[0])
+
+
+def in_plane(tensor: Expr, edges: Any) -> Expr:
+    """The block of a tensor that a cell with these edges lies in: 2 x 2 of the 3 x 3 embedding of a triangle."""
+    if len(edges) != 3 or tensor.ufl_shape[0] == 2:
+        return tensor
+    return ufl.as_tensor([[tensor[i, j] for j in range(2)] for i in range(2)])
 
 
 @dataclass(frozen=True)
@@ -79,14 +101,10 @@ class EdgeProjected:
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
         strain = self.whole.strain(F, rotation)
-        if (
-            strain.ufl_shape[0] == 3 and len(self.edges) == 3
-        ):  # a 2D cell in its 3 x 3 embedding: the edges lie in the plane
-            plane = ufl.as_tensor([[strain[i, j] for j in range(2)] for i in range(2)])
-            kept = edge_projected(plane, self.integrity, self.edges)
-            kept = ufl.as_tensor([[kept[0, 0], kept[0, 1], 0], [kept[1, 0], kept[1, 1], 0], [0, 0, strain[2, 2]]])
-        else:
-            kept = edge_projected(strain, self.integrity, self.edges)
+        plane = in_plane(strain, self.edges)
+        kept = edge_projected(plane, self.integrity, self.edges)
+        if plane is not strain:
+            kept = embed(kept, strain[2, 2])
         return hooke(self, kept) + self.residual * hooke(self, strain)
 
     def thickness_stretch(self, F: Expr) -> Expr | float:

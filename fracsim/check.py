@@ -181,7 +181,9 @@ def _fracture(study: Study) -> str:
         return "off: no damage field, no graph, no average"
     fracture = study.fracture
     average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
-    return f"degraded energy ({fracture.approach}), strength {fracture.strength:g} Pa, {average}"
+    approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
+    closing = ", cracks close" if fracture.unilateral else ""
+    return f"{approach}, strength {fracture.strength:g} Pa, {average}{closing}"
 
 
 def _damping(study: Study) -> str:

@@ -2,6 +2,8 @@
 
 chi     psi_frac = chi psi, chi the share of the edges' stress that intact ones carry (M22 eq. 28), never rising
 edge    psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22 eqs. 21-22, forms.damage)
+
+Where cracks close (`unilateral`) the springs of broken edges are added to either (forms.closing).
 """
 
 from __future__ import annotations
@@ -71,10 +73,8 @@ class Chi:
         """chi itself is in the checkpoint."""
 
 
-class Projection:
-    """Integrity of each edge of each cell; split cells keep the forces of their intact edges."""
-
-    idle = False
+class _Edges:
+    """Integrity of each edge of each cell, and the energy that depends on it."""
 
     def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
         assert equations.integrity is not None
@@ -85,18 +85,60 @@ class Projection:
         density = equations.energy.psi(deformation_gradient(equations.u), rotation)
         self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count)
 
+    def energy(self) -> float:
+        """Elastic energy on this rank, J."""
+        return float(self._volumes @ self._density()[:, 0])
+
+    def update(self) -> None:
+        """Integrity from the patterns of the cells."""
+        self._integrity[: len(self._volumes)] = self._graph.intact(np.arange(len(self._volumes)))
+
+
+class Projection:
+    """The energy follows from the integrity of the edges; split cells keep the forces of intact ones."""
+
+    idle = False
+
+    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
+        self._edges = _Edges(equations, graph)
+
     def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
         """Released: what the projected energy lost at this displacement as edges broke."""
-        before = self._energy()
+        before = self._edges.energy()
         if not broke:
             return 0.0, before
         self.restore()
-        after = self._energy()
+        after = self._edges.energy()
         return before - after, after
 
-    def _energy(self) -> float:
-        return float(self._volumes @ self._density()[:, 0])
+    def restore(self) -> None:
+        """Integrity follows from the patterns."""
+        self._edges.update()
+
+
+class ClosingChi(Chi):
+    """chi beside the springs of broken edges (forms.closing)."""
+
+    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
+        super().__init__(equations, graph)
+        self._edges = _Edges(equations, graph)
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+        """Released: what the energy lost at this displacement as chi fell and edges broke."""
+        before = self._edges.energy()
+        self._lower(stress, psi)
+        if broke:
+            self._edges.update()
+        after = self._edges.energy()
+        return before - after, after
 
     def restore(self) -> None:
-        """Integrity from the patterns of the cells."""
-        self._integrity[: len(self._volumes)] = self._graph.intact(np.arange(len(self._volumes)))
+        """chi itself is in the checkpoint."""
+        self._edges.update()
+
+
+def make_degradation(equations: Equilibrium, graph: EdgeGraph) -> Degradation:
+    """The approach of the study."""
+    if equations.chi is None:
+        return Projection(equations, graph)
+    return Chi(equations, graph) if equations.integrity is None else ClosingChi(equations, graph)

@@ -29,7 +29,7 @@ from .mass import ConsistentMass, LumpedMass, Mass
 from .material import MaterialFields, _coefficient
 from .parallel import total
 from .rotation import RotationField
-from .study import Study
+from .study import Fracture, Study
 
 Values = npt.NDArray[np.float64]
 
@@ -40,7 +40,8 @@ class Equilibrium:
     Attributes:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
         chi: degradation field of the approach "chi", None otherwise.
-        integrity: 1 or 0 for each edge of each cell in the approach "edge", None otherwise.
+        integrity: 1 or 0 for each edge of each cell in the approach "edge" or where cracks close, None otherwise.
+        unilateral: whether broken edges resist being shortened.
         energy: the energy that is assembled; material.energy is that of the undamaged body.
         inertia: the mass matrix.    mass: (owned dofs,) lumped mass of each dof, kg.
         held: owned dofs whose motion is prescribed.
@@ -52,10 +53,10 @@ class Equilibrium:
         self.domain, self.material, self.scheme = domain, material, scheme
         self.u = fem.Function(domain.space, name="displacement")
         self.c_a, self.c_v = scheme.rates(study.time.step)
-        approach = study.fracture.approach if study.fracture is not None else ""
-        self.chi = self._whole_cells("chi", 1) if approach == "chi" else None
+        self.chi: fem.Function | None = None
         self.integrity: fem.Function | None = None
-        self.energy: Energy = self._projected() if approach == "edge" else material.energy
+        self.unilateral = study.fracture is not None and study.fracture.unilateral
+        self.energy: Energy = material.energy if study.fracture is None else self._damaged(study.fracture)
         self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
         self.damping = study.damping
         self.u_n: Any = None
@@ -80,43 +81,58 @@ class Equilibrium:
         field.x.array[:] = 1.0
         return field
 
-    def _projected(self) -> Energy:
-        from .forms.damage import EdgeProjected
+    def _damaged(self, fracture: Fracture) -> Energy:
+        """The energy with the fields of damage that the study's approach needs."""
+        whole: Any = self.material.energy
+        if fracture.approach == "chi":
+            self.chi = self._whole_cells("chi", 1)
+            if not fracture.unilateral:
+                return self.material.energy
         from .graph import local_edges
 
-        residual = 0.0 if self.scheme.inertia else RESIDUAL_STIFFNESS
         edges: list[Any] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
         self.integrity = self._whole_cells("integrity", len(edges))
-        whole: Any = self.material.energy
-        return EdgeProjected(whole, self.integrity, edges, residual)
+        if fracture.approach == "edge":
+            from .forms.damage import EdgeProjected
+
+            whole = EdgeProjected(whole, self.integrity, edges, 0.0 if self.scheme.inertia else RESIDUAL_STIFFNESS)
+        if not fracture.unilateral:
+            return whole  # type: ignore[no-any-return]
+        from .forms.closing import Closing
+
+        share = 1.0 if self.chi is None else 1 - self.chi
+        return Closing(whole, self._floored(self.chi), share, self.integrity, edges)
 
     def _compile(self, study: Study, density: Any) -> None:
         domain, energy = self.domain, self.energy
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
-        chi = self._stiffness_factor()
+        chi, damping = self._floored(self.factor), self._floored(self.chi)
         rotation = self.rotation.field if self.rotation is not None else None
         residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
         self._internal_form = compile_form(residual)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
-        viscous, pressure = self._viscous(w, dx, chi), self._pressure(w)
+        viscous, pressure = self._viscous(w, dx, damping), self._pressure(w)
         self._viscous_form = compile_form(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
         residual = residual + viscous + pressure
         self._residual = compile_form(residual)
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
         at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
-        self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
+        self._reactions = compile_form(at_supports + self._viscous(w, near, damping) + pressure)
         if self.scheme.implicit:
             self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
         self._dead = self._dead_loads(w, dx)
 
-    def _stiffness_factor(self) -> Any:
+    @property
+    def factor(self) -> fem.Function | None:
+        """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
+        return self.chi if self.energy is self.material.energy else None
+
+    def _floored(self, chi: Any) -> Any:
         """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
-        if self.chi is None:
+        if chi is None:
             return 1.0
-        if self.scheme.inertia:
-            return self.chi
-        return RESIDUAL_STIFFNESS + (1 - RESIDUAL_STIFFNESS) * self.chi
+        return chi if self.scheme.inertia else RESIDUAL_STIFFNESS + (1 - RESIDUAL_STIFFNESS) * chi
 
     def _viscous(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form | int:
         """Stiffness-proportional damping; the start of the step and c_v are coefficients that `begin` moves."""

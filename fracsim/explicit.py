@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .edge_stress import barycentric_gradients
 from .equilibrium import Equilibrium
+from .frequencies import cell_frequencies, damaged_frequencies
 from .solve import Outcome
 from .state import State
 from .stepping import Stepper
@@ -30,8 +30,7 @@ class ExplicitStepper(Stepper):
         """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
         if self._frequencies is None or state.step % REFRESH == 0:
             self._frequencies = cell_frequencies(self.equations)
-        chi = self.equations.chi
-        squares = self._frequencies if chi is None else self._frequencies * chi.x.array[: len(self._frequencies)]
+        squares = damaged_frequencies(self.equations, self._frequencies)
         highest = float(np.sqrt(self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)))
         stable = SAFETY * stable_step(highest, self.equations)
         left = self.timing.end - state.t
@@ -61,28 +60,6 @@ class ExplicitStepper(Stepper):
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         return self._arrival
-
-
-def cell_frequencies(equations: Equilibrium) -> Values:
-    """(cells,) upper bounds of omega^2 of each cell on its own, 1/s^2, undamaged and in its current shape.
-
-    A P1 simplex has lumped mass rho V / (d + 1) a node and energy V (mu |sym H|^2 + lambda/2 (tr H)^2), H = grad u.
-    With L = sum_i g_i x g_i a nodal motion with gradient H has sum |u_i|^2 >= H : H L^-1 >= (tr H)^2 / tr L,
-    hence omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L). No assembled body is faster than its fastest cell
-    (Irons and Treharne 1971).
-    """
-    domain, d = equations.domain, equations.domain.dim
-    corners = domain.nodes[domain.cell_nodes]
-    if not equations.material.energy.linear:
-        corners = corners + equations.u.x.array.reshape(-1, d)[domain.cell_nodes]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gradients = barycentric_gradients(corners)
-        spread = np.einsum("nai,naj->nij", gradients, gradients)
-    flat = ~np.isfinite(spread).all(axis=(1, 2))
-    spread[flat] = 0.0  # a cell without volume has forces, but no bound; the others set the step
-    largest, trace = np.linalg.eigvalsh(spread)[:, -1], np.trace(spread, axis1=1, axis2=2)
-    material = equations.material
-    return np.asarray((d + 1) / material.density * (2 * material.mu * largest + material.lmbda * trace))
 
 
 def stable_step(highest: float, equations: Equilibrium) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
-from .degrade import Chi, Degradation, Projection
+from .degrade import make_degradation
 from .domain import Domain
 from .edge_stress import carried_by, edge_vectors, frobenius_norm, normal_stress
 from .equilibrium import Equilibrium
@@ -52,7 +52,7 @@ class FracturePass:
         stress = symmetric_components(cauchy_stress(energy, F, rotation))
         both = ufl.as_vector([*stress, energy.psi(F, rotation)])  # one kernel: F is worked out once
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
-        self.degradation: Degradation = (Chi if equations.chi is not None else Projection)(equations, self.graph)
+        self.degradation = make_degradation(equations, self.graph)
         self._average = _average(domain, fracture)
         self.passes = fracture.passes
         self._most = None if fracture.cap is None else math.ceil(fracture.cap * self.graph.index_map.size_global)

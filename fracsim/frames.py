@@ -74,8 +74,8 @@ class Frames:
                 self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
             )
         values = self._compiled[name]()
-        if self._equations.chi is not None and name != "strain":
-            values *= self._equations.chi.x.array[: self._domain.cell_count, None]
+        if (chi := self._equations.factor) is not None and name != "strain":
+            values *= chi.x.array[: self._domain.cell_count, None]
         return np.nan_to_num(values)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from dolfinx.jit import get_options
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
@@ -32,12 +35,43 @@ def jit_options() -> dict[str, Any]:
     except (OSError, StopIteration):
         cpu = os.uname().machine
     tag = hashlib.sha256(cpu.encode()).hexdigest()[:8]
-    return {"cffi_extra_compile_args": ["-O3", "-march=native", f"-DFRACSIM_CPU=0x{tag}"]}
+    # cffi asks for -std=c17, which forbids fused multiply-add; without it GCC 14 has been seen not to end on a tangent
+    flags = ["-O3", "-march=native", "-ffp-contract=fast", "-g0", f"-DFRACSIM_CPU=0x{tag}"]
+    return {"cffi_extra_compile_args": flags, "timeout": PATIENCE}
+
+
+PATIENCE = 60  # s that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine
 
 
 def compile_form(form: ufl.Form) -> fem.Form:
     """Compile a UFL form (collective)."""
-    return fem.form(form, jit_options=jit_options())
+    return persistently(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
+
+
+def persistently[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
+    """Compile; where an earlier process was killed while it compiled the same kernel, clear that away and do it again.
+
+    FFCx takes what such a process left for a compilation that is still under way (collective).
+    """
+    try:
+        return compile_kernel()
+    except (RuntimeError, TimeoutError) as error:
+        mended = comm.bcast("JIT compilation timed out" in str(error) and _clear_abandoned())
+        if not mended:
+            raise
+        return compile_kernel()
+
+
+def _clear_abandoned() -> bool:
+    """Remove kernels that have been compiling for longer than anyone waits; whether there were any."""
+    folder = Path(get_options()["cache_dir"])
+    abandoned = [
+        path for path in folder.glob("libffcx_*.c")
+        if not path.with_suffix(".c.cached").exists() and time.time() - path.stat().st_mtime > PATIENCE - 1
+    ]  # fmt: skip
+    for path in abandoned:
+        path.unlink(missing_ok=True)
+    return bool(abandoned)
 
 
 class CellExpression:
@@ -47,7 +81,10 @@ class CellExpression:
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
-        self._compiled = fem.Expression(expression, _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options())
+        self._compiled = persistently(
+            comm,
+            lambda: fem.Expression(expression, _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()),
+        )
         self._all = np.arange(cells, dtype=np.int32)
         self._values: npt.NDArray[np.float64] | None = None
 

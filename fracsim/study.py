@@ -161,6 +161,7 @@ class Fracture(Table):
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+    unilateral: Flag = False  # a broken edge shorter than at rest carries pressure: cracks close
     passes: Annotated[int, Field(ge=1, strict=True)] = 1  # solve and break again within a step until nothing new breaks
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     heterogeneity: Heterogeneity | None = None

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from fracsim.explicit import ExplicitStepper, cell_frequencies
+from fracsim.explicit import ExplicitStepper
 from fracsim.forms.energies import lame
+from fracsim.frequencies import cell_frequencies
 from fracsim.scene import Scene
 from fracsim.state import State
 from support.reference import lumped_mass, modes, stiffness

@@ -137,7 +137,8 @@ def test_every_default_is_written() -> None:
         "beta": 0.25, "gamma": 0.5, "rho": 0.8
     }  # fmt: skip
     assert data["fracture"] == {
-        "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6, "passes": 1
+        "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6,
+            "unilateral": False, "passes": 1,
     }  # fmt: skip
     assert data["mesh"]["pattern"] == "structured"
     assert data["material"]["plane"] == "strain"

@@ -171,6 +171,15 @@ RUNS: dict[str, dict[str, Any]] = {
         "time": {"scheme": "quasi-static", "step": 0.125, "end": 1.0},
         "probe": [{"name": "grip", "on": "right"}],
     },
+    # torn, then pushed together again
+    "closing": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
+            "time": [0.0, 0.7, 1.4], "value": [[0.0, 0.0], [0.3, 0.05], [-0.05, 0.0]]}}],
+        "fracture": {"strength": 0.2, "radius": 0.1, "unilateral": True},
+        "time": {"scheme": "generalized-alpha", "step": 0.025, "end": 1.4},
+        "probe": [{"name": "grip", "on": "right"}],
+    },
 }  # fmt: skip
 
 

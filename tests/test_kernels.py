@@ -1,0 +1,41 @@
+"""Kernels: what a killed compilation leaves behind does not stop later runs."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ufl
+from dolfinx import fem, mesh
+from dolfinx.jit import get_options
+from mpi4py import MPI
+
+from fracsim import kernels
+
+
+def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A C file without its library, as a killed process leaves it, older than anyone waits."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    options: dict[str, Any] = {"cache_dir": tmp_path / "fenics"}
+    monkeypatch.setattr(kernels, "get_options", lambda: get_options(options))
+    monkeypatch.setattr(kernels, "jit_options", lambda: options | {"timeout": 1})
+    square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
+    form = fem.Constant(square, 3.14159) * ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx
+    kernels.compile_form(form)
+    for path in (tmp_path / "fenics").iterdir():
+        if path.suffix == ".c":
+            os.utime(path, (0, time.time() - 2 * kernels.PATIENCE))
+        else:
+            path.unlink()
+    assert fem.assemble_scalar(kernels.compile_form(form)) == pytest.approx(3.14159 / 4)
+
+
+def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A young C file belongs to a process that compiles."""
+    monkeypatch.setattr(kernels, "get_options", lambda: {"cache_dir": tmp_path})
+    (tmp_path / "libffcx_forms_0.c").touch()
+    assert not kernels._clear_abandoned()
+    assert (tmp_path / "libffcx_forms_0.c").exists()
