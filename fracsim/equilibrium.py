@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from .domain import Domain
 from .forms.balance import elastic_energy, internal_work, pressure_work, traction_work, viscous_work
 from .forms.energies import Energy
+from .forms.kinematics import deformation_gradient
 from .forms.schemes import Scheme
 from .kernels import compile_form
 from .loads import Forces, Motion
@@ -56,7 +57,7 @@ class Equilibrium:
         self.chi = self._whole_cells("chi", 1) if approach == "chi" else None
         self.integrity: fem.Function | None = None
         self.energy: Energy = self._projected() if approach == "edge" else material.energy
-        self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
+        self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
         self.damping = study.damping
         self.u_n: Any = None
         self.u_v: Any = None
@@ -95,20 +96,40 @@ class Equilibrium:
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
         chi = self._stiffness_factor()
         rotation = self.rotation.field if self.rotation is not None else None
-        residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
-        self._internal_form = compile_form(residual)
+        internal = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
+        relaxed = self._relaxed(w, dx, chi)
+        self._internal_form = compile_form(internal + relaxed)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
         viscous, pressure = self._viscous(w, dx, chi), self._pressure(w)
         self._viscous_form = compile_form(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
-        residual = residual + viscous + pressure
-        self._residual = compile_form(residual)
+        residual = internal + viscous + pressure
+        self._residual = compile_form(residual + relaxed)
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
         at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
-        self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
+        at_supports += self._relaxed(w, near, chi) + self._viscous(w, near, chi) + pressure
+        self._reactions = compile_form(at_supports)
         if self.scheme.implicit:
-            self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
+            v = ufl.TrialFunction(domain.space)
+            self._tangent = compile_form(ufl.derivative(residual, self.u, v) + self._relaxed(w, dx, chi, v))
         self._dead = self._dead_loads(w, dx)
+
+    def _elastic_part(self) -> Any:
+        """What the energy takes of F: all of it, or what plastic flow left (d x d)."""
+        F = deformation_gradient(self.u)
+        if self.material.plastic is None:
+            return F
+        part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
+        return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
+
+    def _relaxed(self, w: Any, dx: ufl.Measure, chi: Any, v: Any = None) -> ufl.Form | int:
+        """What flow within the step takes off the forces; with `v`: its derivative in that direction."""
+        if self.material.plastic is None:
+            return 0
+        relaxation, rotation = self.material.plastic.relaxation, self.rotation.field if self.rotation else None
+        if v is None:
+            return relaxation.work(self.u, w, dx, chi=chi, rotation=rotation)
+        return relaxation.tangent(self.u, v, w, dx, chi=chi, rotation=rotation)
 
     def _stiffness_factor(self) -> Any:
         """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
@@ -178,6 +199,8 @@ class Equilibrium:
         """Set the end time, the loads and the scheme's references; `start`, v, a are the owned state at t - dt."""
         self.c_a, self.c_v = self.scheme.rates(dt)
         late = self.scheme.alpha_f
+        if self.material.plastic is not None:
+            self.material.plastic.begin((1 - late) * dt)
         held = (1 - late) * self.motion.at(t) + late * self.motion.at(t - dt)
         self._refer(t - late * dt, held, start, *self.scheme.references(dt, start, v, a))
 

@@ -49,6 +49,8 @@ class ExplicitStepper(Stepper):
         half[held] = (u[held] - state.u[held]) / dt
         equations.c_a, equations.c_v = equations.scheme.rates(dt)
         equations.hold(state.t + dt, u, half)
+        if self.flow is not None:
+            self.flow.begin(dt)
         unbalanced = equations.forces_in_balance()
         drag = equations.damping.mass if equations.damping is not None else 0.0
         # mass damping at the velocity of the end, not of half-way: second order

@@ -1,0 +1,192 @@
+"""Plastic flow at the end of a step: the elastic stretches of cells past yield flow back to the yield surface.
+
+With F_e = U Sigma V^T and the logarithmic deviator e = V dev(log Sigma) V^T of the elastic stretch a cell flows by
+
+    F_p <- exp(beta e) F_p,    exp(beta e) = V (det(Sigma)^(-1/3) Sigma)^beta V^T,
+
+which leaves F_e <- F_e exp(-beta e) and det F_p = 1. M22 eq. 30 prints the factors the other way round; but V belongs to
+the configuration between F_p and F_e, and only in this order do the stretches of F_e shrink along their own axes. The
+accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the root of
+
+    q(beta) - Y(alpha + beta sqrt(2/3) |e|) = (1 - share) (q(0) - Y(alpha)),    share = 1 - exp(-nu dt),
+
+q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) where
+the body is held, however it is cut into steps, and is gone at once for nu -> infinity. Eq. 31 is the first guess of the
+root without hardening (and with fraction nu for share, which would not know of dt).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from .domain import Domain
+from .forms.energies import von_mises
+from .forms.kinematics import deformation_gradient, symmetric_components
+from .forms.plasticity import Plastic, Relaxation, kirchhoff_stress
+from .kernels import CellExpression
+from .material import MaterialFields, PerCell, per_cell
+from .spectrum import deviatoric_power, eigenvalues, times
+from .study import Study
+
+if TYPE_CHECKING:
+    from .equilibrium import Equilibrium
+
+Values = npt.NDArray[np.float64]
+Cells = npt.NDArray[np.int32]
+
+WEAKEST = 0.01  # share of the yield stress that softening leaves
+CLOSE = 1e-9  # of the yield stress: how near the root is found
+ITERATIONS = 12  # of the secant; three do for small elastic strains
+BLOCK = 16384  # cells at a time: their arrays stay in the cache
+
+
+class Plasticity:
+    """What the cells remember of their flow.
+
+    Attributes:
+        inverse: F_p^-1, DG0, 3 x 3.
+        strain: (cells,) accumulated plastic strain alpha.
+        relaxation: what flow takes off the stress while a step is solved.
+        share: of the return to the yield surface that the step at hand makes; 0 between steps.
+    """
+
+    def __init__(self, domain: Domain, study: Study, material: MaterialFields) -> None:
+        table = study.plasticity
+        assert table is not None
+        self.rate, self.hardening, self.frobenius = table.flow_rate, table.hardening, table.measure == "frobenius"
+        self._yield: PerCell = per_cell(domain, table, "yield_stress", study.material.regions)
+        self._modulus: PerCell = 3 * material.mu
+        self.strain = np.zeros(domain.cell_count)
+        self.inverse = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (3, 3))), name="inverse plastic part")
+        self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
+        self._resistance, self._softness = fem.Function(domain.cell_scalar), fem.Function(domain.cell_scalar)
+        self.share = fem.Constant(domain.mesh, np.float64(0.0))
+        self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
+        self.relaxation = Relaxation(self.energy, self._resistance, self._softness, self.share, self.frobenius)
+        self.refresh()
+
+    def resistance(self, strain: Values, cells: Cells | slice = slice(None)) -> Values:
+        """Y = yield_stress + K alpha of cells with the given alpha, Pa; never below a small share of yield_stress."""
+        start = self._yield[cells] if isinstance(self._yield, np.ndarray) else self._yield
+        return np.maximum(start + self.hardening * strain, WEAKEST * start)
+
+    def refresh(self) -> None:
+        """The fields that belong to `strain`."""
+        Y, count = self.resistance(self.strain), len(self.strain)
+        self._resistance.x.array[:count] = Y
+        stays = Y <= self.resistance(np.full(count, np.inf)) if self.hardening < 0 else np.zeros(count, bool)
+        self._softness.x.array[:count] = 1 / (1 + np.where(stays, 0.0, self.hardening / self._modulus))
+
+    def begin(self, dt: float) -> None:
+        """A step of dt is to be solved."""
+        self.share.value = -np.expm1(-self.rate * dt)
+
+
+def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
+    """F_p^-1; in plane strain with the zeros written out, so that no kernel multiplies by them."""
+    if dim == 3:
+        return inverse
+    return ufl.as_tensor([[inverse[0, 0], inverse[0, 1], 0], [inverse[1, 0], inverse[1, 1], 0], [0, 0, inverse[2, 2]]])
+
+
+def plastic_material(domain: Domain, study: Study, material: MaterialFields) -> MaterialFields:
+    """The material with an energy of the elastic part of F, and with what its cells remember."""
+    plastic = Plasticity(domain, study, material)
+    return replace(material, energy=plastic.energy, plastic=plastic)
+
+
+class Flow:
+    """The flow of a step, once its displacement is known."""
+
+    def __init__(self, equations: Equilibrium) -> None:
+        plastic = equations.material.plastic
+        assert plastic is not None
+        self.plastic: Plasticity = plastic
+        self._equations, domain = equations, equations.domain
+        self._inverse: Values = plastic.inverse.x.array.reshape(-1, 9)
+        F = deformation_gradient(equations.u)
+        rotation = equations.rotation.field if equations.rotation is not None else None
+        sigma, part = kirchhoff_stress(plastic.energy, F, rotation) / abs(ufl.det(F)), plastic.energy.elastic_part(F)
+        of = (domain.comm, domain.mesh)
+        self._stress = CellExpression(*of, ufl.as_vector([von_mises(sigma), ufl.tr(sigma) / 3]), domain.cell_count)
+        self._stretch = CellExpression(*of, symmetric_components(part.T * part), domain.cell_count)
+        self._before: tuple[Cells, Values, Values] | None = None
+
+    def begin(self, dt: float) -> None:
+        """The flow to come is that of a step of dt."""
+        self.plastic.begin(dt)
+
+    def __call__(self) -> float:
+        """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
+        plastic = self.plastic
+        measure, Y = self._measured(self._stress()), plastic.resistance(plastic.strain)
+        cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
+        self._before = cells, self._inverse[cells], plastic.strain[cells]
+        lost = 0.0
+        if plastic.share.value > 0:
+            lost = sum(self._flow(cells[k : k + BLOCK], measure) for k in range(0, len(cells), BLOCK))
+        plastic.share.value = 0.0
+        if len(cells) and plastic.hardening:
+            plastic.refresh()
+        return lost
+
+    def undo(self) -> None:
+        """Take the last flow back: the step will be solved again."""
+        assert self._before is not None
+        cells, inverse, strain = self._before
+        self._inverse[cells], self.plastic.strain[cells] = inverse, strain
+        self.plastic.refresh()
+
+    def _measured(self, stress: Values) -> Values:
+        """What is compared with Y, from (n, 2) von Mises and mean stress: |sigma|^2 = 2/3 q^2 + 3 p^2."""
+        vm, p = stress.T
+        return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
+
+    def _flow(self, cells: Cells, measure: Values) -> float:
+        """Energy lost by a block of cells past yield, J."""
+        plastic, alpha = self.plastic, self.plastic.strain[cells]
+        C = np.ascontiguousarray(self._stretch(cells).T)
+        values = eigenvalues(C)
+        logs = np.log(values)
+        logs -= logs.mean(axis=0)
+        size = np.sqrt(np.sum(logs**2, axis=0) / 6)  # sqrt(2/3) |e| of e = logs / 2
+        beta, vm = self._root(cells, measure[cells], C, values, logs, size)
+        plastic.strain[cells] = alpha + beta * size
+        # power is vm times d alpha; vm has grown by hardening since the start of the step
+        mean = vm - (plastic.resistance(plastic.strain[cells], cells) - plastic.resistance(alpha, cells)) / 2
+        volume = self._equations.domain.volumes[cells] * np.sqrt(np.prod(values, axis=0))
+        chi = 1.0 if self._equations.chi is None else self._equations.chi.x.array[cells]
+        return float(np.sum(chi * volume * mean * beta * size))
+
+    def _root(
+        self, cells: Cells, measure: Values, C: Values, values: Values, logs: Values, size: Values
+    ) -> tuple[Values, Values]:
+        """(beta, von Mises stress after it) by the secant from beta = 0 and the root for a stress linear in beta.
+
+        The cells are left with their F_p of that beta. A beta of 1 has no deviator left to relax: the Frobenius norm of
+        a large pressure may stay above yield.
+        """
+        plastic, start = self.plastic, np.ascontiguousarray(self._inverse[cells].T)
+        alpha, share = plastic.strain[cells], float(plastic.share.value)
+        Y = plastic.resistance(alpha, cells)
+        excess = measure - Y
+        before, g_before = np.zeros(len(cells)), share * excess
+        beta = np.clip(share * excess / (measure + np.maximum(plastic.hardening, 0.0) * size), 0.0, 1.0)
+        for _ in range(ITERATIONS):
+            power = deviatoric_power(C, values, logs, -beta / 2)
+            self._inverse[cells] = times(start, power).T
+            stress = self._stress(cells)
+            g = self._measured(stress) - plastic.resistance(alpha + beta * size, cells) - (1 - share) * excess
+            wrong = (np.abs(g) > CLOSE * Y) & ((beta < 1) | (g < 0)) & (g != g_before)
+            if not wrong.any():
+                break
+            step = np.divide(g * (beta - before), g - g_before, out=np.zeros_like(g), where=wrong)
+            before, g_before, beta = beta, g, np.clip(beta - step, 0.0, 1.0)
+        return beta, stress[:, 0]
+
