@@ -2,12 +2,13 @@
 within a step takes off the stress.
 
 F_p is 3 x 3 in 2D as well: under plane strain (F33 = 1) a body flows across the plane too. At the end of a step the
-elastic stretches flow back along their deviator (eq. 30, fracsim.plasticity). In equilibrium with the stress that this
-leaves, not with the trial stress before it, the step solves
+elastic stretches flow back along their deviator (eq. 30, fracsim.plasticity). What balances in the step is the stress
+that this leaves, not the trial stress before it:
 
     tau = tau_t - beta s,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
 
-s = dev tau_t of the trial stress (F_p of the start of the step). share is 1 - exp(-nu dt) of the flow rate nu, softness
+s = dev tau_t of the trial stress (F_p of the start of the step). With share = 0 (staggered) the trial stress balances,
+and the force of a yielding bar is too high by 3 mu times the strain of a step. share is 1 - exp(-nu dt) of the flow rate nu, softness
 1 / (1 + K / (3 mu)) what hardening by K leaves of the return (Simo and Hughes 1998, box 3.1). The norms |s|, Y_s are of
 Cauchy stress.
 """
@@ -67,15 +68,32 @@ class Plastic:
         return 1.0
 
 
-def kirchhoff_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
-    """tau = P F^T in Pa, 3 x 3, of a body in 3D or plane strain."""
-    solid = ufl.variable(embed(F, 1.0))
-    return ufl.diff(energy.psi(solid, embed(rotation, 1.0) if rotation is not None else None), solid) * solid.T
+class Trial:
+    """Stress of the elastic part of a deformation, before any flow.
+
+    Attributes:
+        part: F_e.    P: d psi / d F_e, Pa.    pull: F_e^-T.
+        mean: tr tau / 3, Pa.    s: s F_e^-T of the deviator s = dev tau, Pa.    size: |s|, Pa.    J: det F_e = det F.
+    """
+
+    def __init__(self, energy: Plastic, u: Expr, rotation: Expr | None) -> None:
+        self.part = energy.elastic_part(deformation_gradient(u))
+        solid = ufl.variable(self.part)
+        self.P = ufl.diff(energy.elastic.psi(solid, embed(rotation, 1.0) if rotation is not None else None), solid)
+        self.J, self.pull = ufl.det(self.part), ufl.inv(self.part).T
+        tau = self.P * self.part.T
+        self.mean, deviator = ufl.tr(tau) / 3, ufl.dev(tau)
+        self.s = self.P - self.mean * self.pull
+        self.size = ufl.sqrt(ufl.inner(deviator, deviator))
+
+    def measures(self) -> Expr:
+        """(von Mises, mean) of the Cauchy stress, Pa."""
+        return ufl.as_vector([ufl.sqrt(1.5) * self.size / abs(self.J), self.mean / self.J])
 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """What flow within the step takes off the stress.
+    """Virtual work and tangent with flow within the step.
 
     Attributes:
         resistance: Y, the yield stress as it is now, Pa.
@@ -91,45 +109,40 @@ class Relaxation:
     frobenius: bool
 
     def work(self, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """-int chi beta s : grad w F^-1 dX in N m, to be added to the virtual work of the trial stress."""
-        s, part, _ = self._trial(u, rotation)
-        return -chi * part * ufl.inner(s, _rate(w, u)) * dx(metadata=ONE_POINT)
+        """int chi (tau_t - beta s) : grad w F^-1 dX in N m; grad w F_p^-1 is the variation of F_e."""
+        trial = Trial(self.energy, u, rotation)
+        return chi * ufl.inner(trial.P - self._flow(trial)[0] * trial.s, self._part(w)) * dx(metadata=ONE_POINT)
 
     def tangent(self, u: Expr, v: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """Its derivative in direction v for small elastic strains, in which d tau_t = C : d and d = sym(grad v F^-1):
+        """Its derivative in direction v, for d tau_t = C : d with C = 2 mu dev + kappa I x I at small elastic strain:
 
-            -int chi 2 mu (beta dev d(v) : d(w) + share softness Y_s/|s| (n : d(v)) (n : d(w))) dX,    n = s / |s|.
+            int chi [(1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)
+                     - 2 mu share softness Y_s/|s| (n : d(v)) (n : d(w))] dX,    n = s / |s|,  d(v) = grad v F^-1.
 
         Symmetric. What it leaves out is smaller by the elastic strain: Newton converges a little less than quadratically.
         """
-        s, part, turning = self._trial(u, rotation)
-        d_v, d_w = (ufl.sym(_rate(field, u)) for field in (v, w))
-        along = ufl.inner(s, d_v) * ufl.inner(s, d_w)
-        both = part * ufl.inner(ufl.dev(d_v), d_w) + turning * along
-        return -2 * chi * self.energy.mu * both * dx(metadata=ONE_POINT)
+        trial, energy = Trial(self.energy, u, rotation), self.energy
+        (beta, turning), (of_v, of_w) = self._flow(trial), (self._part(field) for field in (v, w))
+        elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
+        kappa = energy.lmbda + 2 / 3 * energy.mu
+        volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.pull, trial.s))
+        total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes
+        return chi * total * dx(metadata=ONE_POINT)
 
-    def _trial(self, u: Expr, rotation: Expr | None) -> tuple[Expr, Expr, Expr]:
-        """(s, beta, share softness Y_s/|s|^3), the last with the norm of tau twice: for s in place of n."""
-        F = deformation_gradient(u)
-        tau, J = kirchhoff_stress(self.energy, F, rotation), ufl.det(F)
-        s = ufl.dev(tau)
-        square = ufl.inner(s, s)
-        size, limit = ufl.sqrt(square) / abs(J), deviator_limit(self.resistance, ufl.tr(tau) / (3 * J), self.frobenius)
-        whole, flows = self.share * self.softness, ufl.gt(size, limit)
-        return (
-            s,
-            ufl.conditional(flows, whole * (1 - limit / size), 0.0),
-            ufl.conditional(flows, whole * limit / (size * square), 0.0),
-        )
+    def _part(self, field: Expr) -> Expr:
+        """grad field F_p^-1, 3 x 3."""
+        return embed(ufl.grad(field), 0.0) * self.energy.inverse
+
+    def _flow(self, trial: Trial) -> tuple[Expr, Expr]:
+        """(beta, share softness Y_s/|s|^3), the second for s in place of n."""
+        limit = abs(trial.J) * deviator_limit(self.resistance, trial.mean / trial.J, self.frobenius)
+        whole, flows, ratio = self.share * self.softness, ufl.gt(trial.size, limit), limit / trial.size
+        beta = ufl.conditional(flows, whole * (1 - ratio), 0.0)
+        return beta, ufl.conditional(flows, whole * ratio / trial.size**2, 0.0)
 
 
-def deviator_limit(resistance: Expr, pressure: Expr, frobenius: bool) -> Expr:
+def deviator_limit(resistance: Expr, mean: Expr, frobenius: bool) -> Expr:
     """Y_s, the norm of the deviator at yield: sqrt(2/3) Y, or sqrt(Y^2 - 3 p^2), p = tr sigma / 3."""
     if not frobenius:
         return ufl.sqrt(2 / 3) * resistance
-    return ufl.sqrt(ufl.max_value(resistance**2 - 3 * pressure**2, 0.0))
-
-
-def _rate(field: Expr, u: Expr) -> Expr:
-    """grad field F^-1, 3 x 3: the gradient along the current coordinates."""
-    return embed(ufl.grad(field) * ufl.inv(deformation_gradient(u)), 0.0)
+    return ufl.sqrt(ufl.max_value(resistance**2 - 3 * mean**2, 0.0))

@@ -164,6 +164,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     yield f"material    {study.material.energy}{plane}{regions}"
     yield f"fracture    {_fracture(study)}"
+    yield f"plasticity  {_plasticity(study)}"
     yield f"damping     {_damping(study)}"
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
@@ -182,6 +183,17 @@ def _fracture(study: Study) -> str:
     fracture = study.fracture
     average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
     return f"degraded energy ({fracture.approach}), strength {fracture.strength:g} Pa, {average}"
+
+
+def _plasticity(study: Study) -> str:
+    if study.plasticity is None:
+        return "off: no plastic strain, no flow"
+    table = study.plasticity
+    rate = "independent of the rate" if np.isinf(table.flow_rate) else f"flow rate {table.flow_rate:g} 1/s"
+    return (
+        f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
+        f"hardening {table.hardening:g} Pa, {table.update}"
+    )
 
 
 def _damping(study: Study) -> str:

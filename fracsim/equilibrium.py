@@ -96,22 +96,19 @@ class Equilibrium:
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
         chi = self._stiffness_factor()
         rotation = self.rotation.field if self.rotation is not None else None
-        internal = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
-        relaxed = self._relaxed(w, dx, chi)
-        self._internal_form = compile_form(internal + relaxed)
+        internal = self._internal(w, dx, chi)
+        self._internal_form = compile_form(internal)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
         viscous, pressure = self._viscous(w, dx, chi), self._pressure(w)
         self._viscous_form = compile_form(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
-        residual = internal + viscous + pressure
-        self._residual = compile_form(residual + relaxed)
+        others = viscous + pressure
+        self._residual = compile_form(internal + others)
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
-        at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
-        at_supports += self._relaxed(w, near, chi) + self._viscous(w, near, chi) + pressure
-        self._reactions = compile_form(at_supports)
+        at_supports = self._internal(w, near, chi)
+        self._reactions = compile_form(at_supports + self._viscous(w, near, chi) + pressure)
         if self.scheme.implicit:
-            v = ufl.TrialFunction(domain.space)
-            self._tangent = compile_form(ufl.derivative(residual, self.u, v) + self._relaxed(w, dx, chi, v))
+            self._tangent = compile_form(self._stiffness(internal, others, w, dx, chi))
         self._dead = self._dead_loads(w, dx)
 
     def _elastic_part(self) -> Any:
@@ -122,14 +119,21 @@ class Equilibrium:
         part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
         return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
 
-    def _relaxed(self, w: Any, dx: ufl.Measure, chi: Any, v: Any = None) -> ufl.Form | int:
-        """What flow within the step takes off the forces; with `v`: its derivative in that direction."""
+    def _internal(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form:
+        """Virtual work of the stress, as flow within the step leaves it."""
+        rotation = self.rotation.field if self.rotation is not None else None
         if self.material.plastic is None:
-            return 0
-        relaxation, rotation = self.material.plastic.relaxation, self.rotation.field if self.rotation else None
-        if v is None:
-            return relaxation.work(self.u, w, dx, chi=chi, rotation=rotation)
-        return relaxation.tangent(self.u, v, w, dx, chi=chi, rotation=rotation)
+            return internal_work(self.energy, self.u, w, dx, chi=chi, rotation=rotation)
+        return self.material.plastic.relaxation.work(self.u, w, dx, chi=chi, rotation=rotation)
+
+    def _stiffness(self, internal: ufl.Form, others: Any, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form:
+        """Derivative of the forces in the direction of the trial function."""
+        v = ufl.TrialFunction(self.domain.space)
+        if self.material.plastic is None:
+            return ufl.derivative(internal + others, self.u, v)
+        rotation = self.rotation.field if self.rotation is not None else None
+        tangent = self.material.plastic.relaxation.tangent(self.u, v, w, dx, chi=chi, rotation=rotation)
+        return tangent + (ufl.derivative(others, self.u, v) if others else 0)
 
     def _stiffness_factor(self) -> Any:
         """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""

@@ -8,17 +8,18 @@ which leaves F_e <- F_e exp(-beta e) and det F_p = 1. M22 eq. 30 prints the fact
 the configuration between F_p and F_e, and only in this order do the stretches of F_e shrink along their own axes. The
 accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the root of
 
-    q(beta) - Y(alpha + beta sqrt(2/3) |e|) = (1 - share) (q(0) - Y(alpha)),    share = 1 - exp(-nu dt),
+    q(beta) - Y(alpha + beta sqrt(2/3) |e|) = exp(-nu dt) (q(0) - Y(alpha)),
 
 q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) where
 the body is held, however it is cut into steps, and is gone at once for nu -> infinity. Eq. 31 is the first guess of the
-root without hardening (and with fraction nu for share, which would not know of dt).
+root without hardening (with nu for 1 - exp(-nu dt), so that halving the step would double the flow).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +27,8 @@ import ufl
 from dolfinx import fem
 
 from .domain import Domain
-from .forms.energies import von_mises
-from .forms.kinematics import deformation_gradient, symmetric_components
-from .forms.plasticity import Plastic, Relaxation, kirchhoff_stress
+from .forms.kinematics import symmetric_components
+from .forms.plasticity import Plastic, Relaxation, Trial
 from .kernels import CellExpression
 from .material import MaterialFields, PerCell, per_cell
 from .spectrum import deviatoric_power, eigenvalues, times
@@ -41,7 +41,7 @@ Values = npt.NDArray[np.float64]
 Cells = npt.NDArray[np.int32]
 
 WEAKEST = 0.01  # share of the yield stress that softening leaves
-CLOSE = 1e-9  # of the yield stress: how near the root is found
+CLOSE = 1e-6  # of the stress: how near the root is found
 ITERATIONS = 12  # of the secant; three do for small elastic strains
 BLOCK = 16384  # cells at a time: their arrays stay in the cache
 
@@ -53,13 +53,15 @@ class Plasticity:
         inverse: F_p^-1, DG0, 3 x 3.
         strain: (cells,) accumulated plastic strain alpha.
         relaxation: what flow takes off the stress while a step is solved.
-        share: of the return to the yield surface that the step at hand makes; 0 between steps.
+        fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
+        share: the same where the step is solved with its flow; 0 where flow only follows it.
     """
 
     def __init__(self, domain: Domain, study: Study, material: MaterialFields) -> None:
         table = study.plasticity
         assert table is not None
         self.rate, self.hardening, self.frobenius = table.flow_rate, table.hardening, table.measure == "frobenius"
+        self._implicit, self.fraction = table.update == "implicit", 0.0
         self._yield: PerCell = per_cell(domain, table, "yield_stress", study.material.regions)
         self._modulus: PerCell = 3 * material.mu
         self.strain = np.zeros(domain.cell_count)
@@ -83,9 +85,20 @@ class Plasticity:
         stays = Y <= self.resistance(np.full(count, np.inf)) if self.hardening < 0 else np.zeros(count, bool)
         self._softness.x.array[:count] = 1 / (1 + np.where(stays, 0.0, self.hardening / self._modulus))
 
+    def memory(self) -> Values:
+        """(cells, 10) F_p^-1 and alpha, for a checkpoint."""
+        return np.column_stack([self.inverse.x.array.reshape(-1, 9)[: len(self.strain)], self.strain])
+
+    def restore(self, memory: Values) -> None:
+        """Take up what `memory` gave."""
+        self.inverse.x.array.reshape(-1, 9)[: len(memory)] = memory[:, :-1]
+        self.strain[:] = memory[:, -1]
+        self.refresh()
+
     def begin(self, dt: float) -> None:
-        """A step of dt is to be solved."""
-        self.share.value = -np.expm1(-self.rate * dt)
+        """A step of dt is to be solved; with 0: it is done."""
+        self.fraction = -math.expm1(-self.rate * dt) if dt else 0.0
+        self.share.value = self.fraction if self._implicit else 0.0
 
 
 def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
@@ -110,12 +123,10 @@ class Flow:
         self.plastic: Plasticity = plastic
         self._equations, domain = equations, equations.domain
         self._inverse: Values = plastic.inverse.x.array.reshape(-1, 9)
-        F = deformation_gradient(equations.u)
         rotation = equations.rotation.field if equations.rotation is not None else None
-        sigma, part = kirchhoff_stress(plastic.energy, F, rotation) / abs(ufl.det(F)), plastic.energy.elastic_part(F)
-        of = (domain.comm, domain.mesh)
-        self._stress = CellExpression(*of, ufl.as_vector([von_mises(sigma), ufl.tr(sigma) / 3]), domain.cell_count)
-        self._stretch = CellExpression(*of, symmetric_components(part.T * part), domain.cell_count)
+        trial, of = Trial(plastic.energy, equations.u, rotation), (domain.comm, domain.mesh)
+        self._stress = CellExpression(*of, trial.measures(), domain.cell_count)
+        self._stretch = CellExpression(*of, symmetric_components(trial.part.T * trial.part), domain.cell_count)
         self._before: tuple[Cells, Values, Values] | None = None
 
     def begin(self, dt: float) -> None:
@@ -129,9 +140,9 @@ class Flow:
         cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
         self._before = cells, self._inverse[cells], plastic.strain[cells]
         lost = 0.0
-        if plastic.share.value > 0:
+        if plastic.fraction > 0:
             lost = sum(self._flow(cells[k : k + BLOCK], measure) for k in range(0, len(cells), BLOCK))
-        plastic.share.value = 0.0
+        plastic.begin(0.0)
         if len(cells) and plastic.hardening:
             plastic.refresh()
         return lost
@@ -173,20 +184,23 @@ class Flow:
         a large pressure may stay above yield.
         """
         plastic, start = self.plastic, np.ascontiguousarray(self._inverse[cells].T)
-        alpha, share = plastic.strain[cells], float(plastic.share.value)
-        Y = plastic.resistance(alpha, cells)
-        excess = measure - Y
-        before, g_before = np.zeros(len(cells)), share * excess
+        alpha, share = plastic.strain[cells], plastic.fraction
+        excess = measure - plastic.resistance(alpha, cells)
+        before, g_before, vm = np.zeros(len(cells)), share * excess, np.empty(len(cells))
         beta = np.clip(share * excess / (measure + np.maximum(plastic.hardening, 0.0) * size), 0.0, 1.0)
+        live: Any = slice(None)  # those whose root is not found
         for _ in range(ITERATIONS):
-            power = deviatoric_power(C, values, logs, -beta / 2)
-            self._inverse[cells] = times(start, power).T
-            stress = self._stress(cells)
-            g = self._measured(stress) - plastic.resistance(alpha + beta * size, cells) - (1 - share) * excess
-            wrong = (np.abs(g) > CLOSE * Y) & ((beta < 1) | (g < 0)) & (g != g_before)
-            if not wrong.any():
+            now, where = beta[live], cells[live]
+            power = deviatoric_power(C[:, live], values[:, live], logs[:, live], -now / 2)
+            self._inverse[where] = times(start[:, live], power).T
+            stress = self._stress(where)
+            vm[live] = stress[:, 0]
+            g = self._measured(stress) - plastic.resistance(alpha[live] + now * size[live], where)
+            g -= (1 - share) * excess[live]
+            wrong = (np.abs(g) > CLOSE * measure[live]) & ((now < 1) | (g < 0)) & (g != g_before[live])
+            live, now, g = np.flatnonzero(wrong) if isinstance(live, slice) else live[wrong], now[wrong], g[wrong]
+            if not len(live):
                 break
-            step = np.divide(g * (beta - before), g - g_before, out=np.zeros_like(g), where=wrong)
-            before, g_before, beta = beta, g, np.clip(beta - step, 0.0, 1.0)
-        return beta, stress[:, 0]
-
+            step = g * (now - before[live]) / (g - g_before[live])
+            before[live], g_before[live], beta[live] = now, g, np.clip(now - step, 0.0, 1.0)
+        return beta, vm
