@@ -8,7 +8,8 @@ that this leaves, not the trial stress before it:
     tau = tau_t - beta s,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
 
 s = dev tau_t of the trial stress (F_p of the start of the step). With share = 0 (staggered) the trial stress balances,
-and the force of a yielding bar is too high by 3 mu times the strain of a step. share is 1 - exp(-nu dt) of the flow rate nu, softness
+and the stress of a yielding bar is too high by 3 mu times the strain of a step.
+share is 1 - exp(-nu dt) of the flow rate nu, softness
 1 / (1 + K / (3 mu)) what hardening by K leaves of the return (Simo and Hughes 1998, box 3.1). The norms |s|, Y_s are of
 Cauchy stress.
 """
@@ -119,26 +120,30 @@ class Relaxation:
             int chi [(1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)
                      - 2 mu share softness Y_s/|s| (n : d(v)) (n : d(w))] dX,    n = s / |s|,  d(v) = grad v F^-1.
 
-        Symmetric. What it leaves out is smaller by the elastic strain: Newton converges a little less than quadratically.
+        Symmetric but for the Frobenius norm, whose Y_s falls with the pressure: dY_s = -3 p kappa tr d(v) / Y_s. What
+        is left out is smaller by the elastic strain: Newton converges a little less than quadratically.
         """
         trial, energy = Trial(self.energy, u, rotation), self.energy
-        (beta, turning), (of_v, of_w) = self._flow(trial), (self._part(field) for field in (v, w))
+        (beta, turning, rising), (of_v, of_w) = self._flow(trial), (self._part(field) for field in (v, w))
         elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
         kappa = energy.lmbda + 2 / 3 * energy.mu
         volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.pull, trial.s))
         total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes
+        if self.frobenius:
+            total -= rising * kappa * ufl.inner(trial.pull, of_v) * ufl.inner(trial.s, of_w)
         return chi * total * dx(metadata=ONE_POINT)
 
     def _part(self, field: Expr) -> Expr:
         """grad field F_p^-1, 3 x 3."""
         return embed(ufl.grad(field), 0.0) * self.energy.inverse
 
-    def _flow(self, trial: Trial) -> tuple[Expr, Expr]:
-        """(beta, share softness Y_s/|s|^3), the second for s in place of n."""
+    def _flow(self, trial: Trial) -> tuple[Expr, Expr, Expr]:
+        """(beta, share softness Y_s/|s|^3, share softness 3 p / (Y_s |s|)), norms of tau, s in place of n."""
         limit = abs(trial.J) * deviator_limit(self.resistance, trial.mean / trial.J, self.frobenius)
         whole, flows, ratio = self.share * self.softness, ufl.gt(trial.size, limit), limit / trial.size
         beta = ufl.conditional(flows, whole * (1 - ratio), 0.0)
-        return beta, ufl.conditional(flows, whole * ratio / trial.size**2, 0.0)
+        rising = ufl.conditional(ufl.And(flows, ufl.gt(limit, 0.0)), 3 * whole * trial.mean / (limit * trial.size), 0.0)
+        return beta, ufl.conditional(flows, whole * ratio / trial.size**2, 0.0), rising
 
 
 def deviator_limit(resistance: Expr, mean: Expr, frobenius: bool) -> Expr:

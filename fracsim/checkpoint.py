@@ -101,7 +101,7 @@ def read_checkpoint(
 
 
 def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:
-    """The arrays and the clock; the study can go on with broken edges (`torn_too`), with plastic strain (`bent_too`)."""
+    """The arrays and the clock; the study can go on with broken edges (`torn_too`), plastic strain (`bent_too`)."""
     if not path.exists():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
     try:

@@ -4,8 +4,8 @@ With F_e = U Sigma V^T and the logarithmic deviator e = V dev(log Sigma) V^T of 
 
     F_p <- exp(beta e) F_p,    exp(beta e) = V (det(Sigma)^(-1/3) Sigma)^beta V^T,
 
-which leaves F_e <- F_e exp(-beta e) and det F_p = 1. M22 eq. 30 prints the factors the other way round; but V belongs to
-the configuration between F_p and F_e, and only in this order do the stretches of F_e shrink along their own axes. The
+which leaves F_e <- F_e exp(-beta e) and det F_p = 1. M22 eq. 30 prints the factors the other way round; but V belongs
+to the configuration between F_p and F_e: only in this order do the stretches of F_e shrink along their own axes. The
 accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the root of
 
     q(beta) - Y(alpha + beta sqrt(2/3) |e|) = exp(-nu dt) (q(0) - Y(alpha)),
@@ -81,9 +81,9 @@ class Plasticity:
     def refresh(self) -> None:
         """The fields that belong to `strain`."""
         Y, count = self.resistance(self.strain), len(self.strain)
+        soft = (self.hardening < 0) & (WEAKEST * self._yield >= Y)  # as soft as it gets
         self._resistance.x.array[:count] = Y
-        stays = Y <= self.resistance(np.full(count, np.inf)) if self.hardening < 0 else np.zeros(count, bool)
-        self._softness.x.array[:count] = 1 / (1 + np.where(stays, 0.0, self.hardening / self._modulus))
+        self._softness.x.array[:count] = 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus))
 
     def memory(self) -> Values:
         """(cells, 10) F_p^-1 and alpha, for a checkpoint."""

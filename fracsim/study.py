@@ -175,7 +175,9 @@ class Plasticity(Table):
     measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too
     flow_rate: Annotated[float, Field(gt=0, strict=True)] = float("inf")  # 1/s; inf: independent of the rate
     hardening: Finite = 0.0  # K in Pa: what yield_stress gains with accumulated plastic strain; < 0 softens
-    update: Literal["implicit", "staggered"] = "implicit"  # solve a step with its flow; let flow follow it (small steps)
+    update: Literal["implicit", "staggered"] = (
+        "implicit"  # solve a step with its flow; let flow follow it (small steps)
+    )
 
 
 class Box(Table):
@@ -304,7 +306,18 @@ class Probe(Table):
         return self.record or ("displacement" if self.point is not None else "reaction")
 
 
-FIELDS = ("velocity", "damage", "chi", "piece", "stress", "von_mises", "energy_density", "strain", "region", "plastic_strain")
+FIELDS = (
+    "velocity",
+    "damage",
+    "chi",
+    "piece",
+    "stress",
+    "von_mises",
+    "energy_density",
+    "strain",
+    "region",
+    "plastic_strain",
+)
 FRACTURE_FIELDS = ("damage", "chi", "piece")
 
 
