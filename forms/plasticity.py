@@ -73,14 +73,15 @@ class Trial:
     """Stress of the elastic part of a deformation, before any flow.
 
     Attributes:
-        part: F_e.    P: d psi / d F_e, Pa.    pull: F_e^-T.
+        part: F_e.    psi: J/m^3.    P: d psi / d F_e, Pa.    pull: F_e^-T.
         mean: tr tau / 3, Pa.    s: s F_e^-T of the deviator s = dev tau, Pa.    size: |s|, Pa.    J: det F_e = det F.
     """
 
     def __init__(self, energy: Plastic, u: Expr, rotation: Expr | None) -> None:
         self.part = energy.elastic_part(deformation_gradient(u))
         solid = ufl.variable(self.part)
-        self.P = ufl.diff(energy.elastic.psi(solid, embed(rotation, 1.0) if rotation is not None else None), solid)
+        self.psi = energy.elastic.psi(solid, embed(rotation, 1.0) if rotation is not None else None)
+        self.P = ufl.diff(self.psi, solid)
         self.J, self.pull = ufl.det(self.part), ufl.inv(self.part).T
         tau = self.P * self.part.T
         self.mean, deviator = ufl.tr(tau) / 3, ufl.dev(tau)
@@ -88,8 +89,8 @@ class Trial:
         self.size = ufl.sqrt(ufl.inner(deviator, deviator))
 
     def measures(self) -> Expr:
-        """(von Mises, mean) of the Cauchy stress, Pa."""
-        return ufl.as_vector([ufl.sqrt(1.5) * self.size / abs(self.J), self.mean / self.J])
+        """(von Mises, mean) of the Cauchy stress in Pa, and psi in J/m^3."""
+        return ufl.as_vector([ufl.sqrt(1.5) * self.size / abs(self.J), self.mean / self.J, self.psi])
 
 
 @dataclass(frozen=True)

@@ -135,13 +135,14 @@ class Flow:
 
     def __call__(self) -> float:
         """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
-        plastic = self.plastic
-        measure, Y = self._measured(self._stress()), plastic.resistance(plastic.strain)
+        plastic, trial = self.plastic, self._stress()
+        measure, Y = self._measured(trial), plastic.resistance(plastic.strain)
         cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
         self._before = cells, self._inverse[cells], plastic.strain[cells]
         lost = 0.0
         if plastic.fraction > 0:
-            lost = sum(self._flow(cells[k : k + BLOCK], measure) for k in range(0, len(cells), BLOCK))
+            blocks = [cells[k : k + BLOCK] for k in range(0, len(cells), BLOCK)]
+            lost = sum(self._flow(block, trial[block], measure[block]) for block in blocks)
         plastic.begin(0.0)
         if len(cells) and plastic.hardening:
             plastic.refresh()
@@ -155,11 +156,11 @@ class Flow:
         self.plastic.refresh()
 
     def _measured(self, stress: Values) -> Values:
-        """What is compared with Y, from (n, 2) von Mises and mean stress: |sigma|^2 = 2/3 q^2 + 3 p^2."""
-        vm, p = stress.T
+        """What is compared with Y, from (n, 3) measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
+        vm, p, _ = stress.T
         return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
 
-    def _flow(self, cells: Cells, measure: Values) -> float:
+    def _flow(self, cells: Cells, trial: Values, measure: Values) -> float:
         """Energy lost by a block of cells past yield, J."""
         plastic, alpha = self.plastic, self.plastic.strain[cells]
         C = np.ascontiguousarray(self._stretch(cells).T)
@@ -167,18 +168,20 @@ class Flow:
         logs = np.log(values)
         logs -= logs.mean(axis=0)
         size = np.sqrt(np.sum(logs**2, axis=0) / 6)  # sqrt(2/3) |e| of e = logs / 2
-        beta, vm = self._root(cells, measure[cells], C, values, logs, size)
+        beta, stress = self._root(cells, measure, C, values, logs, size)
         plastic.strain[cells] = alpha + beta * size
-        # power is vm times d alpha; vm has grown by hardening since the start of the step
-        mean = vm - (plastic.resistance(plastic.strain[cells], cells) - plastic.resistance(alpha, cells)) / 2
-        volume = self._equations.domain.volumes[cells] * np.sqrt(np.prod(values, axis=0))
+        gain = plastic.resistance(plastic.strain[cells], cells) - plastic.resistance(alpha, cells)
+        # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
+        (vm, _, psi), (vm_trial, _, psi_trial) = stress.T, trial.T
+        over = np.sqrt(np.prod(values, axis=0)) * (vm_trial - vm) + gain
         chi = 1.0 if self._equations.chi is None else self._equations.chi.x.array[cells]
-        return float(np.sum(chi * volume * mean * beta * size))
+        volumes = self._equations.domain.volumes[cells]
+        return float(np.sum(chi * volumes * (psi_trial - psi - over / 2 * beta * size)))
 
     def _root(
         self, cells: Cells, measure: Values, C: Values, values: Values, logs: Values, size: Values
     ) -> tuple[Values, Values]:
-        """(beta, von Mises stress after it) by the secant from beta = 0 and the root for a stress linear in beta.
+        """(beta, (n, 3) measures after it) by the secant from beta = 0 and the root for a stress linear in beta.
 
         The cells are left with their F_p of that beta. A beta of 1 has no deviator left to relax: the Frobenius norm of
         a large pressure may stay above yield.
@@ -186,7 +189,7 @@ class Flow:
         plastic, start = self.plastic, np.ascontiguousarray(self._inverse[cells].T)
         alpha, share = plastic.strain[cells], plastic.fraction
         excess = measure - plastic.resistance(alpha, cells)
-        before, g_before, vm = np.zeros(len(cells)), share * excess, np.empty(len(cells))
+        before, g_before, after = np.zeros(len(cells)), share * excess, np.empty((len(cells), 3))
         beta = np.clip(share * excess / (measure + np.maximum(plastic.hardening, 0.0) * size), 0.0, 1.0)
         live: Any = slice(None)  # those whose root is not found
         for _ in range(ITERATIONS):
@@ -194,7 +197,7 @@ class Flow:
             power = deviatoric_power(C[:, live], values[:, live], logs[:, live], -now / 2)
             self._inverse[where] = times(start[:, live], power).T
             stress = self._stress(where)
-            vm[live] = stress[:, 0]
+            after[live] = stress
             g = self._measured(stress) - plastic.resistance(alpha[live] + now * size[live], where)
             g -= (1 - share) * excess[live]
             wrong = (np.abs(g) > CLOSE * measure[live]) & ((now < 1) | (g < 0)) & (g != g_before[live])
@@ -203,4 +206,4 @@ class Flow:
                 break
             step = g * (now - before[live]) / (g - g_before[live])
             before[live], g_before[live], beta[live] = now, g, np.clip(now - step, 0.0, 1.0)
-        return beta, vm
+        return beta, after
