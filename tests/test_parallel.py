@@ -178,9 +178,9 @@ def test_same_motion(results: Results, ranks: int, name: str, quantity: str) -> 
 
 @pytest.mark.parametrize("ranks", RANKS[1:])
 def test_same_flow(results: Results, ranks: int) -> None:
-    """F_p and the accumulated plastic strain of every cell, in a body most of which has flowed."""
+    """F_p and the accumulated plastic strain of every cell, some tens of which have flowed (atol: as of the motion)."""
     found, serial = results(ranks)["ductile-plastic"], results(1)["ductile-plastic"]
-    assert np.mean(np.asarray(serial[:, -1], float) > 0.01) > 0.5
+    assert np.count_nonzero(np.asarray(serial[:, -1], float) > 0.01) > 20
     np.testing.assert_allclose(found, serial, atol=1e-6)
 
 

@@ -167,7 +167,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "ductile": {
         "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
         "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.1]}],
-        "plasticity": {"yield_stress": 0.1, "hardening": 0.2, "flow_rate": 20.0},
+        "plasticity": {"yield_stress": 0.06, "hardening": 0.5, "flow_rate": 20.0},
         "fracture": {"strength": 0.2, "radius": 0.15, "passes": 3},
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.4},
         "probe": [{"name": "grip", "on": "right"}],
