@@ -395,14 +395,19 @@ class Study(Table):
         return self
 
     @model_validator(mode="after")
-    def _plasticity_fits(self) -> Study:
-        table, material = self.plasticity, self.material
-        if table is None:
-            special = [name for name, region in material.regions.items() if region.yield_stress is not None]
+    def _flow_needs_plasticity(self) -> Study:
+        if self.plasticity is None:
+            special = [name for name, region in self.material.regions.items() if region.yield_stress is not None]
             if special:
                 raise ValueError(f"material.{special[0]}.yield_stress needs a [plasticity] table")
             if "plastic_strain" in (self.output.fields or []):
                 raise ValueError('output.fields has "plastic_strain", which needs a [plasticity] table')
+        return self
+
+    @model_validator(mode="after")
+    def _plasticity_fits(self) -> Study:
+        table, material = self.plasticity, self.material
+        if table is None:
             return self
         if material.energy == "linear":
             raise ValueError(
