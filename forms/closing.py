@@ -2,8 +2,8 @@
 
     psi = chi psi_d + share k/2 sum min(s, 0)^2 over broken edges,   k of `spring_modulus`
 
-psi_d is the energy that damage leaves: chi psi_0 (share 1 - chi), or the edge-projected one (chi 1, share 1). s is Green's
-strain (stretch^2 - 1)/2 of the edge, or n . eps . n with the linear energy.
+psi_d is the energy that damage leaves: chi psi_0 (share 1 - chi), or the edge-projected one (chi 1, share 1). s is
+Green's strain (stretch^2 - 1)/2 of the edge, or n . eps . n with the linear energy.
 
 METHOD section 4 has a shortened edge count as intact. Taken at its word that makes energy out of nothing: chi jumps
 back at a finite energy, one closed edge lets a cell carry tension across its open ones, and with projected strains the

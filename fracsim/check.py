@@ -164,6 +164,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     yield f"material    {study.material.energy}{plane}{regions}"
     yield f"fracture    {_fracture(study)}"
+    yield f"plasticity  {_plasticity(study)}"
     yield f"damping     {_damping(study)}"
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
@@ -184,6 +185,17 @@ def _fracture(study: Study) -> str:
     approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
     closing = ", cracks close" if fracture.unilateral else ""
     return f"{approach}, strength {fracture.strength:g} Pa, {average}{closing}"
+
+
+def _plasticity(study: Study) -> str:
+    if study.plasticity is None:
+        return "off: no plastic strain, no flow"
+    table = study.plasticity
+    rate = "independent of the rate" if np.isinf(table.flow_rate) else f"flow rate {table.flow_rate:g} 1/s"
+    return (
+        f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
+        f"hardening {table.hardening:g} Pa, {table.update}"
+    )
 
 
 def _damping(study: Study) -> str:

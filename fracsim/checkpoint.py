@@ -46,6 +46,8 @@ def write_checkpoint(
         arrays["drag"] = domain.gather_nodes(state.drag.reshape(-1, d))
     if equations.chi is not None:
         arrays["chi"] = domain.gather_cells(equations.chi.x.array[: domain.cell_count])
+    if (plastic := equations.material.plastic) is not None:
+        arrays["plastic"] = domain.gather_cells(plastic.memory())
     if record is not None:
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
     path = checkpoint_path(folder)
@@ -73,7 +75,8 @@ def read_checkpoint(
     InputError where there is no checkpoint that fits.
     """
     path, comm = checkpoint_path(folder), domain.comm
-    arrays = on_root(comm, lambda: _read(path, domain.source, torn_too=record is not None))
+    plastic = equations.material.plastic
+    arrays = on_root(comm, lambda: _read(path, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
         head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks")
@@ -92,11 +95,13 @@ def read_checkpoint(
         record.restore(broken, breaks)
     if equations.chi is not None and "chi" in names:
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
+    if plastic is not None and "plastic" in names:
+        plastic.restore(scattered(domain.gather_cells, "plastic"))
     equations.displace(state.u)
 
 
-def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:
-    """The arrays and the clock; `torn_too`: the study can go on with broken edges."""
+def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:
+    """The arrays and the clock; the study can go on with broken edges (`torn_too`), plastic strain (`bent_too`)."""
     if not path.exists():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
     try:
@@ -109,6 +114,8 @@ def _read(path: Path, mesh: MeshData | None, torn_too: bool) -> dict[str, Any]:
         raise InputError(f"--restart: {path} belongs to another mesh; run without --restart")
     if len(arrays.get("broken", ())) and not torn_too:
         raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
+    if "plastic" in arrays and arrays["plastic"][:, -1].any() and not bent_too:
+        raise InputError(f"--restart: the body in {path} has flowed; the study needs its [plasticity] table")
     return arrays | {"clock": clock}
 
 

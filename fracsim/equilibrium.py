@@ -8,6 +8,7 @@ M is made once (fracsim.mass) and added; as a term of the form it would be integ
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +23,7 @@ from petsc4py import PETSc
 from .domain import Domain
 from .forms.balance import elastic_energy, internal_work, pressure_work, traction_work, viscous_work
 from .forms.energies import Energy
+from .forms.kinematics import deformation_gradient
 from .forms.schemes import Scheme
 from .kernels import compile_form
 from .loads import Forces, Motion
@@ -57,7 +59,7 @@ class Equilibrium:
         self.integrity: fem.Function | None = None
         self.unilateral = study.fracture is not None and study.fracture.unilateral
         self.energy: Energy = material.energy if study.fracture is None else self._damaged(study.fracture)
-        self.rotation = RotationField(domain, self.u) if material.energy.needs_rotation else None
+        self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
         self.damping = study.damping
         self.u_n: Any = None
         self.u_v: Any = None
@@ -97,7 +99,7 @@ class Equilibrium:
 
             whole = EdgeProjected(whole, self.integrity, edges, 0.0 if self.scheme.inertia else RESIDUAL_STIFFNESS)
         if not fracture.unilateral:
-            return whole  # type: ignore[no-any-return]
+            return whole
         from .forms.closing import Closing
 
         share = 1.0 if self.chi is None else 1 - self.chi
@@ -108,25 +110,59 @@ class Equilibrium:
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
         chi, damping = self._floored(self.factor), self._floored(self.chi)
         rotation = self.rotation.field if self.rotation is not None else None
-        residual = internal_work(energy, self.u, w, dx, chi=chi, rotation=rotation)
-        self._internal_form = compile_form(residual)
+        internal, springs = self._internal(w, dx, chi), self._springs(w, dx)
+        self._internal_form = compile_form(internal + springs)
         self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
         viscous, pressure = self._viscous(w, dx, damping), self._pressure(w)
         self._viscous_form = compile_form(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
-        residual = residual + viscous + pressure
-        self._residual = compile_form(residual)
+        others = viscous + pressure + springs
+        self._residual = compile_form(internal + others)
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
-        at_supports = internal_work(energy, self.u, w, near, chi=chi, rotation=rotation)
-        self._reactions = compile_form(at_supports + self._viscous(w, near, damping) + pressure)
+        at_supports = self._internal(w, near, chi)
+        self._reactions = compile_form(
+            at_supports + self._viscous(w, near, damping) + pressure + self._springs(w, near)
+        )
         if self.scheme.implicit:
-            self._tangent = compile_form(ufl.derivative(residual, self.u, ufl.TrialFunction(domain.space)))
+            self._tangent = compile_form(self._stiffness(internal, others, w, dx))
         self._dead = self._dead_loads(w, dx)
 
     @property
     def factor(self) -> fem.Function | None:
         """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
         return self.chi if self.energy is self.material.energy else None
+
+    def _elastic_part(self) -> Any:
+        """What the energy takes of F: all of it, or what plastic flow left (d x d)."""
+        F = deformation_gradient(self.u)
+        if self.material.plastic is None:
+            return F
+        part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
+        return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
+
+    def _internal(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form:
+        """Virtual work of the stress, as flow within the step leaves it."""
+        rotation = self.rotation.field if self.rotation is not None else None
+        if self.material.plastic is None:
+            return internal_work(self.energy, self.u, w, dx, chi=chi, rotation=rotation)
+        return self.material.plastic.relaxation.work(self.u, w, dx, chi=self._floored(self.chi), rotation=rotation)
+
+    def _springs(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
+        """Virtual work of closing cracks in a body that flows; else it is part of `_internal`."""
+        if self.material.plastic is None or not self.unilateral:
+            return 0
+        alone: Any = replace(self.energy, chi=0)  # type: ignore[type-var]
+        return internal_work(alone, self.u, w, dx)
+
+    def _stiffness(self, internal: ufl.Form, others: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+        """Derivative of the forces in the direction of the trial function."""
+        v = ufl.TrialFunction(self.domain.space)
+        if self.material.plastic is None:
+            return ufl.derivative(internal + others, self.u, v)
+        rotation = self.rotation.field if self.rotation is not None else None
+        floored = self._floored(self.chi)
+        tangent = self.material.plastic.relaxation.tangent(self.u, v, w, dx, chi=floored, rotation=rotation)
+        return tangent + (ufl.derivative(others, self.u, v) if others else 0)
 
     def _floored(self, chi: Any) -> Any:
         """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
@@ -194,6 +230,8 @@ class Equilibrium:
         """Set the end time, the loads and the scheme's references; `start`, v, a are the owned state at t - dt."""
         self.c_a, self.c_v = self.scheme.rates(dt)
         late = self.scheme.alpha_f
+        if self.material.plastic is not None:
+            self.material.plastic.begin((1 - late) * dt)
         held = (1 - late) * self.motion.at(t) + late * self.motion.at(t - dt)
         self._refer(t - late * dt, held, start, *self.scheme.references(dt, start, v, a))
 

@@ -53,6 +53,9 @@ class Frames:
     def _cell_values(self, name: str) -> Values:
         if name == "region":
             return self._domain.region.astype(np.int32)
+        if name == "plastic_strain":
+            strain: Values = self._equations.material.plastic.strain
+            return strain
         if name == "damage":
             return self._broken_share()
         if name == "chi":

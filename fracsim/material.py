@@ -26,6 +26,7 @@ class MaterialFields:
     young: PerCell
     mu: PerCell
     lmbda: PerCell
+    plastic: Any = None  # fracsim.plasticity.Plasticity of a body that flows
 
 
 def material_fields(domain: Domain, material: Material) -> MaterialFields:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from .domain import Domain
-from .forms.kinematics import deformation_gradient
 from .kernels import CellExpression
 from .small_matrices import inverse_transpose
 
@@ -15,13 +15,13 @@ Tensors = npt.NDArray[np.float64]
 
 
 class RotationField:
-    """R of F = R U as a DG0 tensor field, refreshed at every iterate."""
+    """R of F = R U (d x d, an expression of the displacement) as a DG0 tensor field, refreshed at every iterate."""
 
-    def __init__(self, domain: Domain, u: fem.Function) -> None:
+    def __init__(self, domain: Domain, F: Expr) -> None:
         d = domain.dim
         space = fem.functionspace(domain.mesh, ("DG", 0, (d, d)))
         self.field = fem.Function(space, name="rotation")
-        self._gradient = CellExpression(domain.comm, domain.mesh, deformation_gradient(u), domain.cell_count)
+        self._gradient = CellExpression(domain.comm, domain.mesh, F, domain.cell_count)
         self._d = d
 
     def update(self) -> None:

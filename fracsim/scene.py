@@ -37,7 +37,12 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     """Mesh, equations, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
     domain = distribute(comm, on_root(comm, lambda: checked_mesh(study)))
     scheme = make_scheme(study.time)
-    equations = Equilibrium(domain, study, material_fields(domain, study.material), scheme)
+    material = material_fields(domain, study.material)
+    if study.plasticity is not None:
+        from .plasticity import plastic_material
+
+        material = plastic_material(domain, study, material)
+    equations = Equilibrium(domain, study, material, scheme)
     if not scheme.inertia:
         check_supports(domain, equations.motion)
     fracture = None
@@ -47,6 +52,10 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
         fracture = FracturePass(equations, study.fracture, study.material)
     solver = Solver(equations, study.solver) if scheme.implicit else None
     stepper = make_stepper(equations, solver, study.time, fracture)
+    if study.plasticity is not None:
+        from .plasticity import Flow
+
+        stepper.flow = Flow(equations)
     return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
 
 

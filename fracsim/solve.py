@@ -193,8 +193,10 @@ class Solver:
 def _chosen(equations: Equilibrium, given: Options) -> Options:
     """The study's options over the defaults."""
     chosen = DEFAULTS | ({} if given.get("pc_type", "gamg") != "gamg" else MULTIGRID)
-    if equations.forces.pressures and not equations.material.energy.linear:
-        chosen |= {"ksp_type": "gmres"}  # the tangent of a following pressure is not symmetric
+    plastic = equations.material.plastic
+    turned = plastic is not None and plastic.frobenius  # pressure makes flow easier, flow makes no pressure
+    if turned or (equations.forces.pressures and not equations.material.energy.linear):
+        chosen |= {"ksp_type": "gmres"}  # the tangent of this or of a following pressure is not symmetric
     return chosen | given
 
 

@@ -42,6 +42,7 @@ class Stepper:
         self.smallest = timing.smallest or timing.step / 1024
         self.passes = fracture.passes if fracture is not None else 1
         self.comm = equations.domain.comm
+        self.flow: Any = None  # fracsim.plasticity.Flow of a body that yields
         self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
         self.failed = 0  # attempts that did not converge
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
@@ -93,7 +94,10 @@ class Stepper:
         for _ in range(self.passes - 1):
             x = self.equations.u.x.array[: len(state.u)].copy()
             self._arrive(state, dt)
+            self._flow()
             result = self.fracture()
+            if self.flow is not None:
+                self.flow.undo()  # from the start of the step again
             if not result.broken:
                 self._return_to(x, state, dt)
                 break
@@ -159,8 +163,9 @@ class Stepper:
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old)
+        flowed = self._flow()
         broken, released, elastic = self._break(state)
-        broken, released = broken + broken_before, released + released_before
+        broken, released = broken + broken_before, released + released_before + flowed
         if not equations.scheme.inertia:
             # what is neither stored nor moving is gone: releases, and the body's relaxation after them
             released, viscous = work - (elastic - state.elastic), 0.0
@@ -178,6 +183,8 @@ class Stepper:
         x = equations.u.x.array[: len(state.u)].copy()
         u, v, a = equations.scheme.finish(dt, x, state.u, state.v, state.a)
         if equations.scheme.alpha_f:
+            if self.flow is not None:
+                self.flow.begin(dt)
             equations.hold(state.t + dt, u, v, a)
             equations.update_reactions()
         return u, v, a
@@ -195,6 +202,15 @@ class Stepper:
             viscous = 0.5 * float((drag + (state.drag if state.drag is not None else 0.0)) @ increment)
         state.forces, state.drag = forces, drag
         return work, viscous
+
+    def _flow(self) -> float:
+        """Let the body flow, once it has arrived; returns the energy lost to it on this rank, J."""
+        if self.flow is None:
+            return 0.0
+        began = time.perf_counter()
+        lost: float = self.flow()
+        self.phases["plasticity"] = self.phases.get("plasticity", 0.0) + time.perf_counter() - began
+        return lost
 
     def _break(self, state: State) -> tuple[int, float, float]:
         """(edges broken, energy released, elastic energy left) of the step; the energies on this rank, J."""

@@ -100,6 +100,7 @@ class Region(Table):
     poisson: Poisson | None = None
     density: Positive | None = None
     strength: Strength | None = None
+    yield_stress: Strength | None = None
 
 
 class Material(Elastic):
@@ -166,6 +167,18 @@ class Fracture(Table):
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None
+
+
+class Plasticity(Table):
+    """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1."""
+
+    yield_stress: Strength  # Pa, of the Cauchy stress
+    measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too
+    flow_rate: Annotated[float, Field(gt=0, strict=True)] = float("inf")  # 1/s; inf: independent of the rate
+    hardening: Finite = 0.0  # K in Pa: what yield_stress gains with accumulated plastic strain; < 0 softens
+    update: Literal["implicit", "staggered"] = (
+        "implicit"  # solve a step with its flow; let flow follow it (small steps)
+    )
 
 
 class Box(Table):
@@ -294,7 +307,18 @@ class Probe(Table):
         return self.record or ("displacement" if self.point is not None else "reaction")
 
 
-FIELDS = ("velocity", "damage", "chi", "piece", "stress", "von_mises", "energy_density", "strain", "region")
+FIELDS = (
+    "velocity",
+    "damage",
+    "chi",
+    "piece",
+    "stress",
+    "von_mises",
+    "energy_density",
+    "strain",
+    "region",
+    "plastic_strain",
+)
 FRACTURE_FIELDS = ("damage", "chi", "piece")
 
 
@@ -325,6 +349,13 @@ def _is_setting(value: Any) -> Any:
 Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
 
 
+def _moduli(material: Material) -> list[tuple[float, float]]:
+    """(Young, Poisson) of the material and of every region."""
+    regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
+    regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
+    return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
+
+
 class Study(Table):
     """A whole study. A table that is absent costs nothing."""
 
@@ -333,6 +364,7 @@ class Study(Table):
     material: Material
     time: Time
     fracture: Fracture | None = None
+    plasticity: Plasticity | None = None
     damping: Damping | None = None
     boundary: list[Boundary] = []
     load: Load | None = None
@@ -361,6 +393,41 @@ class Study(Table):
         special = [name for name, region in self.material.regions.items() if region.strength is not None]
         if special and self.fracture is None:
             raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
+        return self
+
+    @model_validator(mode="after")
+    def _flow_needs_plasticity(self) -> Study:
+        if self.plasticity is None:
+            special = [name for name, region in self.material.regions.items() if region.yield_stress is not None]
+            if special:
+                raise ValueError(f"material.{special[0]}.yield_stress needs a [plasticity] table")
+            if "plastic_strain" in (self.output.fields or []):
+                raise ValueError('output.fields has "plastic_strain", which needs a [plasticity] table')
+        return self
+
+    @model_validator(mode="after")
+    def _plasticity_fits(self) -> Study:
+        table, material = self.plasticity, self.material
+        if table is None:
+            return self
+        if material.energy == "linear":
+            raise ValueError(
+                "[plasticity] splits the deformation gradient, which the energy linear does not tell from small "
+                'strain; choose energy = "corotated", the same law at small strain'
+            )
+        if material.plane == "stress":
+            raise ValueError('[plasticity] is for 3D and plane strain; choose plane = "strain"')
+        if self.fracture is not None and self.fracture.approach == "edge":
+            raise ValueError(
+                'fracture.approach = "edge" projects strain on the edges at rest, which plastic flow leaves behind; '
+                'choose approach = "chi" with [plasticity]'
+            )
+        for young, poisson in _moduli(material):
+            if table.hardening <= (limit := -1.5 * young / (1 + poisson)):
+                raise ValueError(
+                    f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
+                    "that softens faster than it unloads has no equilibrium"
+                )
         return self
 
     @model_validator(mode="after")

@@ -74,6 +74,12 @@ fields = ["damage", "chi", "piece", "velocity", "stress", "von_mises", "energy_d
 picture = false
 """)
 
+# STRIP that yields before it tears
+DUCTILE_TABLES: dict[str, Any] = {
+    "plasticity": {"yield_stress": 1.2e4, "hardening": 1e5, "flow_rate": 500.0},
+    "output": {"fields": ["damage", "chi", "piece", "plastic_strain"]},
+}
+
 
 def changed(base: dict[str, Any], **tables: Any) -> dict[str, Any]:
     """A copy of a study with keys of its tables set: changed(BAR, time={"end": 1.0}); None removes, others replace."""

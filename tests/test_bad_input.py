@@ -42,6 +42,11 @@ def without(name: str, key: str | None = None, base: Data = BAR) -> Data:
     return data
 
 
+def flowing(base: Data = BAR, **plasticity: Any) -> Data:
+    """A study with [plasticity] and an energy that allows it."""
+    return changed(base, material={"energy": "stvk"}, plasticity={"yield_stress": 1e3, **plasticity})
+
+
 def held_2d(**tables: Any) -> Data:
     return changed(STRIP, **tables)
 
@@ -178,6 +183,32 @@ REFUSED: list[tuple[Data, str]] = [
         "nothing holds the body against moving along z; a quasi-static study needs every body held",
     ),
     (changed(BAR, time={"scheme": "quasi-static"}, initial={"velocity": [1, 0, 0]}), "[initial] sets a velocity"),
+    # plasticity
+    (flowing(yield_stress=0.0), "plasticity.yield_stress = 0.0: must be greater than 0"),
+    (flowing(yield_stress=np.nan), "plasticity.yield_stress = nan: must be greater than 0"),
+    (flowing(flow_rate=-1.0), "plasticity.flow_rate = -1.0: must be greater than 0"),
+    (flowing(hardening=np.inf), "plasticity.hardening = inf: must be a finite number"),
+    (flowing(hardening=-1.2e6), "plasticity.hardening = -1.2e+06: must be greater than -3 mu = -1.154e+06 Pa"),
+    (flowing(measure="mises"), 'plasticity.measure = "mises": must be'),
+    (flowing(yeld_stress=1.0), "plasticity.yeld_stress is not a known key; did you mean yield_stress?"),
+    (changed(BAR, plasticity={}), "plasticity.yield_stress is missing; the table [plasticity] needs it"),
+    (changed(flowing(), material={"energy": "linear"}), 'choose energy = "corotated", the same law at small strain'),
+    (
+        changed(flowing(STRIP), material={"energy": "stvk", "plane": "stress"}),
+        "[plasticity] is for 3D and plane strain",
+    ),
+    (
+        changed(flowing(STRIP), material={"energy": "corotated"}, fracture={"approach": "edge"}),
+        'choose approach = "chi" with [plasticity]',
+    ),
+    (
+        changed(BAR, material={"crust": {"yield_stress": 1.0}}),
+        "material.crust.yield_stress needs a [plasticity] table",
+    ),
+    (
+        changed(BAR, output={"fields": ["plastic_strain"]}),
+        'output.fields has "plastic_strain", which needs a [plasticity] table',
+    ),
     # files
     (changed(BAR) | {"mesh": {"file": "/no/such.msh"}}, 'mesh.file = "/no/such.msh": there is no such file'),
     (

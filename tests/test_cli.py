@@ -48,6 +48,7 @@ def test_check_tells_what_is_built_and_what_is_not() -> None:
     lines = check_study(study(BAR))
     assert lines[0] == "mesh        box: 3D, about 24 cells; groups left, right, front, back, bottom, top"
     assert "fracture    off: no damage field, no graph, no average" in lines
+    assert "plasticity  off: no plastic strain, no flow" in lines
     assert "damping     off" in lines
     assert "time        backward-euler, 3 steps of 0.01 s, halved where a step fails" in lines
     assert "probes      grip (reaction)" in lines
@@ -57,6 +58,11 @@ def test_check_tells_of_fracture() -> None:
     lines = check_study(study(STRIP, fracture={"radius": 0.1}))
     assert "fracture    degraded energy (chi), strength 20000 Pa, average over 0.1 m (linear)" in lines
     assert "material    neo-hookean, plane strain" in lines
+
+
+def test_check_tells_of_plasticity() -> None:
+    lines = check_study(study(STRIP, plasticity={"yield_stress": 1e4, "hardening": -5.0, "flow_rate": 20.0}))
+    assert "plasticity  von-mises stress above 10000 Pa, flow rate 20 1/s, hardening -5 Pa, implicit" in lines
 
 
 # --- a scene costs only what it uses --------------------------------------------------------------------------------
@@ -74,6 +80,7 @@ from fracsim.scene import build_scene
 scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
 Run(scene, Path({str(tmp_path / "out")!r}))()
 parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")
+parts += ("plasticity", "spectrum", "forms.plasticity")
 print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

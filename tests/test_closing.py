@@ -324,3 +324,18 @@ def test_the_force_does_not_jump_as_edges_close() -> None:
             forces.append(scene.equations.internal_force())
         largest.append(np.abs(np.diff(forces, axis=0)).max())
     assert largest[1] == pytest.approx(largest[0] / 2, rel=0.05)
+
+
+def test_a_body_that_flows_closes_too() -> None:
+    """Far below yield the pushed, cut bar is that of the elastic material, springs and all."""
+    forces = []
+    for plasticity in ({}, {"plasticity": {"yield_stress": 10.0}}):
+        boundary = [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": [-1e-3, 0.0]}]
+        scene, state = bar(
+            "chi", "neo-hookean", boundary=boundary, time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+            probe=[{"name": "grip", "on": "right"}], **plasticity,
+        )  # fmt: skip
+        march(scene, state)
+        forces.append(float(scene.probes()[0]))
+    assert forces[1] == pytest.approx(forces[0], rel=1e-8)
+    assert forces[0] < -1e-4

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, STRIP, changed, command, fracsim, study, write_study
+from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.run import Run
 from fracsim.scene import build_scene
@@ -123,6 +123,26 @@ def test_a_restart_with_other_schemes(tmp_path: Path, scheme: str) -> None:
     run(data, tmp_path / "parts", restart=True)
     columns = [name for name in PHYSICAL if "tip" not in name] + ["reaction_grip_z"]
     assert_same_run(tmp_path / "parts", tmp_path / "whole", columns)
+
+
+def test_a_flowing_body_goes_on(tmp_path: Path) -> None:
+    """F_p and the accumulated plastic strain are in the checkpoint, on other ranks too."""
+    data = changed(TEARING, **DUCTILE_TABLES)
+    summary = run(data, tmp_path / "whole")
+    assert summary["broken_edges"] > 0 and last_frame(tmp_path / "whole")["plastic_strain"].max() > 0.01
+    broken = history(tmp_path / "whole")["broken_edges"]
+    stopped_after(data, tmp_path / "parts", int(np.flatnonzero(broken)[0] + 1))
+    shutil.copytree(tmp_path / "parts", tmp_path / "ranks")
+    run(data, tmp_path / "parts", restart=True)
+    second = fracsim("run", write_study(tmp_path / "s.toml", data), "-o", tmp_path / "ranks", "--restart", ranks=2)
+    assert second.returncode == 0, second.stderr
+    for folder in ("parts", "ranks"):
+        assert_same_run(tmp_path / folder, tmp_path / "whole")
+        found, wanted = (last_frame(tmp_path / name)["plastic_strain"] for name in (folder, "whole"))
+        assert np.abs(found - wanted).max() < 1e-6 * wanted.max()
+    plain = {key: value for key, value in data.items() if key != "plasticity"} | {"output": TEARING["output"]}
+    with pytest.raises(InputError, match=r"the body in .* has flowed; the study needs its \[plasticity\] table"):
+        run(plain, tmp_path / "parts", restart=True)
 
 
 def test_peak_reactions_and_totals_survive_a_restart(tmp_path: Path, whole: Path) -> None:

@@ -140,6 +140,11 @@ def test_every_default_is_written() -> None:
         "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6,
             "unilateral": False, "passes": 1,
     }  # fmt: skip
+    assert "plasticity" not in data
+    data = tomllib.loads(study_text(study(STRIP, plasticity={"yield_stress": 1e4})))
+    assert data["plasticity"] == {
+        "yield_stress": 1e4, "measure": "von-mises", "flow_rate": float("inf"), "hardening": 0.0, "update": "implicit"
+    }  # fmt: skip
     assert data["mesh"]["pattern"] == "structured"
     assert data["material"]["plane"] == "strain"
 

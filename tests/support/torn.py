@@ -137,6 +137,8 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
     found[f"{name}-v"] = domain.gather_nodes(state.v.reshape(-1, domain.dim))
     found[f"{name}-energy"] = np.array([state.work, state.dissipated])
     found[f"{name}-mass"] = domain.gather_nodes(scene.equations.mass.reshape(-1, domain.dim))
+    if scene.equations.material.plastic is not None:
+        found[f"{name}-plastic"] = domain.gather_cells(scene.equations.material.plastic.memory())
     if scene.fracture is not None:
         found[f"{name}-chi"] = domain.gather_cells(scene.equations.chi.x.array[: domain.cell_count])
         found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
@@ -159,6 +161,15 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.15, "radius": 0.25, "kernel": "gaussian"},
         "damping": {"mass": 0.1, "stiffness": 0.01},
         "time": {"scheme": "newmark", "step": 0.05, "end": 1.0},
+        "probe": [{"name": "grip", "on": "right"}],
+    },
+    # yields, then tears
+    "ductile": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.1]}],
+        "plasticity": {"yield_stress": 0.06, "hardening": 0.5, "flow_rate": 20.0},
+        "fracture": {"strength": 0.2, "radius": 0.15, "passes": 3},
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.4},
         "probe": [{"name": "grip", "on": "right"}],
     },
     # a symmetric lattice in uniform stress: all aligned edges are tied, and only the hashed noise decides

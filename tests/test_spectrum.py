@@ -1,0 +1,67 @@
+"""Spectra and powers of symmetric tensors against LAPACK, repeated eigenvalues above all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fracsim.spectrum import Values, deviatoric_power, eigenvalues, times
+from support.laws import rotation
+
+EPS = np.finfo(float).eps
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SPECTRA = {
+    "apart": (1.5, 1.0, 0.4),
+    "far apart": (30.0, 1.0, 0.02),
+    "small strain": (1.002, 1.0, 0.999),
+    "two upper": (1.3, 1.3, 0.7),
+    "two lower": (1.3, 0.7, 0.7),
+    "nearly two": (1.3, 0.7 * (1 + 1e-9), 0.7),
+    "one digit apart": (1.3, 0.7 * (1 + EPS), 0.7),
+    "three": (1.2, 1.2, 1.2),
+    "nearly three": (1.2 * (1 + 1e-12), 1.2, 1.2 * (1 - 3e-13)),
+    "identity": (1.0, 1.0, 1.0),
+}
+
+
+def tensors(spectrum: tuple[float, ...]) -> tuple[Values, Values]:
+    """((n, 3, 3), (6, n)) of tensors with the given eigenvalues along random axes, and along the coordinates."""
+    Q = np.array([np.eye(3), *(rotation(3, seed) for seed in range(30))])
+    A = np.einsum("nij,j,nkj->nik", Q, np.array(spectrum), Q)
+    A = (A + A.transpose(0, 2, 1)) / 2
+    return A, np.array([A[:, i, j] for i, j in PAIRS])
+
+
+@pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
+def test_eigenvalues(spectrum: tuple[float, ...]) -> None:
+    """Falling; a double root is known to sqrt(eps) only, which the power below does not feel."""
+    A, C = tensors(spectrum)
+    found = eigenvalues(C)
+    assert np.all(np.diff(found, axis=0) <= EPS * max(spectrum))
+    np.testing.assert_allclose(found[::-1].T, np.linalg.eigvalsh(A), atol=5 * np.sqrt(EPS) * max(spectrum))
+
+
+@pytest.mark.parametrize("exponent", (-0.5, -0.01, 0.0, 1.0))
+@pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
+def test_powers(spectrum: tuple[float, ...], exponent: float) -> None:
+    """(C / det^(1/3))^p to round-off times the condition of C, whether eigenvalues are apart, close or equal."""
+    A, C = tensors(spectrum)
+    values = eigenvalues(C)
+    logs = np.log(values)
+    found = deviatoric_power(C, values, logs - logs.mean(axis=0), np.full(C.shape[1], exponent))
+    w, V = np.linalg.eigh(A)
+    scaled = (w / np.cbrt(np.prod(w, axis=1))[:, None]) ** exponent
+    expected = np.einsum("nij,nj,nkj->nik", V, scaled, V)
+    scale = 50 * EPS * max(spectrum) / min(spectrum) * scaled.max()
+    np.testing.assert_allclose(found, [expected[:, i, j] for i, j in PAIRS], atol=scale)
+
+
+def test_products_have_determinant_one() -> None:
+    """A S scaled by det^(-1/3)."""
+    random = np.random.default_rng(0)
+    A = np.eye(3) + 0.3 * random.uniform(-1, 1, (20, 3, 3))
+    S, components = tensors((1.5, 1.0, 0.4))
+    product = A @ S[:20]
+    found = times(A.reshape(-1, 9).T, components[:, :20]).T.reshape(-1, 3, 3)
+    np.testing.assert_allclose(found, product / np.cbrt(np.linalg.det(product))[:, None, None], atol=50 * EPS)
+    np.testing.assert_allclose(np.linalg.det(found), 1, atol=20 * EPS)
