@@ -44,7 +44,7 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     if study.fracture is not None:
         from .fracture import FracturePass
 
-        fracture = FracturePass(equations, study.fracture, study.material)
+        fracture = FracturePass(equations, study.fracture, study.material, study.brittle)
     solver = Solver(equations, study.solver) if scheme.implicit else None
     stepper = make_stepper(equations, solver, study.time, fracture)
     return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
