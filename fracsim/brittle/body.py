@@ -21,7 +21,7 @@ class Body:
     """A mesh of N nodes and C cells, on the rank that has it.
 
     Attributes:
-        points: (N, d) m.    cells: (C, d + 1).    centroids: (C, d) m.
+        points: (N, d) m.    cells: (C, d + 1); corners: its transpose.    centroids: (C, d) m.
         edges: (E, 2) nodes, the lower first, ascending.    cell_edges: (C, k).
         tolerance: m; nodes as near as this to a surface lie on it.
     """
@@ -29,6 +29,7 @@ class Body:
     def __init__(self, mesh: MeshData) -> None:
         d = mesh.dim
         self.dim, self.points, self.cells = d, mesh.points, mesh.cells
+        self.corners: Ints = np.ascontiguousarray(mesh.cells.T)
         self.centroids: Values = mesh.points[mesh.cells].mean(axis=1)
         pairs = np.sort(mesh.cells[:, local_edges(d)], axis=2).reshape(-1, 2)
         self.edges, _, inverse = distinct_rows(pairs)
@@ -47,6 +48,21 @@ class Body:
         return csr_matrix(
             (np.ones(len(cell), np.int8), (self.cells.ravel(), cell)), (len(self.points), len(self.cells))
         )
+
+    def crossed(self, sides: Flags) -> Ints:
+        """Cells with nodes on both sides (N,)."""
+        first = sides[self.corners[0]]
+        differs = sides[self.corners[1]] != first
+        for column in self.corners[2:]:  # five times as fast as any(axis=1)
+            differs |= sides[column] != first
+        return np.flatnonzero(differs)
+
+    def touching(self, nodes: Flags) -> Flags:
+        """(C,) whether cells have one of the nodes flagged (N,)."""
+        result = nodes[self.corners[0]]
+        for column in self.corners[1:]:
+            result |= nodes[column]
+        return result
 
     def flags_of(self, keys: Ints) -> Flags:
         """(E,) flags of the edges named by pairs of nodes (n, 2)."""

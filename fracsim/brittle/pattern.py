@@ -74,7 +74,9 @@ class Pattern:
                 at.append(places[start])
                 starts.leave_out(places[start])
                 starts.drop(state.touched[load.cell])
-            elif self.grains is not None:  # nothing to open around this grain
+            elif self.grains is None:  # no room for two sides with whole cells
+                starts.leave_out(places[start], 0.5)
+            else:  # nothing to open around this grain
                 starts.drop(self.grains.of_cell[load.cell] == self.grains.of_cell[cell])
         new = np.flatnonzero(~np.isnan(state.cut))
         return Opened(np.array(at).reshape(-1, body.dim), body.edges[new], state.cut[new])
@@ -119,7 +121,7 @@ class Pattern:
     def _by_level_set(self, state: _State, cell: int, known: Flags | None, phi: Values) -> bool:
         """Cut where phi changes its sign, as far as the surface through the cell goes."""
         body, sides = self.body, sides_of(phi, self.body.tolerance)
-        complete = None if known is None else known[body.cells].all(axis=1)
+        complete = None if known is None else ~body.touching(~known)
         if self._settle:
             sides = settled(body, sides, state.whole if complete is None else state.whole & complete)
         crossing = Crossing.of(body, sides, state.broken, complete)

@@ -25,15 +25,6 @@ def sides_of(phi: Values, tolerance: float) -> Flags:
     return np.asarray(phi >= -tolerance)
 
 
-def crossed_cells(cells: Ints, sides: Flags) -> Ints:
-    """Cells (rows of (C, d + 1)) with nodes on both sides."""
-    first, others = sides[cells[:, 0]], cells[:, 1:]
-    differs = sides[others[:, 0]] != first
-    for column in others.T[1:]:
-        differs |= sides[column] != first
-    return np.flatnonzero(differs)
-
-
 @dataclass(frozen=True)
 class Crossing:
     """Cells that a surface crosses, and the edges that it may cut.
@@ -50,7 +41,7 @@ class Crossing:
     @classmethod
     def of(cls, body: Body, sides: Flags, broken: Flags, usable: Flags | None = None) -> Crossing:
         """Of nodes on two `sides` (N,); `usable` (C,): cells in which the sides are known, None: all."""
-        cells = crossed_cells(body.cells, sides)
+        cells = body.crossed(sides)
         if usable is not None:
             cells = cells[usable[cells]]
         i, j = local_edges(body.dim).T
@@ -92,8 +83,8 @@ def settled(body: Body, sides: Flags, usable: Flags) -> Flags:
     over where all other nodes of one of its cells are, so that it has a whole cell there.
     """
     near = np.zeros(len(sides), bool)
-    near[body.cells[crossed_cells(body.cells, sides)]] = True
-    cells = body.cells[np.flatnonzero(near[body.cells].any(axis=1) & usable)]
+    near[body.cells[body.crossed(sides)]] = True
+    cells = body.cells[np.flatnonzero(body.touching(near) & usable)]
     sides, most = sides.copy(), body.dim
     for _ in range(ROUNDS):
         side = sides[cells]

@@ -32,10 +32,10 @@ class Starts:
         self._left = self._left[1:]
         return chosen
 
-    def leave_out(self, place: Values) -> None:
-        """Take out the candidates closer than the spacing to a place (d,)."""
+    def leave_out(self, place: Values, share: float = 1.0) -> None:
+        """Take out the candidates closer than the spacing, or a share of it, to a place (d,)."""
         arm = self.places[self._left] - place
-        self._left = self._left[np.einsum("ni,ni->n", arm, arm) >= self.spacing**2]
+        self._left = self._left[np.einsum("ni,ni->n", arm, arm) >= (share * self.spacing) ** 2]
 
     def drop(self, candidates: npt.NDArray[np.bool_]) -> None:
         """Take out those flagged (n,)."""
