@@ -301,6 +301,17 @@ def test_weights_are_a_share_of_the_strength() -> None:
     np.testing.assert_allclose(np.abs(field.direction[:, 0]), 1.0, rtol=1e-12)
 
 
+@pytest.mark.parametrize("dim", (2, 3))
+def test_moving_nodes_over_spares_a_curved_surface(dim: int) -> None:
+    """A curved surface is known beside itself only; still hardly a node of it is without a cell on its own side."""
+    at, normal = [0.5, 0.3, 0.25][:dim], [1.0, 0.3, 0.2][:dim]
+    plain, moved = (
+        open_at(box(dim, 0.05), [at], [normal], settle, field=np.zeros_like, shape="curved") for settle in (False, True)
+    )
+    common = {tuple(key) for key in plain.opened.keys.tolist()} & {tuple(key) for key in moved.opened.keys.tolist()}
+    assert len(common) > 0.9 * len(plain.opened.keys) and moved.surface.pieces == 2
+
+
 def test_a_scene_with_curved_surfaces_in_uniform_stress_cuts_planes() -> None:
     """Uniform stress: the curved surface is the planar one."""
     tables = {"fracture": {"strength": 0.05, "approach": "edge"}}

@@ -80,10 +80,10 @@ class Curved:
             new = self._layer(new)
         return self.phi
 
-    def everywhere(self) -> Values:
-        """(N,) phi on all nodes, where the surface does not come with the plane that ends nearest."""
-        unknown = np.isnan(self.phi)
-        known = np.flatnonzero(~unknown)
+    def extended(self, wanted: Flags) -> Values:
+        """(N,) phi; on nodes that are wanted (N,) and where the surface does not come, that of the nearest plane."""
+        unknown = np.isnan(self.phi) & wanted
+        known = np.flatnonzero(~np.isnan(self.phi))
         points, phi = self._body.points, self.phi.copy()
         near = known[cKDTree(points[known]).query(points[unknown])[1]]
         phi[unknown] = phi[near] + np.einsum("ni,ni->n", self._normal[near], points[unknown] - points[near])
@@ -97,7 +97,7 @@ class Curved:
         node = node[known]
         if not len(node):
             return node
-        normal, phi = self._extended(node, others)
+        normal, phi = self._beyond(node, others)
         target, place, count = np.unique(node, return_inverse=True, return_counts=True)
         self.phi[target] = np.bincount(place, phi) / count
         for axis in range(self._body.dim):
@@ -118,7 +118,7 @@ class Curved:
         crossed = (side[:, :, 0] != side[:, :, 1]) & ~np.isnan(ends).any(axis=2)
         return cells, missing, crossed.any(axis=1) & ~(crossed & self._broken[body.cell_edges[cells]]).any(axis=1)
 
-    def _extended(self, node: Ints, others: Ints) -> tuple[Values, Values]:
+    def _beyond(self, node: Ints, others: Ints) -> tuple[Values, Values]:
         """(n, d) normals and (n,) phi at nodes from those of the facets (n, d nodes) opposite."""
         ahead = unit(self._normal[others].sum(axis=1))
         found, weight = self._field.direction[node], self._field.weight[node][:, None]

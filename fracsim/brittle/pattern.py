@@ -105,9 +105,15 @@ class Pattern:
             curved = Curved(body, field, state.broken)
             phi = curved(cell, origin, normal)
             known = ~np.isnan(phi)
-            if self.grains is not None:
-                phi = curved.everywhere()
+            # the nodes around tell whether those of the surface have a cell on their own side
+            phi = curved.extended(self._around(known) if self.grains is None else np.ones_like(known))
         return known, phi * self._sense(phi, cell)
+
+    def _around(self, nodes: Flags) -> Flags:
+        """(N,) nodes of the cells around nodes (N,)."""
+        result = nodes.copy()
+        result[self.body.cells[self.body.touching(nodes)]] = True
+        return result
 
     def _sense(self, phi: Values, cell: int) -> float:
         """1 or -1: the lowest node of the cell that is not on the surface is on the positive side.
@@ -123,7 +129,8 @@ class Pattern:
         body, sides = self.body, sides_of(phi, self.body.tolerance)
         complete = None if known is None else ~body.touching(~known)
         if self._settle:
-            sides = settled(body, sides, state.whole if complete is None else state.whole & complete)
+            usable = state.whole if known is None else state.whole & body.touching(known)
+            sides = settled(body, sides, usable, known)
         crossing = Crossing.of(body, sides, state.broken, complete)
         edges = crossing.connected(body.dim, body.cell_edges[cell])
         return state.note(crossing, edges, cut_places(phi, sides, body.edges[edges]))

@@ -76,14 +76,17 @@ class Crossing:
         return self.cells[flags[self.edges].any(axis=1)]
 
 
-def settled(body: Body, sides: Flags, usable: Flags) -> Flags:
+def settled(body: Body, sides: Flags, usable: Flags, movable: Flags | None = None) -> Flags:
     """The sides (N,) with the nodes moved over that would be left without a cell on their own side.
 
-    `usable` (C,): cells that have not come apart. Such a node would drift off as a crumb without stiffness. It goes
-    over where all other nodes of one of its cells are, so that it has a whole cell there.
+    `usable` (C,): cells that have not come apart. `movable` (N,): nodes that may move; None: all. A node without such a
+    cell would drift off as a crumb without stiffness. It goes over where all other nodes of one of its cells are, so
+    that it has a whole cell there.
     """
     near = np.zeros(len(sides), bool)
     near[body.cells[body.crossed(sides)]] = True
+    if movable is not None:
+        near &= movable
     cells = body.cells[np.flatnonzero(body.touching(near) & usable)]
     sides, most = sides.copy(), body.dim
     for _ in range(ROUNDS):
