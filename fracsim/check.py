@@ -16,7 +16,7 @@ from .errors import InputError
 from .laws import AXES, format_point, in_time, motion_law, of_size
 from .mesh_source import build_mesh, find_builder
 from .meshes.data import MeshData
-from .study import MOTIONS, Box, Plane, Study
+from .study import MOTIONS, Box, Brittle, Plane, Study
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"material    {study.material.energy}{plane}{regions}"
     yield f"fracture    {_fracture(study)}"
     yield f"plasticity  {_plasticity(study)}"
+    if study.brittle is not None:
+        yield f"brittle     {_brittle(study.brittle)}"
     yield f"damping     {_damping(study)}"
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
@@ -196,6 +198,21 @@ def _plasticity(study: Study) -> str:
         f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
         f"hardening {table.hardening:g} Pa, {table.update}"
     )
+
+
+def _brittle(brittle: Brittle) -> str:
+    many = f"{brittle.surfaces} surfaces" if brittle.surfaces > 1 else "1 surface"
+    apart = f"starts {brittle.spacing:g} m apart" if brittle.spacing else "starts two mesh edges apart"
+    at_once = f", {brittle.per_pass} a pass" if brittle.per_pass else ""
+    return f"up to {many}{at_once}, {_kind_of(brittle)}, {apart}; edges do not break by themselves"
+
+
+def _kind_of(brittle: Brittle) -> str:
+    grains = brittle.grains
+    if grains is None:
+        return brittle.shape
+    how = "each frees one of" if grains.mode == "replace" else f"{brittle.shape} along the boundaries of"
+    return f"{how} {grains.count} grains (seed {grains.seed}, spread {grains.spread:g})"
 
 
 def _damping(study: Study) -> str:

@@ -23,6 +23,7 @@ from .parallel import Gather, on_root
 from .state import State
 
 if TYPE_CHECKING:
+    from .brittle.surfaces import BrittleSurfaces
     from .surface.record import EdgeRecord
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
@@ -34,11 +35,16 @@ def checkpoint_path(folder: Path) -> Path:
 
 
 def write_checkpoint(
-    folder: Path, domain: Domain, state: State, equations: Equilibrium, record: EdgeRecord | None = None
+    folder: Path,
+    domain: Domain,
+    state: State,
+    equations: Equilibrium,
+    record: EdgeRecord | None = None,
+    surfaces: BrittleSurfaces | None = None,
 ) -> Path:
     """Write folder/checkpoint/state.h5, the old one in place until the new one is whole (collective).
 
-    `record`: what is remembered of broken edges, in a study with fracture.
+    `record`: what is remembered of broken edges, in a study with fracture; `surfaces`: in one with brittle cracks.
     """
     d = domain.dim
     arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
@@ -50,6 +56,8 @@ def write_checkpoint(
         arrays["plastic"] = domain.gather_cells(plastic.memory())
     if record is not None:
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
+    if surfaces is not None:
+        arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)
     on_root(domain.comm, lambda: _write(path, arrays, state, domain))
     return path
@@ -68,7 +76,12 @@ def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain) -> 
 
 
 def read_checkpoint(
-    folder: Path, domain: Domain, state: State, equations: Equilibrium, record: EdgeRecord | None = None
+    folder: Path,
+    domain: Domain,
+    state: State,
+    equations: Equilibrium,
+    record: EdgeRecord | None = None,
+    surfaces: BrittleSurfaces | None = None,
 ) -> None:
     """Bring a checkpoint into the state, chi and the record with its graph (collective).
 
@@ -79,8 +92,8 @@ def read_checkpoint(
     arrays = on_root(comm, lambda: _read(path, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
-        head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks")
-    clock, names, broken, breaks = comm.bcast(head)
+        head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks"), arrays.get("starts")
+    clock, names, broken, breaks, starts = comm.bcast(head)
     for name in _CLOCK:
         setattr(state, name, clock[name])
 
@@ -93,6 +106,8 @@ def read_checkpoint(
     if record is not None and broken is not None:
         record.graph.break_edges(record.graph.flags_of_keys(broken))
         record.restore(broken, breaks)
+    if surfaces is not None and starts is not None:
+        surfaces.starts = starts
     if equations.chi is not None and "chi" in names:
         equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:

@@ -19,7 +19,7 @@ from .forms.kinematics import deformation_gradient, symmetric_components
 from .graph import EdgeGraph
 from .kernels import CellExpression
 from .strength import Strength
-from .study import Fracture, Material
+from .study import Brittle, Fracture, Material
 
 Values = npt.NDArray[np.float64]
 
@@ -40,9 +40,12 @@ class FracturePass:
         graph: edges and their damage.
         strength: of each edge in each cell.
         degradation: what broken edges take out of the energy.
+        surfaces: what breaks edges instead in a study with [brittle]; None elsewhere.
     """
 
-    def __init__(self, equations: Equilibrium, fracture: Fracture, material: Material) -> None:
+    def __init__(
+        self, equations: Equilibrium, fracture: Fracture, material: Material, brittle: Brittle | None = None
+    ) -> None:
         domain = equations.domain
         self.domain, self.equations = domain, equations
         self.graph = EdgeGraph(domain)
@@ -54,6 +57,7 @@ class FracturePass:
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
         self.degradation = make_degradation(equations, self.graph)
         self._average = _average(domain, fracture)
+        self.surfaces = _surfaces(equations, self.graph, self.strength, brittle)
         self.passes = fracture.passes
         self._most = None if fracture.cap is None else math.ceil(fracture.cap * self.graph.index_map.size_global)
 
@@ -63,24 +67,39 @@ class FracturePass:
         stress, psi = values[:, :-1], values[:, -1]
         if not np.isfinite(values.sum()):  # a crushed cell: J = 0
             np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        edges, load = self._overloaded(*self._candidates(stress))
-        if self._most is not None:
-            edges = self._strongest(edges, load, self._most)
-        flags = np.zeros(len(self.graph.broken), bool)
-        flags[edges] = True
-        broken = self.graph.break_edges(flags)
+        broken = self.graph.break_edges(self._by_edges(stress) if self.surfaces is None else self._by_surfaces(stress))
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
         released, elastic = self.degradation(broken > 0, stress, psi)
         return PassResult(broken, released, elastic)
 
-    def _candidates(self, stress: Values) -> tuple[npt.NDArray[np.int64], Values]:
+    def _by_edges(self, stress: Values) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the edges that their own normal stress breaks."""
+        edges, load = self._overloaded(*self._candidates(*self._carried(stress)))
+        if self._most is not None:
+            edges = self._strongest(edges, load, self._most)
+        flags = np.zeros(len(self.graph.broken), bool)
+        flags[edges] = True
+        return flags
+
+    def _by_surfaces(self, stress: Values) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the edges that new surfaces cut; once all surfaces are used up nothing breaks."""
+        if not self.surfaces.left:
+            return np.zeros(len(self.graph.broken), bool)
+        carried, active = self._carried(stress)
+        average = self._average
+        return self.surfaces(
+            *self._candidates(carried, active), lambda: carried if average is None else average(carried, active)
+        )
+
+    def _candidates(
+        self, carried: Values, active: npt.NDArray[np.bool_] | None
+    ) -> tuple[npt.NDArray[np.int64], Values]:
         """Cells whose averaged stress may break an edge, and that stress.
 
         No normal stress exceeds the Frobenius norm of its tensor, and no average exceeds the average of the norms:
         most cells are passed over after one product.
         """
-        carried, active = self._carried(stress)
         size = frobenius_norm(carried, self.domain.dim)
         if self._average is not None:
             return self._average.reaching(carried, size, self.strength.weakest, active)
@@ -95,7 +114,8 @@ class FracturePass:
             return stress, None
         active = ~graph.split
         carried = np.where(active[:, None], stress, 0.0)
-        if self._average is not None:  # else: an intact edge has the same normal stress in the whole tensor
+        # by edges and locally there is no need: an intact edge has the same normal stress in the whole tensor
+        if self._average is not None or self.surfaces is not None:
             whole = damaged[active[damaged]]
             carried[whole] = carried_by(stress[whole], self.equations.corners(whole), graph.intact(whole))
         return carried, active
@@ -125,3 +145,11 @@ def _average(domain: Domain, fracture: Fracture) -> Any:
     from .average import NonlocalAverage
 
     return NonlocalAverage(domain, fracture.radius, fracture.kernel)
+
+
+def _surfaces(equations: Equilibrium, graph: EdgeGraph, strength: Strength, brittle: Brittle | None) -> Any:
+    if brittle is None:
+        return None
+    from .brittle.surfaces import BrittleSurfaces
+
+    return BrittleSurfaces(equations, graph, strength, brittle)

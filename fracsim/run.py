@@ -51,7 +51,7 @@ class Run:
         self.state = scene.stepper.start(scene.study.initial)
         self.record = self._make_record()
         if restart:
-            read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record)
+            read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record, self._surfaces)
             if scene.fracture is not None:
                 scene.fracture.degradation.restore()
             self.state.elastic = scene.equations.elastic_energy()
@@ -63,6 +63,10 @@ class Run:
     @property
     def _graph(self) -> Any:
         return self.scene.fracture.graph if self.scene.fracture is not None else None
+
+    @property
+    def _surfaces(self) -> Any:
+        return self.scene.fracture.surfaces if self.scene.fracture is not None else None
 
     # --- set-up ---
 
@@ -103,7 +107,10 @@ class Run:
         if self.record is None:
             return
         by_forces = self.scene.study.output.cut == "forces"
-        self.record.note(self.state.t, self._cuts() if by_forces else None)
+        if self._surfaces is not None:  # a surface knows where it cuts
+            self.record.note(self.state.t, self._surfaces.cut)
+        else:
+            self.record.note(self.state.t, self._cuts() if by_forces else None)
 
     def _cuts(self) -> npt.NDArray[np.float64]:
         """(edges,) cuts in inverse proportion to the nodal forces at the step's end (M22 fig. 12)."""
@@ -186,7 +193,9 @@ class Run:
 
     def _checkpoint(self) -> Path:
         began = time.perf_counter()
-        path = write_checkpoint(self.folder, self.scene.domain, self.state, self.scene.equations, self.record)
+        path = write_checkpoint(
+            self.folder, self.scene.domain, self.state, self.scene.equations, self.record, self._surfaces
+        )
         self.output_seconds += time.perf_counter() - began
         return path
 

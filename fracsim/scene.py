@@ -49,7 +49,7 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     if study.fracture is not None:
         from .fracture import FracturePass
 
-        fracture = FracturePass(equations, study.fracture, study.material)
+        fracture = FracturePass(equations, study.fracture, study.material, study.brittle)
     solver = Solver(equations, study.solver) if scheme.implicit else None
     stepper = make_stepper(equations, solver, study.time, fracture)
     if study.plasticity is not None:

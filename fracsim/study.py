@@ -181,6 +181,35 @@ class Plasticity(Table):
     )
 
 
+class Grains(Table):
+    """Grain boundaries: regions of seeded points p_i by least k_i |x - p_i|, the same at any number of ranks."""
+
+    count: Annotated[int, Field(ge=2, strict=True)]
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+    spread: Annotated[Finite, Field(ge=0, lt=1)] = 0.0  # k_i from 1 - spread to 1 + spread; 0: all grains alike
+    mode: Literal["replace", "bias"] = "replace"  # a surface frees a grain; or runs along the boundaries nearest to it
+
+
+class Brittle(Table):
+    """[brittle]: instead of single edges, surfaces from the cells of highest averaged principal stress break."""
+
+    surfaces: Annotated[int, Field(ge=1, strict=True)]  # most surfaces of the run: more of them, more debris
+    spacing: Positive | None = None  # m between places where surfaces start; default: about two mesh edges
+    shape: Literal["planar", "curved"] = "planar"  # curved: turns with the principal direction
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0  # of the direction where several principal stresses are equal
+    per_pass: Annotated[int, Field(ge=1, strict=True)] | None = None  # most that start in one pass; default: no limit
+    grains: Grains | None = None
+
+    @model_validator(mode="after")
+    def _grains_have_their_shape(self) -> Brittle:
+        if self.grains is not None and self.grains.mode == "replace" and self.shape == "curved":
+            raise ValueError(
+                'shape = "curved" does nothing where grains.mode = "replace": surfaces are grain boundaries; '
+                'remove shape, or set grains.mode = "bias"'
+            )
+        return self
+
+
 class Box(Table):
     """Nodes inside a box (m)."""
 
@@ -365,6 +394,7 @@ class Study(Table):
     time: Time
     fracture: Fracture | None = None
     plasticity: Plasticity | None = None
+    brittle: Brittle | None = None
     damping: Damping | None = None
     boundary: list[Boundary] = []
     load: Load | None = None
@@ -428,6 +458,22 @@ class Study(Table):
                     f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
                     "that softens faster than it unloads has no equilibrium"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _surfaces_need_strength(self) -> Study:
+        if self.brittle is None:
+            return self
+        if self.fracture is None:
+            raise ValueError("[brittle] needs a [fracture] table: its strength decides where surfaces start")
+        if self.fracture.cap is not None:
+            raise ValueError(
+                "fracture.cap is a share of edges, [brittle] breaks surfaces: set brittle.per_pass instead"
+            )
+        if self.output.cut == "forces":
+            raise ValueError(
+                'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'
+            )
         return self
 
     @model_validator(mode="after")

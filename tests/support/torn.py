@@ -139,8 +139,9 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
     found[f"{name}-mass"] = domain.gather_nodes(scene.equations.mass.reshape(-1, domain.dim))
     if scene.equations.material.plastic is not None:
         found[f"{name}-plastic"] = domain.gather_cells(scene.equations.material.plastic.memory())
-    if scene.fracture is not None:
+    if scene.fracture is not None and scene.equations.chi is not None:
         found[f"{name}-chi"] = domain.gather_cells(scene.equations.chi.x.array[: domain.cell_count])
+    if scene.fracture is not None:
         found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
         found[f"{name}-pieces"] = np.array([find_pieces(scene.fracture.graph).count])
     return found

@@ -1,0 +1,110 @@
+"""Surfaces opened in a mesh without solving anything, and the split surface that they leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyvista
+
+from fracsim.brittle.body import Body
+from fracsim.brittle.level_set import DirectionField
+from fracsim.brittle.pattern import Load, Opened, Pattern
+from fracsim.meshes.data import MeshData
+from fracsim.scene import Scene
+from fracsim.study import Brittle
+from fracsim.surface.build import Split, split
+from fracsim.surface.fragments import volumes
+from fracsim.surface.skeleton import Skeleton
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A body after a pass."""
+
+    opened: Opened
+    places: Values  # (n, d) where edges are cut, m
+    surface: Split
+    volumes: Values  # (pieces,) m^d enclosed
+
+
+def pulled_along(normals: Values) -> Values:
+    """(n, d, d) uniaxial tension of 1 Pa."""
+    return np.einsum("ni,nj->nij", normals, normals)
+
+
+def near(body: Body, place: list[float]) -> int:
+    """The cell whose centroid is nearest to a place."""
+    return int(np.argmin(np.linalg.norm(body.centroids - place, axis=1)))
+
+
+def open_at(
+    mesh: MeshData,
+    places: list[list[float]],
+    normals: list[list[float]],
+    settle: bool = False,
+    field: Any = None,
+    **table: Any,
+) -> Broken:
+    """Surfaces from the cells nearest to places, under tension along the normals, the first place loaded most.
+
+    `field`: a function from places (C, d) to directions of tension in the whole body.
+    """
+    pattern = Pattern(mesh, Brittle(surfaces=len(places), **table), 1e-6, settle)
+    body, dim = pattern.body, mesh.dim
+    cells = np.array([near(body, place) for place in places])
+    direction = np.array(normals, float) / np.linalg.norm(normals, axis=1)[:, None]
+    order = np.argsort(cells)
+    rest = np.broadcast_to(np.eye(dim), (len(body.cells), dim, dim))
+    loads = 2.0 - np.arange(len(cells)) / 100
+    load = Load(cells[order], loads[order], pulled_along(direction[order]), rest[: len(cells)])
+    whole = None
+    if field is not None:
+        whole = DirectionField.of(body, pulled_along(field(body.centroids)), rest, np.ones(len(rest)))
+    opened = pattern.open(load, np.empty((0, 2), np.int64), np.empty((0, dim)), len(places), whole)
+    return after(mesh, opened)
+
+
+def after(mesh: MeshData, opened: Opened) -> Broken:
+    """The body with what a pass opened."""
+    skeleton = Skeleton(mesh)
+    cut = skeleton.of_edges(opened.keys, opened.cut)
+    broken = ~np.isnan(cut)
+    bits = 1 << np.arange(skeleton.cell_edges.shape[1])
+    made = split(skeleton, broken[skeleton.cell_edges] @ bits, cut)
+    return Broken(opened, cut_points(mesh.points, opened.keys, opened.cut), made, enclosed(made))
+
+
+def cut_points(points: Values, keys: Ints, cut: Values) -> Values:
+    """(n, d) where edges between nodes `keys` (n, 2) are cut."""
+    ends = points[keys]
+    return np.asarray(ends[:, 0] + cut[:, None] * (ends[:, 1] - ends[:, 0]))
+
+
+def enclosed(made: Split) -> Values:
+    """(pieces,) volumes inside a surface, by the divergence theorem."""
+    return volumes(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)
+
+
+def scene_surface(scene: Scene) -> Split:
+    """The split surface of a scene as it stands (serial)."""
+    assert scene.domain.source is not None
+    skeleton, graph = Skeleton(scene.domain.source), scene.fracture.graph
+    own = np.flatnonzero(graph.broken)
+    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.surfaces.cut[own])
+    pattern = scene.domain.gather_cells(graph.pattern)
+    assert pattern is not None
+    return split(skeleton, pattern, cut)
+
+
+def volume_above(mesh: MeshData, point: Values, normal: Values) -> float:
+    """Volume of a 3D mesh on the positive side of a plane, as VTK clips it."""
+    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: mesh.cells}, mesh.points)
+    clipped = grid.clip(normal=normal, origin=point, invert=False).triangulate()
+    corners = np.asarray(clipped.points, float)[clipped.cells_dict[pyvista.CellType.TETRA]]
+    return float(np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum()) / 6

@@ -1,0 +1,90 @@
+"""What test_brittle_parallel compares: studies with brittle surfaces run on any number of ranks, in input order.
+
+`mpirun -n 2 python -m mpi4py -m support.shattered OUT.npz`
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fracsim.scene import Scene
+from fracsim.surface.record import EdgeRecord
+
+from .scenes import make_scene, march
+from .torn import MESHES, TIGHT, Found, result_of
+
+STONE = {"young": 1.0, "poisson": 0.2, "density": 1.0}
+JERK_2D = [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.05]}]
+JERK_3D = [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.2, 0.0, 0.05]}]
+STEPS = {"scheme": "newmark", "step": 0.05, "end": 1.2}
+RUNS: dict[str, dict[str, Any]] = {
+    "averaged": {
+        "mesh": MESHES["2d"], "material": STONE | {"energy": "corotated"}, "boundary": JERK_2D, "time": STEPS,
+        "fracture": {"strength": 0.1, "radius": 0.15}, "brittle": {"surfaces": 5, "spacing": 0.1, "per_pass": 2},
+    },
+    "curved": {
+        "mesh": MESHES["3d"], "material": STONE | {"energy": "corotated"}, "boundary": JERK_3D, "time": STEPS,
+        "fracture": {"strength": 0.1, "heterogeneity": {"modulus": 10.0, "seed": 1}},
+        "brittle": {"surfaces": 4, "shape": "curved", "per_pass": 2},
+    },
+    "averaged-curved": {
+        "mesh": MESHES["2d"], "material": STONE | {"energy": "neo-hookean"}, "boundary": JERK_2D, "time": STEPS,
+        "fracture": {"strength": 0.1, "radius": 0.15}, "brittle": {"surfaces": 4, "shape": "curved", "per_pass": 1},
+    },
+    "grains": {
+        "mesh": MESHES["3d"], "material": STONE | {"energy": "corotated"}, "boundary": JERK_3D, "time": STEPS,
+        "fracture": {"strength": 0.1}, "brittle": {"surfaces": 4, "grains": {"count": 12, "seed": 3, "spread": 0.2}},
+    },
+    "bias": {
+        "mesh": MESHES["3d"], "material": STONE | {"energy": "linear"}, "boundary": JERK_3D, "time": STEPS,
+        "fracture": {"strength": 0.1, "approach": "edge"},
+        "brittle": {"surfaces": 3, "grains": {"count": 25, "seed": 3, "mode": "bias"}},
+    },
+    # a lattice stretched alike in all directions: every cell is tied and every direction a principal one
+    "ties": {
+        "mesh": {"builder": "box", "size": [1.0, 0.5], "h": 0.0625},
+        "material": STONE | {"energy": "linear", "poisson": 0.0},
+        "boundary": [
+            {"on": "left", "displacement": [0.0, "free"]}, {"on": "bottom", "displacement": ["free", 0.0]},
+            {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, "free"], [0.2, "free"]]}},
+            {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [["free", 0.0], ["free", 0.1]]}},
+        ],
+        "fracture": {"strength": 0.1}, "brittle": {"surfaces": 3},
+        "time": {"scheme": "quasi-static", "step": 0.125, "end": 0.75},
+    },
+}  # fmt: skip
+
+
+def run(name: str) -> Found:
+    """A study to its end."""
+    scene, state = make_scene(**RUNS[name], solver=TIGHT)
+    rows = [[float(report.broken), report.kinetic, report.elastic] for report in march(scene, state)]
+    return result_of(name, scene, state, rows) | surfaces_of(name, scene)
+
+
+def surfaces_of(name: str, scene: Scene) -> Found:
+    """Where surfaces started and where edges are cut, by sorted keys."""
+    record = EdgeRecord(scene.fracture.graph)
+    record.note(0.0, scene.fracture.surfaces.cut)
+    gathered = record.gathered()
+    found: Found = {f"{name}-starts": scene.fracture.surfaces.starts}
+    if gathered is not None:
+        found[f"{name}-cut"] = gathered[1][:, 1]
+    return found
+
+
+def main(path: str) -> None:
+    """All runs; rank 0 saves."""
+    found: Found = {}
+    for name in RUNS:
+        found |= run(name)
+    if MPI.COMM_WORLD.rank == 0:
+        np.savez(path, **found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
