@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from ...report.content import Cell, Claim, Picture, Plot, Section, Series, Table
+from ...report.pareto import pareto_front
 from .trial import Setting
 
 __all__ = [
@@ -41,19 +42,6 @@ class Point:
     settings: dict[str, Setting] = field(default_factory=dict)
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Numbers of the points (cost, error) that no other point beats: none is as good in both and better in one.
-
-    Ordered by cost. Points that are not finite are never on the front; equal points are on it together.
-    """
-    finite = [i for i, point in enumerate(points) if np.all(np.isfinite(point))]
-    front: list[int] = []
-    for i in sorted(finite, key=lambda i: points[i]):
-        if not front or points[i][1] < points[front[-1]][1] or points[i] == points[front[-1]]:
-            front.append(i)
-    return front
-
-
 def fitted_order(h: Sequence[float], error: Sequence[float]) -> float:
     """Exponent p of error = C h^p: least squares of log error over log h. Needs two different h; errors above 0."""
     x, y = np.log(np.asarray(h, float)), np.log(np.asarray(error, float))
@@ -63,8 +51,8 @@ def fitted_order(h: Sequence[float], error: Sequence[float]) -> float:
 
 def recommended(points: Sequence[Point], limit: float) -> Point | None:
     """The cheapest point with an error of at most `limit`; None where there is none."""
-    good = [point for point in points if point.error <= limit]
-    return min(good, key=lambda point: (point.cost, point.error), default=None)
+    good = sorted((point.cost, point.error, number) for number, point in enumerate(points) if point.error <= limit)
+    return points[good[0][2]] if good else None
 
 
 def timed(seconds: Sequence[float]) -> tuple[float, float]:
