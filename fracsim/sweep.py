@@ -115,10 +115,17 @@ def short_keys(keys: list[str]) -> dict[str, str]:
 def name_of(values: dict[str, str]) -> str:
     """A folder name that can be read: h-0.02_scheme-newmark. A few digits of a hash where characters had to go."""
     whole = "_".join(f"{key}-{value}" for key, value in values.items())
-    safe = re.sub(r"[^A-Za-z0-9.+_-]+", "-", whole.replace('"', "").replace("'", "")).strip("-.")
+    safe = "_".join(f"{key}-{_plain(value)}" for key, value in values.items())
     if safe == whole and len(safe) <= LONGEST_NAME:
         return safe
     return f"{safe[:LONGEST_NAME]}-{hashlib.sha256(whole.encode()).hexdigest()[:6]}"
+
+
+def _plain(value: str) -> str:
+    """A value in characters that no file system or shell minds; a leading minus stays."""
+    if re.fullmatch(r"-?[A-Za-z0-9][A-Za-z0-9.+-]*", value):
+        return value
+    return re.sub(r"[^A-Za-z0-9.+]+", "-", value).strip("-.")
 
 
 def _validated(path: Path, case: Case) -> str:

@@ -104,9 +104,10 @@ def _worth_showing(runs: list[RunData], column: str) -> bool:
     probe = column.rpartition("_")[0]
 
     def largest(name: str) -> float:
-        return max((float(np.max(np.abs(run.history[name]), initial=0.0)) for run in runs), default=0.0)
+        return max(float(np.max(np.abs(run.history.get(name, np.zeros(1))), initial=0.0)) for run in runs)
 
-    return largest(column) > 1e-6 * max(largest(name) for name in runs[0].history if name.rpartition("_")[0] == probe)
+    siblings = {name for run in runs for name in run.history if name.rpartition("_")[0] == probe}
+    return largest(column) > 1e-6 * max(map(largest, siblings))
 
 
 def _motions_of(column: str, runs: list[RunData]) -> Iterator[str]:
