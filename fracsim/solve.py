@@ -30,6 +30,7 @@ DEFAULTS: Options = {
 MULTIGRID: Options = {
     "pc_type": "gamg",
     "pc_gamg_reuse_interpolation": True,
+    "pc_gamg_threshold": 0.0,  # no aggregates across edges that carry nothing (negative: all edges of the pattern)
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
@@ -152,16 +153,19 @@ class Solver:
         """Set the preconditioner up if it has aged. Done here, since SNES has no more than a fixed lag."""
         if self._age == Age.FRESH:
             self._fresh_its = self._fresh_its or ksp.its
-            worn = ksp.its > 1.5 * self._fresh_its + 3
-            self._age = Age.WORN if worn else Age.FRESH if self._keep else Age.DATED
+            self._age = Age.FRESH if self._keep else Age.DATED
+        # also where damage has dated it: coarse spaces from before a crack carry the motion of one side to the other
+        if self._fresh_its and ksp.its > 1.5 * self._fresh_its + 3:
+            self._age = Age.WORN
         if self._age == Age.FRESH:
             return
         if self._age == Age.WORN:
             ksp.pc.reset()
+            self._fresh_its = 0
         ksp.pc.setReusePreconditioner(False)
         ksp.setOperators(self.equations.tangent)
         ksp.setUp()
-        self._age, self._fresh_its = Age.FRESH, 0
+        self._age = Age.FRESH
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
