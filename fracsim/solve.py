@@ -30,7 +30,6 @@ DEFAULTS: Options = {
 MULTIGRID: Options = {
     "pc_type": "gamg",
     "pc_gamg_reuse_interpolation": True,
-    "pc_gamg_threshold": 0.0,  # no aggregates across edges that carry nothing (negative: all edges of the pattern)
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
@@ -196,7 +195,11 @@ class Solver:
 
 def _chosen(equations: Equilibrium, given: Options) -> Options:
     """The study's options over the defaults."""
-    chosen = DEFAULTS | ({} if given.get("pc_type", "gamg") != "gamg" else MULTIGRID)
+    multigrid = given.get("pc_type", "gamg") == "gamg"
+    chosen = DEFAULTS | (MULTIGRID if multigrid else {})
+    if multigrid and equations.scheme.inertia:
+        # no aggregates across edges that carry nothing; without inertia every edge keeps RESIDUAL_STIFFNESS
+        chosen |= {"pc_gamg_threshold": 0.0}
     if equations.forces.pressures and not equations.material.energy.linear:
         chosen |= {"ksp_type": "gmres"}  # the tangent of a following pressure is not symmetric
     return chosen | given

@@ -32,7 +32,7 @@ from .section import Cell, Claim, Picture, Plot, Section, Series, Table, folder_
 from .trial import Trial
 
 CUTS = (0, 1, 10, 100)
-WARM, STEPS = 2, 7
+WARM, STEPS = 2, 5
 LIMIT = 1.10  # what a step after 100 cuts may cost, over one before
 CYLINDER = {"builder": "cylinder", "radius": 0.05, "length": 0.3, "axis": "x"}
 WALL = {"builder": "box", "size": [2.0, 0.3, 1.5], "pattern": "unstructured"}
@@ -61,7 +61,7 @@ def _trial(case: str, ranks: int) -> Trial:
     large = case.startswith("box")
     options = ["--no-baseline"] if ranks > 1 else ["--cuts", "0", "1", "10"] if case == "box-648k-tets" else []
     script = ("fracsim.studies.evidence.growth", case, *options)
-    limit = 3000.0 if large else 300.0
+    limit = 3000.0 if large else 900.0
     return Trial(
         "growth", case, f"ranks-{ranks}", script=script, settings={"ranks": ranks}, ranks=ranks, limit=limit, full=large
     )
