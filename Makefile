@@ -2,7 +2,7 @@
 ranks := 2
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all readers bench lint format clean
+.PHONY: demo test test-all readers bench report report-full lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -26,6 +26,15 @@ readers:
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json
+
+# The evidence: short trials in under 15 minutes on two cores, or all of them. What has been run is not run again.
+report:
+	./env python3 -m fracsim.studies.evidence out/evidence
+	./env fracsim report out/evidence
+
+report-full:
+	./env python3 -m fracsim.studies.evidence out/evidence --full
+	./env fracsim report out/evidence
 
 # mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
 lint:

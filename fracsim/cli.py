@@ -17,6 +17,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of a packaged one")]
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
 _NONE: list[str] = []
+_NO_PATHS: list[Path] = []
 INTERRUPTED = 130  # as typer and shells report SIGINT
 
 
@@ -99,6 +100,39 @@ def render(
     from .picture import Look, render
 
     print(f"saved {render(out, png, Look(colour, explode, view, zoom), frame=frame)}")
+
+
+@app.command()
+def report(
+    outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="folders of runs, sweeps, or of evidence")],
+    html: Annotated[Path | None, typer.Option("-o", "--out", help="the page (OUT/report.html)")] = None,
+    reference: Annotated[list[Path], typer.Option(help="CSV of a curve, columns as in history.csv")] = _NO_PATHS,
+    quantity: Annotated[
+        str | None, typer.Option(help="error against run time of peak_COLUMN, final_COLUMN, ...")
+    ] = None,
+    exact: Annotated[float | None, typer.Option(help="what the quantity should be (that of the finest run)")] = None,
+) -> None:
+    """Tables and plots of runs in one HTML file that needs nothing else, and CSVs beside it."""
+    if not _is_root():
+        return
+    from .report.make import make_report
+
+    print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
+
+
+@app.command()
+def sweep(
+    study: StudyPath,
+    set_: Annotated[list[str], typer.Option("--set", metavar="KEY=A,B,C", help="mesh.h=0.02,0.01")] = _NONE,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME-sweep)")] = None,
+    ranks: Annotated[int, typer.Option(min=1, help="MPI ranks of each run")] = 1,
+    list_: Annotated[bool, typer.Option("--list", help="print one complete command a line for a job array")] = False,
+) -> None:
+    """Run a study once for each combination of values; goes on where it was left."""
+    from .sweep import run_sweep
+
+    path = find_study(study)
+    run_sweep(study, path, set_, out or Path("out") / f"{path.stem}-sweep", ranks=ranks, only_list=list_)
 
 
 @app.command(name="list")

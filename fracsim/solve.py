@@ -152,16 +152,19 @@ class Solver:
         """Set the preconditioner up if it has aged. Done here, since SNES has no more than a fixed lag."""
         if self._age == Age.FRESH:
             self._fresh_its = self._fresh_its or ksp.its
-            worn = ksp.its > 1.5 * self._fresh_its + 3
-            self._age = Age.WORN if worn else Age.FRESH if self._keep else Age.DATED
+            self._age = Age.FRESH if self._keep else Age.DATED
+        # also where damage has dated it: coarse spaces from before a crack carry the motion of one side to the other
+        if self._fresh_its and ksp.its > 1.5 * self._fresh_its + 3:
+            self._age = Age.WORN
         if self._age == Age.FRESH:
             return
         if self._age == Age.WORN:
             ksp.pc.reset()
+            self._fresh_its = 0
         ksp.pc.setReusePreconditioner(False)
         ksp.setOperators(self.equations.tangent)
         ksp.setUp()
-        self._age, self._fresh_its = Age.FRESH, 0
+        self._age = Age.FRESH
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
@@ -192,7 +195,11 @@ class Solver:
 
 def _chosen(equations: Equilibrium, given: Options) -> Options:
     """The study's options over the defaults."""
-    chosen = DEFAULTS | ({} if given.get("pc_type", "gamg") != "gamg" else MULTIGRID)
+    multigrid = given.get("pc_type", "gamg") == "gamg"
+    chosen = DEFAULTS | (MULTIGRID if multigrid else {})
+    if multigrid and equations.scheme.inertia:
+        # no aggregates across edges that carry nothing; without inertia every edge keeps RESIDUAL_STIFFNESS
+        chosen |= {"pc_gamg_threshold": 0.0}
     plastic = equations.material.plastic
     turned = plastic is not None and plastic.frobenius  # pressure makes flow easier, flow makes no pressure
     if turned or (equations.forces.pressures and not equations.material.energy.linear):

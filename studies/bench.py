@@ -67,9 +67,9 @@ def case(n: int, bare: bool) -> dict[str, Any]:
         for _ in range(WARM + STEPS):
             _timed_step(run, stage, times)
             if loop is not None:
-                times["bare"].append(_timed(comm, loop.step))
+                times["bare"].append(timed(comm, loop.step))
         figures = {name: float(np.median(values[WARM:])) for name, values in times.items() if values}
-        figures["output"] = _timed(comm, run._write_frame)
+        figures["output"] = timed(comm, run._write_frame)
         figures["after_fracture"] = _after_fracture(run, stage)
     memory = comm.allreduce(_peak_memory())
     return {"tetrahedra": 24 * n**3, "ranks": comm.size, "peak_memory_GiB": memory, **figures}
@@ -82,14 +82,14 @@ def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
     before = {name: event.getPerfInfo(stage)["time"] for name, event in events.items()}
     fracture = run.scene.stepper.phases["fracture"]
     stage.push()
-    times["step"].append(_timed(run.comm, lambda: _step(run)))
+    times["step"].append(timed(run.comm, lambda: take_step(run)))
     stage.pop()
     for name, event in events.items():
         times[name].append(event.getPerfInfo(stage)["time"] - before[name])
     times["fracture"].append(run.scene.stepper.phases["fracture"] - fracture)
 
 
-def _step(run: Any) -> None:
+def take_step(run: Any) -> None:
     """A step as `fracsim run` takes it, without a frame."""
     report = run.scene.stepper.advance(run.state)
     run.history.append(run.state, report, run._figures(), run.scene.probes())
@@ -108,7 +108,7 @@ def _after_fracture(run: Any, stage: Any) -> float:
     return float(np.median(times["step"][WARM:]))
 
 
-def _timed(comm: Any, work: Any) -> float:
+def timed(comm: Any, work: Any) -> float:
     comm.Barrier()
     began = time.perf_counter()
     work()

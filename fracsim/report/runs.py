@@ -1,0 +1,168 @@
+"""Run folders as the report sees them: settings, history and summary of each."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+
+Values = npt.NDArray[np.float64]
+PHASES = ("setup", "solve", "fracture", "energies", "output")
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What one run left behind.
+
+    Attributes:
+        name: how the page calls it.
+        settings: "table.key" -> value of the study as run.
+        history: column -> values, a number a step; with the motions of driven groups (motion_<probe>_<axis>, m).
+        summary: of summary.json; empty where the run was killed.
+    """
+
+    name: str
+    folder: Path
+    settings: dict[str, Any]
+    history: dict[str, Values]
+    summary: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> str:
+        return str(self.summary.get("outcome", "unfinished"))
+
+    @property
+    def ranks(self) -> int:
+        return int(self.summary.get("ranks", 1))
+
+    @property
+    def wall(self) -> float:
+        """Seconds of wall time; of an unfinished run those of its steps."""
+        return float(self.summary.get("wall", self.history["wall_step"].sum()))
+
+    def figure(self, name: str) -> float:
+        """A quantity by its name: peak_COLUMN, final_COLUMN, or a number of summary.json. InputError where unknown."""
+        kind, _, column = name.partition("_")
+        if column in self.history and kind in ("peak", "final"):
+            values = self.history[column]
+            return float("nan") if not len(values) else float(np.max(np.abs(values)) if kind == "peak" else values[-1])
+        if _is_number(self.summary.get(name)):
+            return float(self.summary[name])
+        columns, figures = ", ".join(self.history), ", ".join(k for k, v in self.summary.items() if _is_number(v))
+        raise InputError(
+            f"--quantity {name}: {self.name} has no such figure. Give peak_COLUMN or final_COLUMN with one of the "
+            f"columns {columns}; or one of {figures or 'the figures of summary.json, which it does not have'}"
+        )
+
+    def column(self, name: str, option: str) -> Values:
+        """A column of the history. InputError where there is none of that name."""
+        if name not in self.history:
+            raise InputError(f"{option}: {self.name} has no column {name}; it has: {', '.join(self.history)}")
+        return self.history[name]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a run has begun there."""
+    return (folder / "study.toml").is_file() and (folder / "history.csv").is_file()
+
+
+def find_runs(folders: list[Path]) -> list[RunData]:
+    """Runs of the folders given, those of a sweep's folder one by one. InputError for a folder that is neither."""
+    found: list[Path] = []
+    for folder in folders:
+        inner = [path for path in _cases(folder) if is_run(path)]
+        if not inner and not is_run(folder):
+            problem = "there is no such folder" if not folder.is_dir() else "it has no study.toml with a history.csv"
+            raise InputError(f"{folder} is not the output folder of a run, a sweep or of evidence: {problem}")
+        found += inner or [folder]
+    return [read_run(path, name) for path, name in zip(found, _names(found), strict=True)]
+
+
+def _cases(folder: Path) -> list[Path]:
+    """Folders of a sweep, in its order; none where there was no sweep."""
+    table = folder / "sweep.csv"
+    if not table.is_file():
+        return []
+    with table.open(newline="", encoding="utf-8") as file:
+        return [folder / row["case"] for row in csv.DictReader(file) if row.get("case")]
+
+
+def _names(folders: list[Path]) -> list[str]:
+    """The last parts of the paths, as many of them as tell the folders apart."""
+    parts = [folder.resolve().parts for folder in folders]
+    for depth in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    raise InputError("the same folder is given twice")
+
+
+def read_run(folder: Path, name: str) -> RunData:
+    """Read one run. InputError where its files are not what a run writes."""
+    try:
+        study = tomllib.loads((folder / "study.toml").read_text(encoding="utf-8"))
+        history = _read_history(folder / "history.csv")
+        path = folder / "summary.json"
+        summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{folder}: its files are not those of a run: {error}") from None
+    return RunData(name, folder, flattened(study), history | _motions(folder, history), summary)
+
+
+def _read_history(path: Path) -> dict[str, Values]:
+    """Columns of history.csv; a last row that was cut short is left out."""
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if not {"time", "step", "wall_step"} <= set(header):
+        raise ValueError("history.csv has no columns step, time and wall_step")
+    table = np.array([row for row in rows if len(row) == len(header)], float).reshape(-1, len(header))
+    return dict(zip(header, table.T, strict=True))
+
+
+def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
+    """How far the groups are driven whose reaction is recorded, m: against it a reaction is usually plotted."""
+    from ..laws import motion_law
+    from ..study_file import load_study
+
+    motions: dict[str, Values] = {}
+    try:
+        study = load_study(folder / "study.toml")
+    except InputError:  # written by another version: its history can be shown all the same
+        return motions
+    for probe in study.probe:
+        axes = [axis for axis in "xyz" if f"reaction_{probe.name}_{axis}" in history]
+        for i, entry in enumerate(study.boundary):
+            if axes and entry.on == probe.on and entry.kind in ("displacement", "velocity"):
+                law, held = motion_law(entry, len(axes), f"boundary.{i}")
+                path = np.array([law(t) for t in history["time"]]).reshape(-1, len(axes))
+                chosen = [k for k in range(len(axes)) if held[k] and np.any(path[:, k])]
+                motions |= {f"motion_{probe.name}_{axes[k]}": path[:, k] for k in chosen}
+    return motions
+
+
+def flattened(data: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested tables as "a.b.0.c" -> value; lists of plain values stay whole."""
+    if isinstance(data, list) and any(isinstance(item, dict) for item in data):
+        data = dict(enumerate(data))
+    if not isinstance(data, dict):
+        return {prefix: data}
+    parts = [flattened(value, f"{prefix}.{key}" if prefix else str(key)) for key, value in data.items()]
+    return {key: value for part in parts for key, value in part.items()}
+
+
+def differing(runs: list[RunData]) -> list[str]:
+    """Settings that are not the same in all runs, in the order of the study; titles left out."""
+    keys = list(dict.fromkeys(key for run in runs for key in run.settings))
+    return [key for key in keys if key != "title" and len({repr(run.settings.get(key)) for run in runs}) > 1]

@@ -1,0 +1,89 @@
+"""Run trials and gather what the page shows: python -m fracsim.studies.evidence OUT [--full] [--only GROUP ...]."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from datetime import date
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ...report.content import Section, to_data
+from ...report.machine import machine, programs
+from .runner import fingerprint, run_trial
+from .trial import Trial
+
+GROUPS = ("precision", "stability", "ladder", "growth", "dependence")
+Records = list[dict[str, Any]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence", description=__doc__)
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the evidence; what is there is not run again")
+    parser.add_argument("--full", action="store_true", help="the long trials too")
+    parser.add_argument("--only", nargs="+", choices=GROUPS, default=GROUPS, metavar="GROUP", help=", ".join(GROUPS))
+    given = parser.parse_args()
+    modules = {name: importlib.import_module(f".{name}", __package__) for name in given.only if _exists(name)}
+    records = {name: _run(name, module.trials(), given.out, given.full) for name, module in modules.items()}
+    path = write_evidence(given.out, records, {name: module.sections for name, module in modules.items()})
+    failed = [record for group in records.values() for record in group if record["outcome"] != "done"]
+    print(
+        f"{sum(map(len, records.values()))} trials, {len(failed)} of them not done; now: fracsim report {path.parent}"
+    )
+
+
+def _exists(group: str) -> bool:
+    return find_spec(f".{group}", __package__) is not None
+
+
+def _run(group: str, trials: list[Trial], out: Path, full: bool) -> Records:
+    """Records of a group; of the long trials only those that are there already, unless `full`."""
+    chosen = [trial for trial in trials if full or not trial.full or recorded(trial, out)]
+    began, records, spent = time.monotonic(), [], 0.0
+    for number, trial in enumerate(chosen, 1):
+        record = run_trial(trial, out)
+        records.append(record)
+        spent += sum(record["wall"])
+        left = spent / number * (len(chosen) - number)
+        line = f"{group} {number}/{len(chosen)} {trial.case}/{trial.name}: {record['outcome']}"
+        print(f"{line}, {record['wall'][-1]:.1f} s, about {left:.0f} s left in the group", flush=True)
+    print(f"{group}: {time.monotonic() - began:.0f} s", flush=True)
+    return records
+
+
+def recorded(trial: Trial, out: Path) -> bool:
+    """Whether this very trial has been run before."""
+    path = out / trial.group / trial.case / trial.name / "record.json"
+    return path.exists() and json.loads(path.read_text())["digest"] == fingerprint(trial)
+
+
+def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any]) -> Path:
+    """OUT/evidence.json: the sections of each group as data, and where each number comes from.
+
+    Groups that were left out this time keep their place. A group whose section cannot be made says so in its place.
+    """
+    path = out / "evidence.json"
+    groups = json.loads(path.read_text())["groups"] if path.exists() else {}
+    groups |= {name: {"sections": _sections(makers[name], group)} for name, group in records.items()}
+    ordered = {name: groups[name] for name in GROUPS if name in groups}
+    out.mkdir(parents=True, exist_ok=True)
+    about = programs() | machine() | {"trials run on": date.today().isoformat()}
+    path.write_text(json.dumps({"about": about, "groups": ordered}, indent=1) + "\n")
+    return path
+
+
+def _sections(make: Any, records: Records) -> list[dict[str, Any]]:
+    try:
+        return to_data(make(records))
+    except Exception as error:
+        text = f"This section could not be made from the records: {type(error).__name__}: {error}"
+        print(text, file=sys.stderr)
+        return to_data([Section(f"{records[0]['group'] if records else 'an empty group'}: failed", text)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""The ladder: what each feature costs where it is used, and that it costs nothing where it is not.
+
+    python -m fracsim.studies.evidence.ladder RUNG [--n 10] -o figures.json
+
+Each rung is the bar of `make bench` (24 n^3 tetrahedra, one Newton iteration and CG to 1e-6 a step) with one feature
+more. It is timed step by step in turn with the elastic bar in one process; the elastic bar itself in turn with the bare
+loop of bench.py, which knows no features at all. Start-up, modules, fields and memory: in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from ...study import Study
+from ..bench import study as bench_study
+from ..bench import take_step, timed
+from .section import Cell, Claim, Plot, Section, Series, Table
+from .trial import Trial
+
+WARM, STEPS = 3, 15
+SHORT, LONG = 10, 20  # cells along a metre: 24k and 192k tetrahedra
+LIMIT = 1.05  # what the elastic bar may cost over the bare loop
+DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never stressed enough to break by itself
+FRACTURE_MODULES = ("fracture", "graph", "degrade", "strength", "edge_stress", "pieces")
+OPTIONAL = (*FRACTURE_MODULES, "average", "surface", "forms.damage", "plasticity", "brittle", "picture", "report")
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One scene.
+
+    Attributes:
+        tables: what differs from the elastic bar; None takes a table away.
+        uses: modules of `OPTIONAL` that it may import (with what lies inside them).
+        cut: whether a plane across the middle is broken before the first step.
+        plane: whether it is the 2D bar, of about as many triangles.
+        after: name of the rung that it is compared with; "" for the bare loop.
+        needs: table of the study file without which the program has no such rung.
+    """
+
+    tables: dict[str, Any] = field(default_factory=dict)
+    uses: tuple[str, ...] = ()
+    cut: bool = False
+    plane: bool = False
+    after: str = "elastic"
+    needs: str = ""
+
+
+def rungs(n: int) -> dict[str, Rung]:
+    """All rungs by name, those that this version of the program has."""
+    near = {"fracture": DAMAGE["fracture"] | {"radius": 2 / n}}
+    average = (*FRACTURE_MODULES, "average")
+    every = {
+        "elastic": Rung(after=""),
+        "linear": Rung({"material": {"energy": "linear"}}),
+        "corotated": Rung({"material": {"energy": "corotated"}}),
+        "damage": Rung(DAMAGE, FRACTURE_MODULES),
+        "damage-cut": Rung(DAMAGE, FRACTURE_MODULES, cut=True),
+        "average": Rung(near, average),
+        "average-cut": Rung(near, average, cut=True),
+        "surface": Rung(DAMAGE | {"output": {"surface": True}}, (*FRACTURE_MODULES, "surface"), cut=True),
+        "plasticity": Rung({"plasticity": {"yield_stress": 2e4}}, ("plasticity",), needs="plasticity"),
+        "brittle": Rung(
+            DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, "brittle"), needs="brittle"
+        ),
+        "plane": Rung(plane=True),
+        "plane-damage": Rung(DAMAGE, FRACTURE_MODULES, plane=True, after="plane"),
+    }  # fmt: skip
+    return {name: rung for name, rung in every.items() if not rung.needs or rung.needs in Study.model_fields}
+
+
+def trials() -> list[Trial]:
+    """Every rung at 24k tetrahedra, and at 192k in full."""
+    return [_trial(name, n) for n in (SHORT, LONG) for name in rungs(n)]
+
+
+def _trial(name: str, n: int) -> Trial:
+    script = ("fracsim.studies.evidence.ladder", name, "--n", str(n))
+    settings: dict[str, Any] = {"rung": name, "n": n}
+    return Trial("ladder", f"n-{n}", name, script=script, settings=settings, limit=60.0 * n / 2, full=n > SHORT)
+
+
+def rung_study(name: str, n: int) -> dict[str, Any]:
+    """The study of a rung."""
+    rung, data = rungs(n)[name], bench_study(n)
+    del data["fracture"]
+    data["output"] |= {"surface": False}
+    if rung.plane:
+        h = 1 / round((3 * n**3) ** 0.5)  # 8 / h^2 triangles
+        data["mesh"] = {"builder": "box", "size": [1.0, 4.0], "h": h}
+        data["boundary"] = [{"on": "bottom", "fix": "xy"}, {"on": "top", "velocity": [0.0, 1.0]}]
+        data["load"] = {"gravity": [0.0, -9.81]}
+    for key, table in rung.tables.items():
+        data[key] = data.get(key, {}) | table
+    return data
+
+
+# --- the script -----------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    began = time.perf_counter()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rung")
+    parser.add_argument("--n", type=int, default=SHORT)
+    parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    if given.alone:
+        given.out.write_text(json.dumps(alone(given.rung, given.n, began)))
+        return
+    figures = in_turn(given.rung, given.n)  # first, so that its kernels are compiled before a start-up is timed
+    part = given.out.with_name("alone.json")
+    command = [sys.executable, "-m", "fracsim.studies.evidence.ladder", given.rung, "--n", str(given.n), "--alone"]
+    subprocess.run([*command, "-o", str(part)], check=True, timeout=600)
+    given.out.write_text(json.dumps(figures | json.loads(part.read_text()), indent=1) + "\n")
+
+
+def started(name: str, n: int, folder: Path) -> Any:
+    """The run of a rung, ready to step."""
+    from mpi4py import MPI
+
+    from ...run import Run
+    from ...scene import build_scene
+    from ...study_file import validate
+
+    run = Run(build_scene(MPI.COMM_WORLD, validate(rung_study(name, n), name)), folder)
+    if rungs(n)[name].cut:
+        from .growth import cut_planes
+
+        # through the middle, askew and off the nodes of the lattice
+        cut_planes(run, [((0.02, 0.03, 1.0), 0.5013 * (run.scene.domain.lower + run.scene.domain.upper))])
+        run._note_breaks()
+    return run
+
+
+def alone(name: str, n: int, began: float) -> dict[str, Any]:
+    """Start-up, modules, fields and memory of a rung by itself."""
+    from ... import run, scene  # noqa: F401  what every run imports: memory is counted from here
+
+    before = _memory("VmRSS")
+    with tempfile.TemporaryDirectory() as folder:
+        started_ = started(name, n, Path(folder))
+        take_step(started_)
+        start_up = time.perf_counter() - began
+        for _ in range(WARM):
+            take_step(started_)
+        frame = timed(started_.comm, started_._write_frame)
+        cells = started_.scene.domain.cell_count
+        modules = sorted(name for name in sys.modules if name.startswith("fracsim.") and ".studies" not in name)
+        fields = _fields()
+    memory = (_memory("VmHWM") - before) / cells
+    return {
+        "start_up": start_up,
+        "frame": frame,
+        "cells": cells,
+        "memory_per_cell": memory,
+        "modules": modules,
+        **fields,
+    }
+
+
+def _memory(which: str) -> float:
+    """Bytes that this process holds (VmRSS) or has held at most (VmHWM); ru_maxrss would start from its parent's."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * float(next(line for line in lines if line.startswith(which)).split()[1])
+
+
+def _fields() -> dict[str, int]:
+    """DOLFINx functions that are alive, and their bytes."""
+    import gc
+
+    from dolfinx import fem
+
+    gc.collect()
+    # by type: isinstance would ask proxies for their class
+    found = [thing for thing in gc.get_objects() if type(thing) is fem.Function]
+    return {"fields": len(found), "field_bytes": sum(function.x.array.nbytes for function in found)}
+
+
+def in_turn(name: str, n: int) -> dict[str, Any]:
+    """Seconds per step of a rung and of what it is compared with, one step of each in turn."""
+    rung = rungs(n)[name]
+    with tempfile.TemporaryDirectory() as folder:
+        run = started(name, n, Path(folder, "rung"))
+        run._write_frame()  # for its kernels
+        if rung.after:
+            other = started(rung.after, n, Path(folder, "other"))
+            compared = lambda: take_step(other)  # noqa: E731
+        else:
+            from ..bench import Bare
+
+            compared = Bare(n, run.scene.domain).step
+        times: tuple[list[float], list[float]] = ([], [])
+        for number in range(WARM + STEPS):
+            # each first in half of the turns: what runs second finds the caches full of the other's data
+            for which in (0, 1) if number % 2 else (1, 0):
+                times[which].append(timed(run.comm, compared if which else lambda: take_step(run)))
+    pairs = list(zip(times[0][WARM:], times[1][WARM:], strict=True))
+    return {
+        "after": rung.after or "bare",
+        "step": median(a for a, _ in pairs), "step_spread": _spread([a for a, _ in pairs]),
+        "ratio": median(a / b for a, b in pairs), "ratio_spread": _spread([a / b for a, b in pairs]),
+    }  # fmt: skip
+
+
+def _spread(values: list[float]) -> float:
+    """Half the distance between the quartiles."""
+    import numpy as np
+
+    low, high = np.percentile(values, [25, 75])
+    return float(high - low) / 2
+
+
+# --- the section ----------------------------------------------------------------------------------------------------
+
+
+def strangers(name: str, n: int, modules: list[str]) -> list[str]:
+    """Modules of features that a rung imported without using them."""
+    optional = {module for module in modules for part in OPTIONAL if _inside(module, part)}
+    allowed = {module for module in modules for part in rungs(n)[name].uses if _inside(module, part)}
+    return sorted(optional - allowed)
+
+
+def _inside(module: str, part: str) -> bool:
+    return f"{module}.".startswith(f"fracsim.{part}.")
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """Table, bars of ratios, and the claim."""
+    columns = (
+        "cells along 1 m", "scene", "cells", "s a step", "±", "compared with", "ratio", "± ", "frame s", "start-up s",
+        "memory bytes/cell", "fields", "field bytes/cell", "modules", "modules beyond the elastic scene", "outcome",
+    )  # fmt: skip
+    base = _modules_of_elastic(records)
+    rows = tuple(_row(record, base) for record in records)
+    text = (
+        f"Medians of {STEPS} steps, each timed in turn with a step of what it is compared with in one process; ratio: "
+        "the median of those of single steps; ± half the distance between the quartiles. The elastic scene is compared "
+        "with the same loop written bare in DOLFINx. 'cut': a plane through the middle is broken. 'frame': writing one "
+        "frame, which no step contains. Start-up: from the first import to the end of the first step, kernels compiled "
+        "before."
+    )
+    plot = Plot(
+        "Seconds per step over those of the scene compared with",
+        "scene, in the order of the table", "ratio", _bars(records), levels=(1.0, LIMIT),
+    )  # fmt: skip
+    table = Table("ladder", "What each feature costs", columns, rows)
+    title = "Ladder: the cost of what is used, and of what is not"
+    return [Section(title, text, _claims(records), (table,), (plot,))]
+
+
+def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:
+    elastic = (record["figures"].get("modules", []) for record in records if record["name"] == "elastic")
+    return {module for modules in elastic for module in modules}
+
+
+def _row(record: dict[str, Any], base: set[str]) -> tuple[Cell, ...]:
+    get, cells = record["figures"].get, record["figures"].get("cells")
+    modules = get("modules", [])
+    beyond = ", ".join(sorted(name.removeprefix("fracsim.") for name in set(modules) - base))
+    outcome = record["outcome"] if record["outcome"] == "done" else f"{record['outcome']}: {record['message']}"
+    return (
+        record["settings"]["n"], record["name"], cells, get("step"), get("step_spread"), get("after"), get("ratio"),
+        get("ratio_spread"), get("frame"), get("start_up"), get("memory_per_cell"), get("fields"),
+        get("field_bytes") / cells if cells else None, len(modules), beyond, outcome,
+    )  # fmt: skip
+
+
+def _bars(records: list[dict[str, Any]]) -> tuple[Series, ...]:
+    result = []
+    for n in (SHORT, LONG):
+        shown = [record for record in records if record["settings"]["n"] == n and "ratio" in record["figures"]]
+        figures = [record["figures"] for record in shown]
+        if shown:
+            names, places = tuple(record["name"] for record in shown), tuple(map(float, range(len(shown))))
+            y, spread = (tuple(each[key] for each in figures) for key in ("ratio", "ratio_spread"))
+            result.append(Series(f"{24 * n**3:,} tets", places, y, "points", names, spread))
+    return tuple(result)
+
+
+def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
+    elastic = [record for record in records if record["name"] == "elastic" and "ratio" in record["figures"]]
+    ratios = ", ".join(f"{record['figures']['ratio']:.3f} at {record['figures']['cells']:,} tets" for record in elastic)
+    cheap = all(record["figures"]["ratio"] <= LIMIT for record in elastic) if elastic else None
+    found = {
+        record["name"]: strangers(record["name"], record["settings"]["n"], record["figures"]["modules"])
+        for record in records
+        if "modules" in record["figures"]
+    }
+    extra = "; ".join(f"{name}: {', '.join(modules)}" for name, modules in found.items() if modules)
+    none = f"{len(found)} scenes, none imports the modules of another's feature"
+    return (
+        Claim(
+            "Features that are off cost at most 5 % of a step (elastic scene over bare loop)",
+            ratios or "nothing",
+            cheap,
+        ),
+        Claim("A feature that is off imports nothing", extra or none, not extra if found else None),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Duplication of cut cells with virtual nodes: what methods that open a crack by new unknowns have to solve.
+
+The baseline of the report, after Molino, Bao and Fedkiw (2004), A virtual node algorithm for changing mesh topology
+during simulation; Bao et al. (2007) fracture with it, and the unknowns are those that an extended finite element method
+with shifted Heaviside functions adds. Each cut cell becomes one copy for each group of nodes that its intact edges
+still join. A copy owns the nodes of its group and gets virtual ones for the rest. Copies in cells with a common face
+are one material where they own a common node of that face: there they share all three nodes of it, so that the
+displacement is continuous. At the tip of a crack two copies of one cell may come to share a whole face this way, which
+then has three cells; DOLFINx has no such meshes, and the copy that owns less of the face keeps its virtual nodes there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Duplicated:
+    """The mesh with copies.
+
+    Attributes:
+        cells: (copies, d + 1) new nodes.
+        owned: (copies, d + 1) whether the copy owns the node; the others are virtual.
+        cell: (copies,) the cell that each is a copy of.
+        node: (new nodes,) the node that each is a copy of.
+        share: (copies,) part of the cell's material: owned nodes over d + 1. They sum to 1 over the copies of a cell.
+    """
+
+    cells: Ints
+    owned: npt.NDArray[np.bool_]
+    cell: Ints
+    node: Ints
+    share: npt.NDArray[np.float64]
+
+
+def duplicate(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], nodes: int) -> Duplicated:
+    """Copies of `cells` (m, d + 1) by `groups` (m, d + 1): the lowest local node that each local node is joined to."""
+    corners: Ints = np.asarray(cells, np.int64)
+    joined: Ints = np.asarray(groups, np.int64)
+    leads = joined == np.arange(corners.shape[1])  # a copy for each group, named by its lowest node
+    number: Ints = np.cumsum(leads).reshape(leads.shape) - 1
+    of_node: Ints = np.take_along_axis(number, joined, axis=1)  # (m, d + 1) the copy that owns each local node
+    cell, lead = np.nonzero(leads)
+    owned = joined[cell] == lead[:, None]
+    own, shared = _owners(corners, of_node, nodes), _across_faces(corners, joined, of_node, nodes)
+    alone = np.zeros(len(cell), bool)
+    while True:
+        kept = shared[:, ~alone[(shared - nodes) // corners.shape[1]].any(axis=0)]
+        places, source = _joined(np.concatenate([own, kept], axis=1), nodes, corners[cell])
+        found = _third_cells(places, owned, cell) & ~alone
+        if not found.any():
+            return Duplicated(places, owned, cell, source, owned.mean(axis=1))
+        alone |= found
+
+
+def _joined(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
+    """New nodes of the copies, (copies, d + 1), and what each is a copy of: places that pairs connect are one node."""
+    total = nodes + originals.size
+    graph = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), (total, total))
+    count, label = connected_components(graph, directed=False)
+    source = np.empty(count, np.int64)
+    source[label[:nodes]] = np.arange(nodes)
+    places: Ints = label[nodes:].reshape(originals.shape).astype(np.int64)
+    source[places] = originals
+    return places, source
+
+
+def _third_cells(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints) -> npt.NDArray[np.bool_]:
+    """(copies,) those that share a whole face with another copy of their cell, and own less of it."""
+    result, width = np.zeros(len(cell), bool), places.shape[1]
+    for apart in range(1, width):  # copies of a cell follow each other
+        a = np.flatnonzero(cell[apart:] == cell[:-apart])
+        b = a + apart
+        face = places[a] == places[b]
+        whole = np.count_nonzero(face, axis=1) >= width - 1
+        a, b, face = a[whole], b[whole], face[whole]
+        less = np.count_nonzero(owned[a] & face, axis=1) < np.count_nonzero(owned[b] & face, axis=1)
+        result[np.where(less, a, b)] = True
+    return result
+
+
+def _owners(cells: Ints, of_node: Ints, nodes: int) -> Ints:
+    """(2, n) pairs: the place of each owned node in its copy, and the node itself."""
+    width = cells.shape[1]
+    return np.stack([(nodes + of_node * width + np.arange(width)).ravel(), cells.ravel()])
+
+
+def _across_faces(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> Ints:
+    """(2, n) pairs of places that copies in neighbouring cells share, because they own a common node of the face."""
+    first, second, at_first, at_second = _common_faces(cells, np.any(groups != 0, axis=1))
+    width, pairs = cells.shape[1], []
+    for own in range(width - 1):
+        a = of_node[first, at_first[:, own]]
+        b = of_node[second, at_second[:, own]]
+        pairs += [
+            np.stack([nodes + a * width + at_first[:, k], nodes + b * width + at_second[:, k]])
+            for k in range(width - 1)
+        ]
+    return np.concatenate(pairs, axis=1)
+
+
+def _common_faces(cells: Ints, cut: npt.NDArray[np.bool_]) -> tuple[Ints, Ints, Ints, Ints]:
+    """Cells on both sides of the inner faces at which a cut cell lies, and the local nodes of the face in each of them.
+
+    (n,), (n,), (n, d), (n, d): column k is the same node on both sides.
+    """
+    width = cells.shape[1]
+    local = np.array([[k for k in range(width) if k != face] for face in range(width)])
+    faces = cells[:, local].reshape(-1, width - 1)
+    order = np.argsort(faces, axis=1)
+    keys = np.take_along_axis(faces, order, axis=1)
+    at = np.take_along_axis(np.tile(local, (len(cells), 1)), order, axis=1)
+    sorted_ = np.lexsort(keys.T[::-1])
+    same = np.all(keys[sorted_[1:]] == keys[sorted_[:-1]], axis=1)
+    a, b = sorted_[:-1][same], sorted_[1:][same]
+    wanted = cut[a // width] | cut[b // width]
+    a, b = a[wanted], b[wanted]
+    return a // width, b // width, at[a], at[b]

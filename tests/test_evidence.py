@@ -1,0 +1,245 @@
+"""The evidence: fronts, orders and recommendations against brute force; duplication with virtual nodes; trials once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from fracsim.graph import local_edges, node_groups
+from fracsim.meshes.box import lattice
+from fracsim.meshes.topology import facets_of, signed_measures
+from fracsim.studies.evidence import __main__ as program
+from fracsim.studies.evidence import growth, ladder
+from fracsim.studies.evidence.section import Point, Section, fitted_order, pareto_front, recommended, timed
+from fracsim.studies.evidence.trial import Trial
+from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
+
+POINTS = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
+
+
+# --- arithmetic -----------------------------------------------------------------------------------------------------
+
+
+@given(POINTS)
+def test_the_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
+    def beaten(p: tuple[int, int]) -> bool:
+        return any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points)
+
+    front = pareto_front([(float(a), float(b)) for a, b in points])
+    assert sorted(front) == [i for i, point in enumerate(points) if not beaten(point)]
+    assert [points[i] for i in front] == sorted(points[i] for i in front)
+
+
+def test_failed_points_are_on_no_front() -> None:
+    assert pareto_front([(1.0, float("nan")), (2.0, 3.0), (float("inf"), 0.0)]) == [1]
+
+
+@given(st.floats(0.5, 4.0), st.floats(1e-6, 1e3))
+def test_an_exact_power_has_its_order(order: float, factor: float) -> None:
+    h = np.array([0.2, 0.1, 0.07, 0.01])
+    assert fitted_order(h.tolist(), (factor * h**order).tolist()) == pytest.approx(order, rel=1e-9)
+
+
+def test_the_order_is_that_of_least_squares() -> None:
+    h, error = np.array([0.4, 0.2, 0.1, 0.05]), np.array([0.31, 0.07, 0.022, 0.004])
+    slope = np.polyfit(np.log(h), np.log(error), 1)[0]
+    assert fitted_order(h.tolist(), error.tolist()) == pytest.approx(slope, rel=1e-12)
+
+
+@given(POINTS, st.integers(0, 6))
+def test_the_recommended_setting_is_the_cheapest_that_is_good_enough(points: list[tuple[int, int]], limit: int) -> None:
+    given_ = [Point(float(a), float(b)) for a, b in points]
+    found = recommended(given_, limit)
+    good = [point for point in given_ if point.error <= limit]
+    assert (found is None) == (not good)
+    assert found is None or (found in good and all(found.cost <= point.cost for point in good))
+
+
+def test_timings_are_medians_with_half_their_range() -> None:
+    assert timed([3.0, 1.0, 1.5]) == (1.5, 1.0)
+
+
+# --- virtual nodes --------------------------------------------------------------------------------------------------
+
+
+def block(steps: tuple[int, int, int]) -> tuple[Any, Any]:
+    points, cells = lattice(steps)
+    return points * np.array(steps), cells
+
+
+def groups_after(cells: Any, broken: Any) -> Any:
+    """Node groups of cells whose edges are broken where `broken(a, b)` says so, for arrays of nodes."""
+    edges = local_edges(3)
+    flags = broken(cells[:, edges[:, 0]], cells[:, edges[:, 1]])
+    return node_groups(3)[flags @ (1 << np.arange(len(edges)))]
+
+
+def pieces_of(cells: Any, nodes: int) -> int:
+    a, b = cells[:, :-1].ravel(), cells[:, 1:].ravel()
+    return int(connected_components(coo_array((np.ones(len(a)), (a, b)), (nodes, nodes)))[0])
+
+
+def check_laws(points: Any, cells: Any, new: Duplicated) -> None:
+    """What holds for any cut: copies lie where their cell lies, material is neither lost nor made, the mesh is one."""
+    np.testing.assert_array_equal(new.node[new.cells], cells[new.cell])
+    np.testing.assert_allclose(np.bincount(new.cell, new.share), 1.0, rtol=1e-15)
+    volume = np.abs(signed_measures(points[new.node], new.cells)) @ new.share
+    assert volume == pytest.approx(np.abs(signed_measures(points, cells)).sum(), rel=1e-12)
+    assert new.owned.sum() == cells.size, "each corner of each cell is owned by one copy"
+    faces = np.sort(facets_of(new.cells).reshape(-1, 3), axis=1)
+    assert np.unique(faces, axis=0, return_counts=True)[1].max() <= 2, "no face has three cells"
+    assert np.array_equal(np.unique(new.cells), np.arange(len(new.node)))
+
+
+def test_a_whole_body_is_left_as_it_is() -> None:
+    points, cells = block((3, 2, 2))
+    new = duplicate(cells, np.zeros_like(cells), len(points))
+    np.testing.assert_array_equal(new.node[new.cells], cells)
+    assert len(new.node) == len(points) and new.share.min() == 1.0 and len(new.cells) == len(cells)
+
+
+def test_a_plane_through_doubles_the_nodes_beside_it() -> None:
+    """Cut between x = 1 and x = 2 of a lattice: the 12 nodes of each of the two layers get a virtual twin, and every
+    cell between them a twin: 3 x 2 cubes of 6 cells."""
+    points, cells = block((4, 3, 2))
+    groups = groups_after(cells, lambda a, b: (points[a, 0] < 1.5) != (points[b, 0] < 1.5))
+    new = duplicate(cells, groups, len(points))
+    check_laws(points, cells, new)
+    assert len(new.node) == len(points) + 2 * 12
+    assert len(new.cells) == len(cells) + 3 * 2 * 6
+    assert pieces_of(new.cells, len(new.node)) == 2
+
+
+def test_a_cut_that_ends_inside_leaves_one_body() -> None:
+    """The same plane over half of a greater width: what lies ahead of its tip stays joined."""
+    points, cells = block((4, 8, 2))
+
+    def broken(a: Any, b: Any) -> Any:
+        across = (points[a, 0] < 1.5) != (points[b, 0] < 1.5)
+        return across & (points[a, 1] < 4.5) & (points[b, 1] < 4.5)
+
+    new = duplicate(cells, groups_after(cells, broken), len(points))
+    check_laws(points, cells, new)
+    assert pieces_of(new.cells, len(new.node)) == 1
+    copies = np.bincount(new.node)
+    beside = np.isin(points[:, 0], (1, 2))
+    np.testing.assert_array_equal(copies[beside & (points[:, 1] <= 2)], 2, "behind the tip, as in a plane through")
+    np.testing.assert_array_equal(copies[~beside | (points[:, 1] > 5)], 1, "ahead of it and elsewhere nothing changes")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_pieces_are_those_of_the_graph(share: float, seed: int) -> None:
+    """Edges broken at random, crack tips everywhere: nodes are joined in the mesh where intact edges join them."""
+    points, cells = block((3, 3, 2))
+    count = len(points)
+    cut = np.random.default_rng(seed).random((count, count)) < share
+    cut |= cut.T
+    new = duplicate(cells, groups_after(cells, lambda a, b: cut[a, b]), count)
+    check_laws(points, cells, new)
+    pairs = cells[:, local_edges(3)].reshape(-1, 2)
+    a, b = pairs[~cut[pairs[:, 0], pairs[:, 1]]].T
+    graph = coo_array((np.ones(len(a)), (a, b)), (count, count))
+    assert pieces_of(new.cells, len(new.node)) == connected_components(graph, directed=False)[0]
+
+
+# --- growth and ladder ----------------------------------------------------------------------------------------------
+
+
+def test_growth_of_a_small_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One plane halves the body for both methods; only the baseline has more unknowns for it, and both move alike."""
+    mesh = {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1}
+    monkeypatch.setitem(growth.SCENES, "small", mesh)
+    figures = growth.measure("small", [0, 1], baseline=True)
+    before, after = figures["stages"]
+    assert (before["pieces"], after["pieces"]) == (1, 2) and before["broken_edges"] == 0 < after["broken_edges"]
+    assert before["unknowns"] == after["unknowns"] == before["baseline_unknowns"] == 3 * figures["nodes"]
+    # between x = 0.3 and x = 0.4 lie two layers of 3 x 3 nodes, which get twins
+    assert figures["nodes"] == 7 * 9 and after["baseline_unknowns"] == 3 * (figures["nodes"] + 2 * 9)
+    assert all(stage[key] > 0 for stage in figures["stages"] for key in ("cut", "whole", "baseline", "cut_ratio"))
+
+
+def test_sections_show_what_failed() -> None:
+    """Groups make their sections from records of trials that failed, and say so."""
+    for module in (growth, ladder):
+        records = [
+            {
+                "group": trial.group, "case": trial.case, "name": trial.name, "settings": trial.settings, "ranks": 1,
+                "outcome": "failed (1)", "message": "boom", "command": "x", "wall": [1.0], "stepping": [],
+                "summary": None, "figures": {},
+            }
+            for trial in module.trials()
+        ]  # fmt: skip
+        sections = module.sections(records)
+        rows = [row for section in sections for table in section.tables for row in table.rows]
+        assert len(rows) == len(records) and all(str(row[-1]).startswith("failed (1)") for row in rows)
+        assert all(claim.holds is not True for section in sections for claim in section.claims)
+
+
+def test_modules_of_other_features_are_noticed() -> None:
+    modules = ["fracsim.run", "fracsim.surface", "fracsim.surface.record", "fracsim.graph", "fracsim.average"]
+    assert ladder.strangers("elastic", 10, modules) == sorted(modules[1:])
+    assert ladder.strangers("damage", 10, ["fracsim.graph", "fracsim.average"]) == ["fracsim.average"]
+    assert ladder.strangers("average", 10, ["fracsim.graph", "fracsim.average"]) == []
+
+
+def test_every_rung_is_a_study() -> None:
+    from fracsim.study_file import validate
+
+    for name in ladder.rungs(4):
+        assert validate(ladder.rung_study(name, 4), name).title.startswith("bench")
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+
+def test_trials_run_once_and_failed_ones_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three trials one fails and one is for --full; a second call takes what is there, a third what is new."""
+
+    class Group:
+        @staticmethod
+        def trials() -> list[Trial]:
+            broken = ("fracsim.no_such_module",)
+            return [
+                Trial("ladder", "a", "good", script=("json.tool", "--help"), limit=20.0),
+                Trial("ladder", "a", "bad", script=broken, limit=20.0),
+                Trial("ladder", "a", "long", script=broken, limit=20.0, full=True),
+            ]
+
+        @staticmethod
+        def sections(records: list[dict[str, Any]]) -> list[Section]:
+            return [Section(" ".join(f"{record['name']} {record['outcome']}" for record in records))]
+
+    monkeypatch.setattr(program.importlib, "import_module", lambda *_: Group)
+
+    def title(*options: str) -> str:
+        monkeypatch.setattr("sys.argv", ["evidence", str(tmp_path), "--only", "ladder", *options])
+        program.main()
+        data = json.loads((tmp_path / "evidence.json").read_text())
+        assert data["about"]["cores"]
+        return str(data["groups"]["ladder"]["sections"][0]["title"])
+
+    record = tmp_path / "ladder" / "a" / "good" / "record.json"
+    assert title() == "good done bad failed (1)"
+    made = record.stat().st_mtime_ns
+    assert title() == "good done bad failed (1)"
+    assert title("--full") == "good done bad failed (1) long failed (1)"
+    assert title() == "good done bad failed (1) long failed (1)", "what --full has left is shown"
+    assert record.stat().st_mtime_ns == made
+
+
+def test_a_section_that_cannot_be_made_says_so(tmp_path: Path) -> None:
+    def broken(records: list[dict[str, Any]]) -> list[Section]:
+        raise KeyError("step")
+
+    path = program.write_evidence(tmp_path, {"growth": [{"group": "growth"}]}, {"growth": broken})
+    (section,) = json.loads(path.read_text())["groups"]["growth"]["sections"]
+    assert "KeyError: 'step'" in section["text"]

@@ -1,0 +1,214 @@
+"""fracsim report: one page that needs nothing else, with the numbers of the runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cases import BAR, STRIP, fracsim, write_study
+from fracsim.errors import InputError
+from fracsim.report.content import Claim, Picture, Plot, Section, Series, Table, from_data, to_data
+from fracsim.report.make import make_report
+from fracsim.report.page import write_page
+from fracsim.report.runs import find_runs, flattened
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of the bar over two cell sizes, and one run of a strip that breaks."""
+    folder = tmp_path_factory.mktemp("report")
+    bar = write_study(folder / "bar.toml", BAR)
+    assert fracsim("sweep", bar, "--set", "mesh.h=0.25,0.125", "-o", folder / "sweep").returncode == 0
+    strip = write_study(folder / "strip.toml", STRIP, time={"end": 0.1})
+    assert fracsim("run", strip, "-o", folder / "strip").returncode == 0
+    return folder
+
+
+class Page(HTMLParser):
+    """Tags that are open, and everything that would be fetched from elsewhere."""
+
+    VOID = ("meta", "link", "img", "br")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.fetched: list[str] = []
+        self.ids: list[str] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+        for key, value in attributes:
+            if key in ("src", "href", "xlink:href", "data", "poster") and not (value or "").startswith(("#", "data:")):
+                self.fetched.append(f"{tag} {key}={value}")
+            if key == "id" and value:
+                self.ids.append(value)
+
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attributes)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def parsed(path: Path) -> Page:
+    page = Page()
+    page.feed(path.read_text())
+    assert not page.open, "every tag is closed"
+    return page
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_page_needs_nothing_else(runs: Path, tmp_path: Path) -> None:
+    target = make_report([runs / "sweep", runs / "strip"], tmp_path / "page.html", references=[])
+    text, page = target.read_text(), parsed(target)
+    assert page.fetched == [] and "http" not in text and "<script" not in text and "@import" not in text
+    assert "url(" not in re.sub(r"url\(#\w+\)", "", text)
+    assert text.count("<svg") >= 8
+    # markers and clips that plots refer to: each must be in the page once, or plots would draw those of others
+    referred = set(re.findall(r'(?:url\(|xlink:href=")#(\w+)', text))
+    assert referred and all(page.ids.count(name) == 1 for name in referred)
+
+
+def test_the_numbers_are_those_of_the_runs(runs: Path, tmp_path: Path) -> None:
+    make_report([runs / "sweep", runs / "strip"], tmp_path / "page.html", references=[])
+    found = {row["run"]: row for row in table(tmp_path / "page" / "runs.csv")}
+    assert len(found) == 3
+    for name, folder in (("h-0.125", runs / "sweep" / "h-0.125"), ("strip", runs / "strip")):
+        summary, row = json.loads((folder / "summary.json").read_text()), found[name]
+        assert float(row["wall s"]) == summary["wall"] and int(row["cells"]) == summary["cells"]
+        assert float(row["peak reaction_grip_x N"]) == summary["peak_reactions"]["reaction_grip_x"]
+        assert int(row["broken edges"]) == summary["broken_edges"]
+        assert float(row["solve s"]) == summary["seconds"]["solve"]
+    assert int(found["strip"]["broken edges"]) > 0
+    assert {found[name]["mesh.h"] for name in found} == {"0.25", "0.125"}
+
+
+def test_error_against_run_time(runs: Path, tmp_path: Path) -> None:
+    """The error of the coarse run is that of its peak beside that of the fine one; the fine one has none."""
+    quantity = "peak_reaction_grip_x"
+    make_report([runs / "sweep"], tmp_path / "page.html", references=[], quantity=quantity)
+    coarse, fine = table(tmp_path / "page" / "precision.csv")
+    peaks = [
+        np.abs(np.genfromtxt(runs / "sweep" / name / "history.csv", delimiter=",", names=True)["reaction_grip_x"]).max()
+        for name in ("h-0.25", "h-0.125")
+    ]
+    assert float(coarse["error, relative"]) == pytest.approx(abs(peaks[0] / peaks[1] - 1), rel=1e-12)
+    assert fine["error, relative"] == ""
+    make_report([runs / "sweep"], tmp_path / "page.html", references=[], quantity=quantity, exact=2 * peaks[0])
+    assert [float(row["error, relative"]) for row in table(tmp_path / "page" / "precision.csv")] == pytest.approx(
+        [0.5, 1 - peaks[1] / (2 * peaks[0])]
+    )
+
+
+def test_a_reference_that_is_the_run_is_no_distance_away(runs: Path, tmp_path: Path) -> None:
+    (run,) = find_runs([runs / "strip"])
+    x, y = run.history["motion_grip_x"], run.history["reaction_grip_x"]
+    np.testing.assert_allclose(x, run.history["time"] * 1.0, rtol=1e-12)  # drawn at 1 m/s
+    lines = "\n".join(f"{a:.17g},{b:.17g}" for a, b in zip(x, y, strict=True))
+    curve = tmp_path / "curve.csv"
+    curve.write_text(f"motion_grip_x,reaction_grip_x\n{lines}\n")
+    make_report([runs / "strip"], tmp_path / "page.html", references=[curve])
+    (row,) = table(tmp_path / "page" / "references.csv")
+    assert float(row["rms, relative"]) < 1e-12 and abs(float(row["peak, relative"])) < 1e-12
+    curve.write_text("motion_grip_x,reaction_grip_x\n" + "\n".join(f"{a},{2 * b}" for a, b in zip(x, y, strict=True)))
+    make_report([runs / "strip"], tmp_path / "page.html", references=[curve])
+    (row,) = table(tmp_path / "page" / "references.csv")
+    assert float(row["peak, relative"]) == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("nothing",), "there is no such folder"),
+        (("empty",), "is not the output folder of a run, a sweep or of evidence: it has no study.toml"),
+        (("strip", "-o", "page.pdf"), "the report is an .html file"),
+        (("strip", "--quantity", "peak_reaction_hand_x"), "has no such figure. Give peak_COLUMN"),
+        (("strip", "--exact", "3"), "name it with --quantity"),
+        (("strip", "strip"), "the same folder is given twice"),
+        (("strip", "--reference", "bad.csv"), "Give a CSV whose first line names columns of history.csv"),
+        (("strip", "--reference", "other.csv"), "has no column load"),
+    ],
+)
+def test_what_cannot_be_reported(runs: Path, arguments: tuple[str, ...], words: str) -> None:
+    (runs / "empty").mkdir(exist_ok=True)
+    (runs / "bad.csv").write_text("time,elastic\n1,two\n")
+    (runs / "other.csv").write_text("time,load\n0,1\n")
+    names = ("nothing", "empty", "strip", "bad.csv", "other.csv", "page.pdf")
+    done = fracsim("report", *(runs / name if name in names else name for name in arguments))
+    assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_unfinished_run_is_shown_as_such(runs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    for name in ("study.toml", "history.csv"):
+        text = (runs / "strip" / name).read_text()
+        (folder / name).write_text(text[:-20] if name == "history.csv" else text)
+    make_report([folder], tmp_path / "page.html", references=[])
+    (row,) = table(tmp_path / "page" / "runs.csv")
+    assert row["outcome"] == "unfinished" and row["steps"] == "19" and float(row["wall s"]) > 0
+
+
+def test_text_of_a_study_cannot_become_markup(tmp_path: Path) -> None:
+    """Titles, names and labels are shown as they are, formulas included."""
+    nasty = "<b>$x_1$ & co</b>"
+    plot = Plot(nasty, nasty, nasty, (Series(nasty, (1.0, 2.0), (1.0, None), names=(nasty, "")),))
+    section = Section(nasty, nasty, (Claim(nasty, nasty, False),), (Table("t", nasty, (nasty,), ((nasty,),)),), (plot,))
+    target = write_page(tmp_path / "page.html", [section], tmp_path, title=nasty, subtitle=nasty, about={nasty: nasty})
+    parsed(target)
+    text = target.read_text()
+    assert "<b>$x" not in text and "&lt;b&gt;$x_1$ &amp; co&lt;/b&gt;" in text
+
+
+def test_sections_survive_json() -> None:
+    plot = Plot(
+        "c", "x", "y", (Series("l", (1.0, None), (2.0, 3.0), "points", ("a", "b"), (0.1, 0.2)),), "loglog", True, (1.0,)
+    )
+    table_ = Table("t", "c", ("a", "b"), ((1, 2.5), ("x", None)), "run it", (1,))
+    sections = [Section("s", "t", (Claim("c", "m", None),), (table_,), (plot,), (Picture("p", "a/b.png"),))]
+    assert from_data(json.loads(json.dumps(to_data(sections)))) == sections
+
+
+def test_evidence_is_shown_without_importing_a_study(tmp_path: Path) -> None:
+    """From its JSON alone: claims at the top, a picture inside the page, one that does not exist with a remark."""
+    from PIL import Image
+
+    Image.new("RGB", (4, 4), "red").save(tmp_path / "there.png")
+    pictures = (Picture("there", "there.png"), Picture("gone", "gone.png"))
+    sections = [Section("A", claims=(Claim("all is well", "3", True), Claim("more", "4", False)), pictures=pictures)]
+    data = {"about": {"cores": "2"}, "groups": {"precision": {"sections": to_data(sections)}}}
+    (tmp_path / "evidence.json").write_text(json.dumps(data))
+    code = f"""
+import sys
+from pathlib import Path
+from fracsim.report.make import make_report
+make_report([Path({str(tmp_path)!r})], references=[])
+print([name for name in ("dolfinx", "fracsim.studies", "mpi4py", "petsc4py") if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+    text = (tmp_path / "report.html").read_text()
+    assert "1 of 2 claims hold" in text and text.count("data:image/png;base64,") == 1 and "no picture" in text
+    (tmp_path / "evidence.json").write_text("{}")
+    with pytest.raises(InputError, match="cannot be read"):
+        make_report([tmp_path], references=[])
+
+
+def test_tables_inside_tables_are_named_by_their_path() -> None:
+    data = {"a": {"b": 1, "c": [{"d": 2}, {"d": 3}]}, "e": [1, 2]}
+    assert flattened(data) == {"a.b": 1, "a.c.0.d": 2, "a.c.1.d": 3, "e": [1, 2]}

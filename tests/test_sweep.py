@@ -1,0 +1,169 @@
+"""fracsim sweep: combinations, resuming, failures, the list for job arrays."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from cases import BAR, command, fracsim, mpirun, write_study
+from fracsim.errors import InputError
+from fracsim.sweep import combinations, name_of, split_list
+
+KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
+
+
+def rows(out: Path) -> list[dict[str, str]]:
+    with (out / "sweep.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# --- combinations ---------------------------------------------------------------------------------------------------
+
+
+def test_commas_inside_brackets_and_quotes_part_nothing() -> None:
+    assert split_list("[1, 1, 1],[2,1,1]") == ["[1, 1, 1]", "[2,1,1]"]
+    assert split_list('"a,b",c') == ['"a,b"', "c"]
+    assert split_list("{a = [1,2], b = 3},4") == ["{a = [1,2], b = 3}", "4"]
+    assert split_list("1e-3") == ["1e-3"]
+
+
+def test_every_combination_has_a_readable_folder_of_its_own(tmp_path: Path) -> None:
+    sets = ["mesh.h=0.02,0.01", "time.scheme=newmark,explicit", "mesh.size=[1,1,1],[2,1,1]"]
+    cases = combinations(sets, tmp_path)
+    assert len({case.folder for case in cases}) == 2 * 2 * 2
+    assert cases[0].overrides == ["mesh.h=0.02", "time.scheme=newmark", "mesh.size=[1,1,1]"]
+    assert cases[1].values["mesh.size"] == "[2,1,1]", "the last key changes fastest"
+    assert cases[0].folder.name.startswith("h-0.02_scheme-newmark_size-1-1-1")
+
+
+def test_names_that_lose_characters_stay_apart() -> None:
+    assert name_of({"h": "0.02", "scheme": "newmark"}) == "h-0.02_scheme-newmark"
+    assert name_of({"size": "[1,11]"}) != name_of({"size": "[11,1]"}) != name_of({"size": "[1-11]"})
+    assert len(name_of({"a": "x" * 300})) < 120
+    assert "/" not in name_of({"file": "../part.msh"}) and not name_of({"file": "../part.msh"}).startswith(".")
+
+
+def test_keys_with_the_same_end_are_written_out(tmp_path: Path) -> None:
+    (case,) = combinations(["solver.a.tol=1", "other.tol=2"], tmp_path)
+    assert case.folder.name == "solver.a.tol-1_other.tol-2"
+
+
+@pytest.mark.parametrize(
+    ("sets", "words"),
+    [
+        ([], "a sweep needs values"),
+        (["mesh.h"], "write key=a,b,c"),
+        (["mesh.h=1,,2"], "empty value"),
+        (["mesh.h=1,2,1"], "1 comes up twice"),
+        (["mesh.h=1", "mesh.h=2"], "mesh.h is given twice"),
+    ],
+)
+def test_what_is_no_sweep(sets: list[str], words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=words):
+        combinations(sets, tmp_path)
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+
+def test_a_sweep_runs_every_case_and_then_none_again(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    done = fracsim("sweep", bar, *KEYS, "-o", out)
+    assert done.returncode == 0, done.stderr
+    table = rows(out)
+    assert [(row["mesh.h"], row["time.step"], row["steps"]) for row in table] == [
+        ("0.25", "0.01", "3"), ("0.25", "0.015", "2"), ("0.125", "0.01", "3"), ("0.125", "0.015", "2"),
+    ]  # fmt: skip
+    for row in table:
+        summary = json.loads((out / row["case"] / "summary.json").read_text())
+        assert float(row["peak_reaction_grip_x"]) == summary["peak_reactions"]["reaction_grip_x"] > 0
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
+    again = fracsim("sweep", bar, *KEYS, "-o", out)
+    assert again.returncode == 0 and again.stdout.count("done before") == 4
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
+
+
+def test_a_changed_study_is_run_again(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    fracsim("sweep", bar, "--set", "mesh.h=0.25", "-o", out)
+    write_study(bar, BAR, material={"young": 2e6})
+    assert "done before" not in fracsim("sweep", bar, "--set", "mesh.h=0.25", "-o", out).stdout
+
+
+def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
+    """A solver that may take no Krylov iteration does not converge; the next one does."""
+    out = tmp_path / "out"
+    options = ("--set", "solver.ksp_max_it=1,200", "--set", "time.adapt=false")
+    done = fracsim("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
+    assert done.returncode == 3
+    assert (
+        "1 of 2 runs did not end well: ksp_max_it-1_adapt-false (not converged: no solution at t = 0.01" in done.stderr
+    )
+    assert [row["outcome"].partition(":")[0] for row in rows(out)] == ["not converged", "done"]
+
+
+def test_nothing_runs_where_one_combination_is_wrong(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--set", "mesh.h=0.25,-1")
+    done = fracsim("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
+    assert done.returncode == 2 and "h--1" in done.stderr and "Nothing was run" in done.stderr
+    assert not out.exists()
+
+
+def test_the_list_has_a_whole_command_a_line(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out of the way"
+    listed = fracsim("sweep", bar, *KEYS, "-o", out, "--list")
+    lines = listed.stdout.splitlines()
+    assert listed.returncode == 0 and len(lines) == 4 and not out.exists()
+    words = shlex.split(lines[1])
+    assert words[:2] == ["fracsim", "run"] and words[-1] == str(out / "h-0.25_step-0.015")
+    assert fracsim(*words[1:]).returncode == 0
+    assert json.loads((out / "h-0.25_step-0.015" / "summary.json").read_text())["steps"] == 2
+
+
+def test_a_stopped_sweep_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    """SIGTERM ends the running case with a checkpoint; the same command goes on from it, not from the start."""
+    bar = write_study(tmp_path / "bar.toml", BAR, time={"step": 1e-4, "end": 0.3}, output={"every": 1000})
+    out = tmp_path / "out"
+    arguments = ("sweep", bar, "--set", "material.young=1e6,2e6", "-o", out)
+    process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    history = out / "young-1e6" / "history.csv"
+    deadline = time.monotonic() + 40
+    while not (history.exists() and len(history.read_text().splitlines()) > 20) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 4 and "interrupted after 0 of 2 runs" in said
+    steps = len(history.read_text().splitlines()) - 1
+    assert 20 <= steps < 3000, "the run must have been stopped on its way"
+    line = fracsim(*arguments, "--list").stdout.splitlines()[0]
+    assert line.endswith("--restart")
+    first = history.read_text().splitlines()[: steps + 1]
+    assert fracsim(*arguments, "--set", "time.end=0.3").returncode == 0  # the same study by another name: new folders
+    assert fracsim(*arguments).returncode == 0
+    assert history.read_text().splitlines()[: steps + 1] == first, "the rows before the stop are those of that run"
+    assert json.loads((out / "young-1e6" / "summary.json").read_text())["steps"] == 3000
+
+
+def test_runs_on_two_ranks(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    done = fracsim("sweep", bar, "--set", "mesh.h=0.125", "-o", out, "--ranks", "2")
+    assert done.returncode == 0, done.stderr
+    assert rows(out)[0]["ranks"] == "2"
+
+
+def test_a_sweep_is_not_started_by_mpirun(tmp_path: Path) -> None:
+    bar = write_study(tmp_path / "bar.toml", BAR)
+    done = subprocess.run(
+        [*mpirun(2), *command("sweep", bar, *KEYS, "-o", tmp_path / "out")],
+        capture_output=True, text=True, timeout=60, env=dict(os.environ), check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stderr.count("call it without mpirun") == 1
