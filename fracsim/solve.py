@@ -38,6 +38,9 @@ MULTIGRID: Options = {
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
+# Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
+RESTART = 200
+
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -109,8 +112,9 @@ class Solver:
             outcome = self._attempt(guess)
             self._keep = self._iterative
         if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg":
-            # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
+            # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
+            self.snes.ksp.setGMRESRestart(RESTART)
             outcome = self._attempt(guess)
             self.snes.ksp.setType("cg")
         return outcome

@@ -1,0 +1,61 @@
+"""What once failed at an extreme, and must not again. The whole table: studies/evidence/stability.py."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from fracsim.run import run_study
+from fracsim.scene import build_scene
+from fracsim.studies.evidence import extremes
+from fracsim.study_file import validate
+
+
+@pytest.mark.parametrize(("velocity", "step"), [(1e3, 1e-6), (3e6, 1e-2)])
+def test_a_fast_body_flies_on_in_short_steps(velocity: float, step: float) -> None:
+    """No force acts: v stays, u = v t. The round-off of M u / dt^2 is more than all that Newton has to balance; taken
+    for a residual it cannot be lowered, and halving the step makes it four times as large.
+    """
+    study = extremes.flying(velocity, step, 20)
+    study["time"]["adapt"] = False
+    scene = build_scene(MPI.COMM_WORLD, validate(study, "flying"))
+    state = scene.stepper.start(scene.study.initial)
+    for _ in range(20):
+        scene.stepper.advance(state)
+    u, v = state.u.reshape(-1, 3), state.v.reshape(-1, 3)
+    mass = scene.equations.mass.reshape(-1, 3)[:, :1]
+    eps = np.finfo(float).eps
+    drift = np.abs((mass * v).sum(axis=0) / mass.sum() - [velocity, 0.0, 0.0]).max()
+    assert drift <= 20 * 8 * eps * velocity * 20  # each step divides the round-off of u = 20 v dt by dt
+    assert np.allclose((mass * u).sum(axis=0) / mass.sum(), [velocity * step * 20, 0, 0], rtol=1e-12, atol=0.02 * step)
+
+
+def collapsed(energy: str) -> dict[str, Any]:
+    """Saint Venant-Kirchhoff in uniaxial tension: E_t = -nu E_1, so that l_t^2 = 1 - nu (l_1^2 - 1) is negative beyond
+    l_1 = 2.08 for nu = 0.3: there is no such body.
+    """
+    study = extremes.block(3.0, material={"energy": energy}, steps=10)
+    return study | {"output": study["output"] | {"every": 1}}
+
+
+def test_a_body_without_volume_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    summary = run_study(MPI.COMM_WORLD, validate(collapsed("stvk"), "x"), tmp_path / "stvk")
+    assert summary["smallest_J"] < 1e-6 and summary["inverted_cells"] == 192
+    said = capfd.readouterr().err
+    assert "192 unbroken cells are crushed flat or turned inside out" in said
+    assert "first seen at t = 0.6 s" in said  # stretches are 1 + 2 t: 2.0 at 0.5 s, 2.2 at 0.6 s
+    assert 'energy = "neo-hookean" resists that' in said
+
+
+def test_a_sound_body_is_not_accused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The least J is that of the closed form: the neo-Hookean block's, whose lateral stretch is found by bisection."""
+    from fracsim.studies.evidence.closed_forms import lateral_stretch
+
+    study = collapsed("neo-hookean")
+    study["boundary"][-1]["displacement"]["value"][1][0] = -0.5
+    summary = run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
+    exact = 0.5 * lateral_stretch(study["material"], 0.5) ** 2
+    assert summary["smallest_J"] == pytest.approx(exact, rel=1e-6) and summary["inverted_cells"] == 0
+    assert "inside out" not in capfd.readouterr().err
