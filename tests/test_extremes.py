@@ -59,3 +59,34 @@ def test_a_sound_body_is_not_accused(tmp_path: Path, capfd: pytest.CaptureFixtur
     exact = 0.5 * lateral_stretch(study["material"], 0.5) ** 2
     assert summary["smallest_J"] == pytest.approx(exact, rel=1e-6) and summary["inverted_cells"] == 0
     assert "inside out" not in capfd.readouterr().err
+
+
+def test_factors_where_iterations_fail() -> None:
+    """With three Krylov iterations no attempt gets through: factors give the answer that enough of them give, and the
+    preconditioner is what it was afterwards.
+    """
+    results = []
+    for options in ({"ksp_rtol": 1e-10}, {"ksp_max_it": 3, "ksp_rtol": 1e-10}):
+        study = extremes.block(1.5, steps=2) | {"solver": options}
+        scene = build_scene(MPI.COMM_WORLD, validate(study, "x"))
+        state = scene.stepper.start(None)
+        scene.stepper.advance(state)
+        assert scene.solver is not None and scene.stepper.failed == 0
+        ksp = scene.solver.snes.ksp
+        assert (ksp.getType(), ksp.pc.getType()) == ("cg", "gamg")
+        results.append(state.u)
+        scene.stepper.advance(state)
+        scene.solver.forget_options()
+    assert np.allclose(*results, rtol=0, atol=1e-5 * np.abs(results[0]).max())
+
+
+def test_nearly_incompressible_bodies_need_no_shorter_steps() -> None:
+    """Tangents at nu = 0.4999 are indefinite on the way; CG and GMRES gave up on some numbers of ranks, and the steps
+    that were halved then led to other cracks.
+    """
+    study = extremes.torn(extremes.BAR, speed=1.0, step=1e-2, steps=20, strength=2e5, material={"poisson": 0.4999})
+    scene = build_scene(MPI.COMM_WORLD, validate(study, "x"))
+    state = scene.stepper.start(None)
+    for _ in range(20):
+        scene.stepper.advance(state)
+    assert scene.stepper.failed == 0 and scene.fracture.graph.broken_count > 100

@@ -196,7 +196,8 @@ class _Motion:
                 return False
             if np.linalg.norm(r[free]) < 1e-9 * scale:
                 u: Values = x.reshape(-1, 2)
-                self.u, self.v = u, (u - self.u) / STEP
+                self.v = np.asarray((u - self.u) / STEP)
+                self.u = u
                 return True
             K[np.diag_indices_from(K)] += self.mass / STEP**2
             x[free] -= np.linalg.solve(K[np.ix_(free, free)], r[free])

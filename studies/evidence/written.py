@@ -80,18 +80,17 @@ def _halves() -> Any:
     return replace(made, regions={"heavy": heavy, "light": light})
 
 
-def main() -> None:
-    """Write, then run; the exit code is the run's."""
+def run_written(make: Callable[[], tuple[Any, dict[str, Any]]]) -> None:
+    """Write mesh and study, then run; ends the process with the exit code of the run."""
     import tomli_w
     from mpi4py import MPI
 
     from ... import cli
     from ...meshes.write import write_mesh
 
-    name = sys.argv[1]
     if MPI.COMM_WORLD.rank == 0:
-        mesh, study = MESHES[name]()
-        write_mesh(mesh, Path("mesh.msh"))
+        mesh, study = make()
+        write_mesh(mesh, Path(FILE["file"]))
         Path("trial.toml").write_text(tomli_w.dumps(study))
     MPI.COMM_WORLD.barrier()
     sys.argv = ["fracsim", "run", "trial.toml", "-o", "run"]
@@ -99,4 +98,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_written(MESHES[sys.argv[1]])
