@@ -113,7 +113,8 @@ class Solver:
             self._age, self._keep = Age.WORN, False
             outcome = self._attempt(guess)
             self._keep = self._iterative
-        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg":
+        tired = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
+        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg" and not tired:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             self.snes.ksp.setGMRESRestart(RESTART)

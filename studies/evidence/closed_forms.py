@@ -57,7 +57,7 @@ def stretch_error(study: dict[str, Any], rows: dict[str, Values]) -> dict[str, f
     try:
         lateral = np.array([lateral_stretch(material, l1) if free else 1.0 for l1 in stretches])
     except ValueError:
-        return {"error": float("inf")}
+        return {}  # no such body: there is nothing to be near to
     P = np.array([principal_stress(material, *pair)[0] for pair in zip(stretches, lateral, strict=True)])
     true = P if material["energy"] == "linear" else P / lateral**2
     strength = study.get("fracture", {}).get("strength", np.inf)

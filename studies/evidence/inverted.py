@@ -64,7 +64,7 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     if comm.rank == 0 and (note := watch.note(energy)):
         print(f"fracsim: note: {note}", file=sys.stderr)
     return {
-        "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.least,
+        "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.least, "error": abs(watch.least - 1),
         "steps": state.step, "newton_max": max(newton), "newton_mean": float(np.mean(newton)),
         "growth": float(np.max(np.diff(energies)).clip(0) / energies[0]) if energies[0] else 0.0,
         "halved": stepper.failed,

@@ -209,7 +209,8 @@ def sections(records: list[Record]) -> list[Section]:
     text = (
         "Energy growth is the largest rise of elastic + kinetic + dissipated - work as a share of the energy at play; "
         "the error is that of a force, a momentum or a weight known in closed form (homogeneous stretch, dead load on "
-        "a free body); the smallest J is that of the cells that still carry. `warned` means that the run says that its "
+        "a free body); the smallest J is that of the cells that still carry. `stable` means finite, and no energy "
+        "from nowhere, where no closed form is known; `warned` means that the run says that its "
         "result is not to be trusted and why. Each row was run on 1 and on 2 ranks."
     )
     found = [record for record in records if record["case"] == "failed"]
