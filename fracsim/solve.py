@@ -129,8 +129,8 @@ class Solver:
         return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
     def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> Outcome:
-        """Factors instead of iterations, for a tangent that no Krylov method gets through: pieces that hang by a thread,
-        or no compressibility. A shorter step would be no easier.
+        """Factors instead of iterations, for a tangent that no Krylov method gets through: pieces that hang by a
+        thread, or no compressibility. A shorter step would be no easier.
         """
         ksp = self.snes.ksp
         kind, preconditioner = ksp.getType(), ksp.pc.getType()
