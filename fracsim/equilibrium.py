@@ -396,28 +396,26 @@ class Equilibrium:
     def force_scale(self) -> tuple[float, float]:
         """(size, round-off) of the forces in the residual, N, as root sums of squares over all dofs.
 
-        Size: reactions, inertia and dead loads, which the residual is the balance of. Round-off: eps times the
-        stiffness Y h^(d-2) of a node times the extent of the body, for every dof.
+        Size: reactions, inertia and dead loads, which the residual is the balance of. Round-off: eps times what the
+        residual is made of, the stiffness Y h^(d-2) of a node times the extent of the body and its displacement, and
+        M c_a u. Some 8 of these are left of a body far from where it began, more than all its forces in a short step.
         """
         c_mass, _ = self._mass_factors
-        inertia = c_mass * self.mass * (self.u.x.array[: self._owned] - self._references[0]) if c_mass else 0.0
+        u = self.u.x.array[: self._owned]
+        inertia = c_mass * self.mass * (u - self._references[0]) if c_mass else 0.0
         reactions = self.unbalanced[self.held]
-        squares = [np.sum(np.square(part)) for part in (inertia, self.external, reactions)]
-        loads = np.sqrt(total(self.domain.comm, np.array(squares)))
-        return float(loads.max()), self._round_off
+        parts = (inertia, self.external, reactions, u, self.mass * u if c_mass else 0.0)
+        *loads, moved, carried = np.sqrt(total(self.domain.comm, np.array([np.sum(np.square(part)) for part in parts])))
+        (stiffness, extent), eps = self._stiffest, np.finfo(float).eps
+        return float(max(loads)), float(eps * (stiffness * extent + 8 * (stiffness * moved + c_mass * carried)))
 
     @cached_property
-    def _round_off(self) -> float:
-        young = float(np.max(self.material.young, initial=0.0))
-        dofs = self.domain.space.dofmap.index_map.size_global * self.domain.dim
-        stiffest = self.domain.comm.allreduce(young, op=MPI.MAX)
-        return float(
-            np.finfo(float).eps
-            * stiffest
-            * self.domain.mean_edge ** (self.domain.dim - 2)
-            * self.domain.size
-            * np.sqrt(dofs)
-        )
+    def _stiffest(self) -> tuple[float, float]:
+        """(largest Y h^(d-2), N/m; extent of the body as a root sum of squares over all dofs, m)."""
+        domain = self.domain
+        dofs = domain.space.dofmap.index_map.size_global * domain.dim
+        young = domain.comm.allreduce(float(np.max(self.material.young, initial=0.0)), op=MPI.MAX)
+        return float(young * domain.mean_edge ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
 
 
 # Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large

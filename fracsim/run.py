@@ -20,6 +20,7 @@ from .fields_file import FieldsFile
 from .frames import Frames
 from .history import History
 from .interrupt import Interrupt
+from .inverted import Inverted
 from .output_folder import OutputClock, make_folder, versions
 from .parallel import on_root, total
 from .progress import Progress
@@ -77,6 +78,7 @@ class Run:
         self.history = History(self.folder / "history.csv" if root else None, self.scene.probes.names, step)
         names = study.output.fields if study.output.fields is not None else default_fields(study)
         self.frames = Frames(self.scene.equations, names, self.scene.fracture)
+        self.inverted = Inverted(self.scene.equations, self.scene.fracture)
         source = self.scene.domain.source
         self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
         self._open_surface(restart)
@@ -153,6 +155,8 @@ class Run:
         summary = self._summary(outcome)
         self.history.close()
         if self.comm.rank == 0:
+            if note := self.inverted.note(self.scene.study.material.energy):
+                print(f"fracsim: note: {note}", file=sys.stderr)
             (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
             if self.scene.study.output.picture:
                 _draw(self.folder)
@@ -184,6 +188,7 @@ class Run:
     def _write_frame(self) -> None:
         began = time.perf_counter()
         fields = self.frames(self.state, self._damage[2])
+        self.inverted.look(self.state.t)
         if self.fields is not None and self.state.t not in self.fields.times:
             self.fields.write(self.state.t, fields)
         if self.surface is not None:
@@ -225,6 +230,7 @@ class Run:
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "steps_failed": stepper.failed, "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces,
+            "smallest_J": self.inverted.least, "inverted_cells": self.inverted.count,
             "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
             "seconds": {key: round(value, 4) for key, value in seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "peak_memory_MiB": round(float(memory), 1),

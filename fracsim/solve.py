@@ -38,6 +38,11 @@ MULTIGRID: Options = {
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
+# Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
+RESTART = 200
+# dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
+FACTORISED = 100_000
+
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -108,11 +113,38 @@ class Solver:
             self._age, self._keep = Age.WORN, False
             outcome = self._attempt(guess)
             self._keep = self._iterative
-        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg":
-            # CG met negative curvature (a buckling or softening body): GMRES does not mind it.
+        tired = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
+        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg" and not tired:
+            # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
+            self.snes.ksp.setGMRESRestart(RESTART)
             outcome = self._attempt(guess)
             self.snes.ksp.setType("cg")
+        if self._linear_failure(outcome) and self._may_factorise():
+            outcome = self._attempt_directly(guess)
+        return outcome
+
+    def _may_factorise(self) -> bool:
+        dofs = self.equations.residual.getSize()
+        return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
+
+    def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> Outcome:
+        """Factors instead of iterations, for a tangent that no Krylov method gets through: pieces that hang by a
+        thread, or no compressibility. A shorter step would be no easier.
+        """
+        ksp = self.snes.ksp
+        kind, preconditioner = ksp.getType(), ksp.pc.getType()
+        ksp.setType("preonly")
+        ksp.pc.reset()
+        ksp.pc.setType("lu")
+        ksp.pc.setFactorSolverType("mumps")
+        self._age, self._keep = Age.WORN, False
+        outcome = self._attempt(guess)
+        ksp.pc.reset()
+        ksp.pc.setType(preconditioner)
+        ksp.pc.setFromOptions()
+        ksp.setType(kind)
+        self._age, self._keep = Age.WORN, True
         return outcome
 
     def damage_changed(self) -> None:

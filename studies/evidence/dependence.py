@@ -1,0 +1,170 @@
+"""How far the answer depends on the mesh: a bar and a plate with a slit on five meshes, local and averaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import slit
+from .section import Cell, Picture, Plot, Section, Series, Table, folder_of
+from .survival import read_history, read_surface
+from .trial import Trial
+
+GROUP = "dependence"
+RADIUS = 2e-3  # m: two cells of the coarsest mesh
+MESHES = (
+    ("structured", 1e-3),
+    ("unstructured", 7e-4),
+    ("structured", 5e-4),
+    ("unstructured", 3.5e-4),
+    ("structured", 2.5e-4),
+)
+Record = dict[str, Any]
+
+
+def trials() -> list[Trial]:
+    """Two specimens, two radii, five meshes; the finest mesh is of the full version."""
+    return [
+        _trial(name, pattern, h, radius) for name in slit.SPECIMENS for radius in (0.0, RADIUS) for pattern, h in MESHES
+    ]
+
+
+def _trial(name: str, pattern: str, h: float, radius: float) -> Trial:
+    study: dict[str, Any] | None = None
+    script: tuple[str, ...] = ()
+    if pattern == "structured":
+        script = ("fracsim.studies.evidence.slit", name, f"{h:g}", f"{radius:g}")
+    else:
+        study = slit.study(slit.SPECIMENS[name], slit.unstructured(slit.SPECIMENS[name], h), radius)
+    label = "local" if radius == 0 else "averaged"
+    return Trial(
+        GROUP, f"{name}-{label}", f"{h * 1e3:g}-mm-{pattern}", study=study, script=script,
+        settings={"h": h, "pattern": pattern, "radius": radius}, measure=f"dependence:broken_{name}", limit=600.0,
+        full=h < 3e-4,
+    )  # fmt: skip
+
+
+# --- what is measured -----------------------------------------------------------------------------------------------
+
+
+def broken_bar(run: Path) -> dict[str, float]:
+    """Figures of the bar."""
+    return broken(run, slit.BAR)
+
+
+def broken_plate(run: Path) -> dict[str, float]:
+    """Figures of the plate."""
+    return broken(run, slit.PLATE)
+
+
+def broken(run: Path, specimen: slit.Specimen) -> dict[str, float]:
+    """Peak load, new surface, energy and path of the crack, all for a thickness of 1 m."""
+    rows = read_history(run)
+    area, centres = crack_faces(run)
+    stray = np.abs(centres[:, specimen.axis] - specimen.plane)
+    load = np.abs(rows[f"reaction_load_{specimen.pull}"])
+    return {
+        "peak_load": float(load.max()),
+        "at": float(rows["time"][load.argmax()] * abs(specimen.travel)),
+        "broken_area": float(area.sum() / 2),
+        "dissipated": float(rows["dissipated"][-1]),
+        "stray": float(stray @ area / area.sum()) if area.sum() else 0.0,
+        "left": float(load[-1] / load.max()),
+        "broken_edges": float(rows["broken_edges"][-1]),
+    }
+
+
+def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(n,) sizes of the faces that breaking opened, both sides, as they lay at rest, and their (n, 3) centres.
+
+    Lengths in 2D (m^2 for a thickness of 1 m), areas in 3D, of the last frame of the split surface.
+    """
+    from fracsim.surface.files import read_collection
+    from fracsim.surface.skeleton import CRACK
+
+    grid = read_surface(run / read_collection(run / "surface.pvd")[-1][1])
+    points = np.asarray(grid.points, float) - np.asarray(grid.point_data["displacement"], float)
+    kind = 3 if 3 in grid.cells_dict else 5  # VTK: lines in 2D, triangles in 3D
+    faces = grid.cells_dict[kind]
+    opened = np.asarray(grid.cell_data["origin"])[grid.celltypes == kind] == CRACK
+    corners = points[faces[opened]]
+    d = corners[:, 1:] - corners[:, :1]
+    size = np.linalg.norm(d[:, 0], axis=1) if kind == 3 else np.linalg.norm(np.cross(d[:, 0], d[:, 1]), axis=1) / 2
+    return size, corners.mean(axis=1)
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+FIGURES = ("peak_load", "broken_area", "dissipated", "stray")
+COLUMNS = (
+    "specimen",
+    "h, m",
+    "pattern",
+    "outcome",
+    "peak load, N",
+    "broken area, m2",
+    "dissipated, J",
+    "stray, m",
+    "load left",
+)
+
+
+def sections(records: list[Record]) -> list[Section]:
+    """Tables of all runs and of the spreads, curves over h, and what it looks like."""
+    rows = tuple(_row(record) for record in records)
+    text = (
+        "A bar pulled along its length and a plate pulled upwards, both with a slit, in plane strain and for a "
+        "thickness of 1 m, on five meshes. Cracks follow mesh edges: with radius 0 the peak load falls as the cells at "
+        "the tip get smaller, since an elastic stress there has no bound; a radius of two coarse cells gives the "
+        "stress a length of its own. Stray is the mean distance of the new surface from the plane of the slit. The "
+        "broken area counts every crack, also those beside the one that parts the body. Spread is (max - min) / mean "
+        "over the meshes, as found."
+    )
+    tables = (
+        Table(
+            "dependence-spread", "Spread over the meshes", ("specimen", "meshes", *FIGURES), tuple(_spreads(records))
+        ),
+        Table("dependence", "All runs", COLUMNS, rows),
+    )
+    plots = tuple(_plot(records, key) for key in ("peak_load", "dissipated"))
+    pictures = tuple(
+        Picture(f"{r['case']}, {r['name']}", f"{folder_of(r)}/run/last.png") for r in records if r["outcome"] == "done"
+    )
+    return [Section("Dependence on the mesh", text, tables=tables, plots=plots, pictures=pictures[:12])]
+
+
+def _row(record: Record) -> tuple[Cell, ...]:
+    figures, settings = record["figures"], record["settings"]
+    measured = (figures.get(key) for key in (*FIGURES, "left"))
+    return (record["case"], settings["h"], settings["pattern"], record["outcome"], *measured)
+
+
+def spread(values: list[float]) -> float:
+    """(max - min) / mean."""
+    return (max(values) - min(values)) / (sum(values) / len(values)) if any(values) else 0.0
+
+
+def _spreads(records: list[Record]) -> list[tuple[Cell, ...]]:
+    found: list[tuple[Cell, ...]] = []
+    for case in dict.fromkeys(record["case"] for record in records):
+        done = [record["figures"] for record in records if record["case"] == case and record["outcome"] == "done"]
+        if done:
+            found.append((case, len(done), *(spread([figures[key] for figures in done]) for key in FIGURES)))
+    return found
+
+
+def _plot(records: list[Record], key: str) -> Plot:
+    """One figure over h, a line for each specimen and radius, each over its value on the coarsest mesh."""
+    words = f"{key.replace('_', ' ')} over that of the coarsest mesh"
+    series = []
+    for case in dict.fromkeys(record["case"] for record in records):
+        done = [record for record in records if record["case"] == case and record["outcome"] == "done"]
+        if not done:
+            continue
+        first = done[0]["figures"][key] or 1.0
+        h, values = [r["settings"]["h"] for r in done], [r["figures"][key] / first for r in done]
+        series.append(Series(case, tuple(h), tuple(values)))
+    return Plot(words.capitalize(), "h, m", words, tuple(series), kind="logx")

@@ -1,0 +1,75 @@
+"""A body that starts turned inside out: python -m fracsim.studies.evidence.inverted ENERGY -o figures.json.
+
+No study file can state such a start: F = -diag(0.9, 1, 1.1) in every cell, by a displacement about the middle. Then
+backward Euler with the body free: it should turn itself right, or say that it cannot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import extremes
+
+
+def main() -> None:
+    """Advance until the end, write what was found."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("energy")
+    parser.add_argument("-o", dest="out", type=Path)
+    given = parser.parse_args()
+    from mpi4py import MPI
+
+    from ...errors import NotConverged
+
+    try:
+        figures = turned(MPI.COMM_WORLD, given.energy)
+    except NotConverged as error:
+        if MPI.COMM_WORLD.rank == 0:
+            print(f"fracsim: {error}", file=sys.stderr)
+        sys.exit(int(error.exit_code))
+    if MPI.COMM_WORLD.rank == 0:
+        given.out.write_text(json.dumps(figures) + "\n")
+
+
+def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
+    """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
+    from ...inverted import Inverted
+    from ...parallel import total
+    from ...scene import build_scene
+    from ...study_file import validate
+
+    study = extremes.bare("inside out", extremes.BAR, {"energy": energy}, steps)
+    study["damping"] = {"mass": 5.0}
+    study["time"] = {"step": 0.01, "end": steps * 0.01}
+    scene = build_scene(comm, validate(study, "inverted"))
+    domain, stepper = scene.domain, scene.stepper
+    state = stepper.start(None)
+    middle = (domain.lower + domain.upper) / 2
+    state.u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
+    scene.equations.displace(state.u)
+    stepper.settle(state)
+    energies, newton = [total(comm, scene.equations.elastic_energy())[0]], []
+    while state.t < study["time"]["end"] * (1 - 1e-12):
+        report = stepper.advance(state)
+        energies.append(report.elastic + report.kinetic)
+        newton.append(report.outcome.newton)
+    watch = Inverted(scene.equations)
+    watch.look(state.t)
+    if comm.rank == 0 and (note := watch.note(energy)):
+        print(f"fracsim: note: {note}", file=sys.stderr)
+    return {
+        "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.least, "error": abs(watch.least - 1),
+        "steps": state.step, "newton_max": max(newton), "newton_mean": float(np.mean(newton)),
+        "growth": float(np.max(np.diff(energies)).clip(0) / energies[0]) if energies[0] else 0.0,
+        "halved": stepper.failed,
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,287 @@
+"""What survives and what does not: extremes of step, stiffness, shape and damage, on 1 and 2 ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+from . import extremes as x
+from .section import Cell, Claim, Section, Table
+from .trial import Setting, Trial
+
+GROUP = "stability"
+Record = dict[str, Any]
+GROWN, OFF = 0.05, 0.02  # more energy from nowhere, or a larger relative error, is no right answer
+
+
+def trials() -> list[Trial]:
+    """Every case on 1 and on 2 ranks."""
+    cases = chain(
+        _steps(), _stiffness(), _poisson(), _densities(), _stretches(), _inverted(), _slivers(), _shells(),
+        _strengths(), _many(), _one_cell(), _lengths(), _long_steps(), _edge(), _failed(),
+    )  # fmt: skip
+    return [_on_ranks(trial, ranks) for trial in cases for ranks in ((1,) if trial.case == "failed" else (1, 2))]
+
+
+def _on_ranks(trial: Trial, ranks: int) -> Trial:
+    return replace(trial, name=f"{trial.name}-r{ranks}", ranks=ranks)
+
+
+def _trial(case: str, name: str, study: x.Data, measure: str = "survived", limit: float = 60.0) -> Trial:
+    setting: dict[str, Setting] = {"of": name}
+    return Trial(
+        GROUP, case, name, study=study, settings=setting, measure=f"survival:{measure}", always=True, limit=limit
+    )
+
+
+def _script(case: str, name: str, module: str, *arguments: str, measure: str = "survival:survived") -> Trial:
+    script = (f"fracsim.studies.evidence.{module}", *arguments)
+    return Trial(GROUP, case, name, script=script, settings={"of": name}, measure=measure, always=True, limit=60.0)
+
+
+# --- the cases ------------------------------------------------------------------------------------------------------
+
+
+def _steps() -> list[Trial]:
+    long = [_trial("dt", f"{step:.0e}-s", x.thrown(step), "thrown") for step in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)]
+    long += [_trial("dt", "1e-06-s-flying", x.flying(1e3, 1e-6), "drifting")]
+    schemes = ("newmark", "generalized-alpha", "explicit")
+    return long + [_trial("dt", f"1e-2-s-{name}", x.thrown(1e-2, scheme=name), "thrown") for name in schemes]
+
+
+def _stiffness() -> list[Trial]:
+    return [
+        _trial("young", f"{young:.0e}-Pa", x.block(1.3, material={"young": young}, strength=0.15 * young), "pulled")
+        for young in (1e3, 1e6, 1e9, 1e12)
+    ]
+
+
+def _poisson() -> list[Trial]:
+    found = []
+    for nu in (-0.9, 0.0, 0.49, 0.499, 0.4999):
+        found.append(_trial("poisson", f"{nu:g}", x.block(1.3, material={"poisson": nu}), "pulled"))
+    torn = x.torn(x.BAR, speed=1.0, step=1e-2, steps=60, strength=2e5, material={"poisson": 0.4999})
+    return [*found, _trial("poisson", "0.4999-torn", torn)]
+
+
+def _densities() -> list[Trial]:
+    return [
+        _script("density-ratio", "1e4-thrown", "written", "two-densities", measure="survival:thrown"),
+        _script("density-ratio", "1e4-hanging", "written", "two-densities-hanging", measure="survival:hung"),
+    ]
+
+
+def _stretches() -> list[Trial]:
+    found = []
+    for energy in ("linear", "corotated", "stvk", "neo-hookean"):
+        material = {"energy": energy, "poisson": 0.05}
+        found.append(_trial("stretch", f"10x-{energy}", x.block(10.0, material=material), "pulled"))
+        crushed = x.block(0.05, material=material, confined=True)
+        found.append(_trial("compression", f"5-percent-{energy}", crushed, "pulled"))
+    return found
+
+
+def _inverted() -> list[Trial]:
+    """Bodies that start inside out, and one whose right face is pushed through the left one in one step."""
+    energies = ("corotated", "stvk", "neo-hookean")
+    found = [_script("inverted", energy, "inverted", energy, measure="") for energy in energies]
+    found.append(_trial("inverted", "pushed-through", x.block(-1.0, steps=1, confined=True), "pulled"))
+    swift = x.torn(x.BAR, speed=-20.0, step=0.1, steps=2, strength=float("inf"))
+    return [*found, _trial("inverted", "pushed-through-moving", swift)]
+
+
+def _slivers() -> list[Trial]:
+    found = []
+    for ratio in (1e2, 1e3, 1e4):
+        mesh = {"builder": "box", "size": [4.0, 4.0, 1 / ratio], "h": 1.0}
+        found.append(_trial("slivers", f"{ratio:.0e}-along", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
+        mesh = {"builder": "box", "size": [1 / ratio, 4.0, 4.0], "h": 1.0}
+        found.append(_trial("slivers", f"{ratio:.0e}-across", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
+    exact = found[-1].study | {"solver": {"snes_rtol": 1e-10}}  # type: ignore[operator]
+    found.append(_trial("slivers", "1e+04-across-snes_rtol-1e-10", exact, "pulled"))
+    mesh = {"builder": "box", "size": [4.0, 4.0, 1e-4], "h": 1.0}
+    return [*found, _trial("slivers", "1e+04-torn", x.torn(mesh, speed=1.0, step=2e-2, steps=60, strength=1e5))]
+
+
+def _shells() -> list[Trial]:
+    mesh = {"builder": "box", "size": [1.0, 1.0, 1e-3], "h": 0.05}
+    blown = x.torn(mesh, speed=0.5, step=5e-3, steps=60, strength=2e5)
+    lifted = x.torn(mesh, speed=2.0, step=5e-3, steps=60, strength=1e5, axis=2)
+    return [
+        _trial("shells", "1-to-1000-stretched", x.block(1.3, mesh=mesh, strength=2e5), "pulled"),
+        _trial("shells", "1-to-1000-torn", blown),
+        _trial("shells", "1-to-1000-bent", lifted),
+    ]
+
+
+def _strengths() -> list[Trial]:
+    found = []
+    for strength in (0.0, 1e-300, 1e-3, 1e3, 1e30, float("inf")):
+        study = x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=strength)
+        found.append(_trial("strength", f"{strength:g}-Pa", study))
+    return [*found, _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan")))]
+
+
+def _many() -> list[Trial]:
+    mesh = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.05}
+    cube = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.1}
+    return [
+        _trial("many", "10000-edges-in-a-step", x.block(1.2, mesh=mesh, strength=1e5, steps=10), "pulled", 120.0),
+        _trial("many", "1000-pieces", x.spun(cube, spin=50.0, step=5e-3, steps=30, strength=1e2), "drifting"),
+    ]
+
+
+def _one_cell() -> list[Trial]:
+    return [_script("one-cell", name, "written", name) for name in ("triangle", "tetrahedron")]
+
+
+def _lengths() -> list[Trial]:
+    found = []
+    for name, unit in (("micrometres", 1e-6), ("kilometres", 1e3)):
+        mesh = {"builder": "box", "size": [unit, 0.25 * unit, 0.25 * unit], "h": 0.125 * unit}
+        found.append(_trial("lengths", name, x.block(1.3, mesh=mesh, strength=1.5e5), "pulled"))
+        # the same bar in every length, its time scaled with it: the same breaks
+        study = x.torn(mesh, speed=1.0, step=1e-2 * unit, steps=60, strength=1e5)
+        found.append(_trial("lengths", f"{name}-torn", study))
+    return found
+
+
+def _long_steps() -> list[Trial]:
+    """M22's cylinder of about 600 nodes at dt = 5e-2 s, where XFEM is not stable."""
+    mesh = {"builder": "cylinder", "radius": 0.25, "length": 1.0, "h": 0.095}
+    found = []
+    for energy in ("stvk", "neo-hookean", "corotated"):
+        study = x.torn(
+            mesh, speed=0.5, step=5e-2, steps=60, strength=5e5, ends=("bottom", "top"), axis=2,
+            material={"energy": energy, "young": 1e7},
+        )  # fmt: skip
+        found.append(_trial("dt-5e-2", f"cylinder-{energy}", study))
+    return found
+
+
+def _edge() -> list[Trial]:
+    """The approach is for small strains: what a strength that allows 30 % does to it."""
+    found = []
+    for energy in ("linear", "corotated"):
+        study = x.torn(
+            x.BAR, speed=1.0, step=1e-2, steps=60, strength=3e5, approach="edge", material={"energy": energy}
+        )
+        found.append(_trial("edge-approach", f"30-percent-{energy}", study))
+    return found
+
+
+def _failed() -> list[Trial]:
+    """M22s section 6, as an experiment of its own (failed.py)."""
+    from .failed import APPROACHES
+
+    return [_script("failed", name, "failed", name, measure="") for name in APPROACHES]
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+
+def verdict(record: Record) -> str:
+    """How a run ended, in words: right, stable, warned, refused, not converged, or WRONG."""
+    figures, outcome, message = record["figures"], record["outcome"], record["message"].removeprefix("fracsim: ")
+    if outcome in ("refused", "not converged"):
+        return f"{outcome}: {message}" if message else f"WRONG: {outcome} without a word"
+    if outcome != "done":
+        return f"WRONG: {outcome}"
+    if not figures.get("finite", False):
+        return "WRONG: not finite"
+    if message.startswith("note: ") and "turned inside out" in message:
+        return f"warned: {message.removeprefix('note: ')}"
+    if figures.get("growth", 0.0) > GROWN:
+        return "WRONG: energy grew"
+    if "error" not in figures:
+        return "stable"
+    near = figures["error"] <= OFF and not figures.get("break_off_by", 0)
+    return "right" if near else "WRONG: far from the closed form"
+
+
+def sections(records: list[Record]) -> list[Section]:
+    """The table, what must hold of it, and M22's two failed approaches."""
+    from .failed import section
+
+    table = [record for record in records if record["case"] != "failed"]
+    text = (
+        "Energy growth is the largest rise of elastic + kinetic + dissipated - work as a share of the energy at play; "
+        "the error is that of a force, a momentum or a weight known in closed form (homogeneous stretch, dead load on "
+        "a free body); the smallest J is that of the cells that still carry. `stable` means finite, and no energy "
+        "from nowhere, where no closed form is known; `warned` means that the run says that its "
+        "result is not to be trusted and why. Each row was run on 1 and on 2 ranks."
+    )
+    found = [record for record in records if record["case"] == "failed"]
+    first = Section("Stability", text, claims=_claims(table), tables=(_table(table),))
+    return [first, *([section(found)] if found else [])]
+
+
+def _claims(records: list[Record]) -> tuple[Claim, ...]:
+    wrong = [f"{r['case']}/{r['name']}" for r in records if verdict(r).startswith("WRONG")]
+    endless = [f"{r['case']}/{r['name']}" for r in records if r["outcome"] == "out of time"]
+    infinite = [f"{r['case']}/{r['name']}" for r in records if r["figures"].get("finite") is False]
+    differ = [f"{one['case']}/{_place(one)}" for one, *others in _by_place(records) if not _alike(one, others)]
+    return (
+        _claim("No hang in the whole table, on 1 and 2 ranks", endless, records),
+        _claim("No NaN in history, fields or surface, on 1 and 2 ranks", infinite, records),
+        _claim("Each case ends in a right answer or in a clear word", wrong, records),
+        _claim("2 ranks break the same edges as 1", differ, records),
+    )
+
+
+def _claim(text: str, against: Sequence[str], records: list[Record]) -> Claim:
+    measured = f"{len(records)} runs; against it: {', '.join(against) or 'none'}"
+    return Claim(text, measured, not against if records else None)
+
+
+def _place(record: Record) -> str:
+    return str(record["name"]).rpartition("-r")[0]
+
+
+def _by_place(records: list[Record]) -> list[list[Record]]:
+    """Runs of one study on different ranks, fewest first."""
+    places: dict[tuple[str, str], list[Record]] = {}
+    for record in sorted(records, key=lambda record: record["ranks"]):
+        places.setdefault((record["case"], _place(record)), []).append(record)
+    order = list(dict.fromkeys((record["case"], _place(record)) for record in records))
+    return [places[place] for place in order]
+
+
+def _alike(one: Record, others: list[Record]) -> bool:
+    """Whether runs ended alike, with as many broken edges and pieces."""
+    return all(
+        one["outcome"] == other["outcome"]
+        and all(one["figures"].get(key) == other["figures"].get(key) for key in ("broken", "pieces"))
+        for other in others
+    )
+
+
+COLUMNS = (
+    "case", "of", "verdict", "2 ranks alike", "error", "energy growth", "Newton, mean", "Newton, most", "smallest J",
+    "steps halved", "broken edges", "in one step", "pieces", "s",
+)  # fmt: skip
+DAMAGE = ("broken", "broken_in_a_step", "pieces")
+FIGURES = ("error", "growth", "newton_mean", "newton_max", "smallest_J")
+
+
+def _table(records: list[Record]) -> Table:
+    rows = tuple(_row(one, others) for one, *others in _by_place(records))
+    return Table("stability", "What survives, and what does not", COLUMNS, rows)
+
+
+def _row(one: Record, others: list[Record]) -> tuple[Cell, ...]:
+    figures, summary = one["figures"], one["summary"] or {}
+    words = list(dict.fromkeys(verdict(record) for record in (one, *others)))
+    return (
+        one["case"], _place(one), "; on 2 ranks ".join(words) if _differs(words) else words[0],
+        _alike(one, others) if others else None, *(figures.get(key) for key in FIGURES),
+        summary.get("steps_failed", figures.get("halved")), *(figures.get(key) for key in DAMAGE),
+        one["wall"][-1],
+    )  # fmt: skip
+
+
+def _differs(words: list[str]) -> bool:
+    """Whether verdicts differ in their first word: messages carry figures that may differ in the last digits."""
+    return len({word.partition(":")[0] for word in words}) > 1

@@ -1,0 +1,162 @@
+"""What is measured of a run however it ended: is all of it finite, did energy come from nowhere, what did it take."""
+
+from __future__ import annotations
+
+import csv
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from . import closed_forms, extremes
+
+Values = npt.NDArray[np.float64]
+Figures = dict[str, float | int | bool]
+
+
+def survived(run: Path) -> Figures:
+    """Figures of an output folder; of a study that was refused there is none, and no figure."""
+    if not (run / "history.csv").exists():
+        return {}
+    rows, frames = read_history(run), _frames(run)
+    figures: Figures = {
+        "finite": all(np.isfinite(column).all() for column in rows.values()) and frames[0] and surface_is_finite(run),
+        "smallest_J": frames[1],
+        "checkpoint": (run / "checkpoint").exists(),
+    }
+    if len(rows["time"]):
+        figures |= {
+            "steps": len(rows["time"]),
+            "growth": energy_growth(rows, moving_at_start="initial" in read_study(run)),
+            "newton_max": int(rows["newton_its"].max()),
+            "newton_mean": float(rows["newton_its"].mean()),
+            "broken": int(rows["broken_edges"][-1]),
+            "broken_in_a_step": int(np.diff(rows["broken_edges"], prepend=0).max()),
+            "pieces": int(rows["pieces"][-1]),
+        }
+    return figures
+
+
+def pulled(run: Path) -> Figures:
+    """As `survived`, and the error of a uniaxial or confined stretch against its closed form."""
+    return survived(run) | closed_forms.stretch_error(read_study(run), read_history(run)) if run.exists() else {}
+
+
+def thrown(run: Path) -> Figures:
+    """As `survived`, and the error of the momentum, p = F t with a dead load F on a free body, whatever breaks."""
+    if not run.exists():
+        return {}
+    study = read_study(run)
+    area, traction = np.prod(extremes.BAR["size"][1:]), np.array(study["boundary"][0]["traction"])
+    pieces = _columns(run / "pieces.csv")
+    last = pieces["time"] == pieces["time"].max()
+    momentum = np.array([(pieces["mass"] * pieces[f"velocity_{axis}"])[last].sum() for axis in "xyz"])
+    exact = traction * area * pieces["time"].max()
+    return survived(run) | {"error": float(np.linalg.norm(momentum - exact) / np.linalg.norm(exact))}
+
+
+def hung(run: Path) -> Figures:
+    """As `survived`, and the error of the force at the support against the weight of the body."""
+    if not run.exists():
+        return {}
+    pieces, rows = _columns(run / "pieces.csv"), read_history(run)
+    weight = -pieces["mass"][pieces["time"] == 0].sum() * read_study(run)["load"]["gravity"][2]
+    return survived(run) | {"error": float(abs(rows["reaction_grip_z"][-1] / weight - 1))}
+
+
+def drifting(run: Path) -> Figures:
+    """As `survived`, and what a body that no force acts on gains in momentum, over its mass times its fastest speed."""
+    if not run.exists():
+        return {}
+    start, pieces = read_study(run)["initial"].get("velocity", [0.0, 0.0, 0.0]), _columns(run / "pieces.csv")
+    last = pieces["time"] == pieces["time"].max()
+    mass, v = pieces["mass"][last], np.stack([pieces[f"velocity_{axis}"][last] for axis in "xyz"])
+    gained = v @ mass - mass.sum() * np.array(start)
+    return survived(run) | {"error": float(np.linalg.norm(gained) / (mass.sum() * np.linalg.norm(v, axis=0).max()))}
+
+
+# --- reading an output folder ---------------------------------------------------------------------------------------
+
+
+def read_history(run: Path) -> dict[str, Values]:
+    """history.csv by columns."""
+    return _columns(run / "history.csv")
+
+
+def _columns(path: Path) -> dict[str, Values]:
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    table = np.array([[float(value) for value in row] for row in rows[1:]]).reshape(-1, len(rows[0]))
+    return dict(zip(rows[0], table.T, strict=True))
+
+
+def read_study(run: Path) -> dict[str, Any]:
+    """The study as it was run, every default written out."""
+    return tomllib.loads((run / "study.toml").read_text())
+
+
+def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:
+    """Largest rise of elastic + kinetic + dissipated - work above what it was before, as a share of the energy at play.
+
+    Schemes may lose energy, never make it. In a quasi-static run the balance is closed by `dissipated`, which has to
+    grow: a fall of it is energy from nowhere. Trapezoidal work over large steps has an error of its own.
+    """
+    held = rows["elastic"] + rows["kinetic"]
+    balance = held + rows["dissipated"] - rows["external_work"]
+    if not moving_at_start:
+        balance = np.concatenate([[0.0], balance])
+    scale = max(np.abs(rows["external_work"]).max(), held.max())
+    fall = -rows["dissipated"].min(initial=0.0) if not rows["kinetic"].any() else 0.0
+    rise = (balance - np.minimum.accumulate(balance)).max()
+    return float(max(rise, fall) / scale) if scale else 0.0
+
+
+def _frames(run: Path) -> tuple[bool, float]:
+    """(all fields finite, smallest J of any cell that carries) over the frames of fields.h5."""
+    finite, least = True, np.inf
+    with h5py.File(run / "fields.h5") as file:
+        points, cells = file["points"][()], file["cells"][()]
+        for frame in file["frames"].values():
+            finite &= all(np.isfinite(data[()]).all() for data in frame.values())
+            carries = _carrying(frame, len(cells))
+            J = volume_ratios(points, cells, frame["displacement"][()])
+            least = min(least, J[carries].min(initial=np.inf))
+    return bool(finite), float(least)
+
+
+def _carrying(frame: Any, cells: int) -> npt.NDArray[np.bool_]:
+    """(m,) cells whose J matters: those that broken edges have not taken apart."""
+    if "chi" in frame:
+        return np.asarray(frame["chi"][()] > 0)
+    return np.asarray(frame["damage"][()] == 0) if "damage" in frame else np.ones(cells, bool)
+
+
+def volume_ratios(points: Values, cells: npt.NDArray[np.integer], u: Values) -> Values:
+    """(m,) J = det(x_1 - x_0, ...) / det(X_1 - X_0, ...) of each simplex; points and u (n, 3), 2D in their plane."""
+    d = cells.shape[1] - 1
+
+    def measure(x: Values) -> Values:
+        corners = x[cells][:, :, :d]
+        return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+
+    return measure(points + u) / measure(points)
+
+
+def surface_is_finite(run: Path) -> bool:
+    """Whether every point of the last frame of the split surface is a number, where there is a surface."""
+    if not (run / "surface.pvd").exists():
+        return True
+    from fracsim.surface.files import read_collection
+
+    frames = read_collection(run / "surface.pvd")
+    return not frames or bool(np.isfinite(read_surface(run / frames[-1][1]).points).all())
+
+
+def read_surface(path: Path) -> Any:
+    """One frame of the split surface as a pyvista grid."""
+    import pyvista
+
+    return pyvista.read(path)

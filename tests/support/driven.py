@@ -1,0 +1,49 @@
+"""Extremes on the ranks of this process: python -m support.driven TARGET.npz (under mpirun)."""
+
+import sys
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fracsim.inverted import Inverted
+from fracsim.scene import Scene, build_scene
+from fracsim.studies.evidence import extremes
+from fracsim.study_file import validate
+
+
+def stepped(study: dict[str, Any], steps: int) -> tuple[Scene, Any, Any]:
+    """The scene, its state and the last report after some steps (collective)."""
+    scene = build_scene(MPI.COMM_WORLD, validate(study, "driven"))
+    state = scene.stepper.start(scene.study.initial)
+    for _ in range(steps):
+        report = scene.stepper.advance(state)
+    return scene, state, report
+
+
+def nearly_incompressible() -> list[float]:
+    """(attempts that failed, broken edges, elastic energy in J) of a bar torn at nu = 0.4999."""
+    study = extremes.torn(extremes.BAR, speed=1.0, step=1e-2, steps=12, strength=2e5, material={"poisson": 0.4999})
+    scene, _, report = stepped(study, 12)
+    broken = MPI.COMM_WORLD.allreduce(scene.fracture.graph.broken_count)
+    return [scene.stepper.failed, broken, report.elastic]
+
+
+def crushed() -> list[float]:
+    """(cells, smallest J, s) that are told of a block mirrored along x."""
+    scene, state, _ = stepped(extremes.block(-1.0, steps=1, confined=True), 1)
+    watch = Inverted(scene.equations)
+    watch.look(state.t)
+    return [watch.count, watch.least, watch.since]
+
+
+def flown() -> list[float]:
+    """(attempts that failed, kinetic energy in J) of a fast body in short steps."""
+    scene, _, report = stepped(extremes.flying(1e3, 1e-6), 20)
+    return [scene.stepper.failed, report.kinetic]
+
+
+if __name__ == "__main__":
+    found = {"soft": nearly_incompressible(), "crushed": crushed(), "flown": flown()}
+    if MPI.COMM_WORLD.rank == 0:
+        np.savez(sys.argv[1], **{name: np.array(values) for name, values in found.items()})

@@ -1,0 +1,258 @@
+"""The trials of the stability and dependence groups, what they measure, and the sections made of them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from fracsim.check import check_study
+from fracsim.errors import InputError
+from fracsim.run import run_study
+from fracsim.studies.evidence import closed_forms, dependence, extremes, failed, slit, stability, survival, written
+from fracsim.studies.evidence.trial import Trial
+from fracsim.study_file import validate
+
+TRIALS = [*stability.trials(), *dependence.trials()]
+
+
+def test_trials_have_places_of_their_own() -> None:
+    places = [(trial.group, trial.case, trial.name) for trial in TRIALS]
+    assert len(set(places)) == len(places) > 100
+    for trial in TRIALS:
+        assert json.loads(json.dumps(trial.settings)) == trial.settings
+        assert trial.limit <= 600 and (trial.study is None) != (not trial.script)
+    pairs = {(t.case, t.name[:-3]) for t in stability.trials() if t.case != "failed"}
+    assert all((case, f"{name}-r{n}") in {p[1:] for p in places} for case, name in pairs for n in (1, 2))
+
+
+@pytest.mark.parametrize("trial", [t for t in TRIALS if t.study and t.ranks == 1], ids=lambda t: f"{t.case}-{t.name}")
+def test_studies_are_valid(trial: Trial) -> None:
+    """All but those that are there to be refused: a strength of zero, or none that is a number."""
+    assert trial.study is not None
+    if trial.name in ("0-Pa-r1", "nan-Pa-r1"):
+        with pytest.raises(InputError, match=r"fracture\.strength"):
+            validate(trial.study, "trial")
+        return
+    assert check_study(validate(trial.study, "trial"))
+
+
+def test_measures_exist() -> None:
+    modules = {"survival": survival, "dependence": dependence}
+    for trial in TRIALS:
+        if trial.measure:
+            module, _, name = trial.measure.partition(":")
+            assert callable(getattr(modules[module], name))
+
+
+# --- closed forms ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("energy", ["linear", "corotated", "stvk", "neo-hookean"])
+def test_principal_stress_is_the_derivative_of_the_energy(energy: str) -> None:
+    """P_1 = d psi / d l_1 and P_t = (1/2) d psi / d l_t, psi in principal stretches, by central differences."""
+    material = extremes.RUBBER | {"energy": energy}
+    mu, lmbda = 1e6 / 2.6, 3e5 / (1.3 * 0.4)
+
+    def psi(l1: float, lt: float) -> float:
+        stretches = np.array([l1, lt, lt])
+        if energy == "neo-hookean":
+            m, volumetric = 4 / 3 * mu, lmbda + 5 / 6 * mu
+            trace, alpha = stretches @ stretches, 1 + m / volumetric - m / (4 * volumetric)
+            both = m * (trace - 3) - m * np.log(trace + 1)
+            return float(both / 2 + volumetric / 2 * (stretches.prod() - alpha) ** 2)
+        strain = (stretches**2 - 1) / 2 if energy == "stvk" else stretches - 1
+        return float(mu * strain @ strain + lmbda / 2 * strain.sum() ** 2)
+
+    l1, lt, step = 1.7, 0.8, 1e-6
+    P = closed_forms.principal_stress(material, l1, lt)
+    along = (psi(l1 + step, lt) - psi(l1 - step, lt)) / (2 * step)
+    across = (psi(l1, lt + step) - psi(l1, lt - step)) / (4 * step)
+    assert pytest.approx((along, across), rel=1e-6) == P  # eps psi / step
+
+
+def test_lateral_stretch_of_hooke_is_poissons() -> None:
+    """l_t = 1 - nu (l_1 - 1); and where that is not positive there is no answer."""
+    material = extremes.RUBBER | {"energy": "linear"}
+    assert closed_forms.lateral_stretch(material, 1.2) == pytest.approx(1 - 0.3 * 0.2, rel=1e-12)
+    with pytest.raises(ValueError):
+        closed_forms.lateral_stretch(material, 5.0)
+
+
+# --- measures -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_volume_ratios_are_determinants(dim: int) -> None:
+    """An affine map x = A X + b has J = det A in every cell; a mirror has a negative one."""
+    from fracsim.meshes.box import lattice
+
+    points, cells = lattice((2,) * dim)
+    A = np.eye(dim) + np.random.default_rng(1).normal(size=(dim, dim)) * 0.3
+    for map_ in (A, A @ np.diag([-1.0] + [1.0] * (dim - 1))):
+        u = np.zeros((len(points), 3))
+        u[:, :dim] = points @ map_.T + 5.0 - points
+        padded = np.pad(points, ((0, 0), (0, 3 - dim)))
+        assert np.allclose(survival.volume_ratios(padded, cells, u), np.linalg.det(map_), rtol=1e-12)
+
+
+def rows(**columns: list[float]) -> dict[str, Any]:
+    names = ("elastic", "kinetic", "dissipated", "external_work")
+    return {name: np.array(columns.get(name, [0.0] * 3), float) for name in names}
+
+
+def test_energy_growth() -> None:
+    """A rise of the balance counts against the largest energy; a loss does not, nor what was there at first."""
+    lossy = rows(kinetic=[1.0, 0.5, 0.4], external_work=[1.0, 1.0, 1.0])
+    assert survival.energy_growth(lossy, moving_at_start=False) == 0
+    grown = rows(kinetic=[1.0, 0.5, 3.0], external_work=[1.0, 1.0, 1.0])
+    assert survival.energy_growth(grown, moving_at_start=False) == pytest.approx(2.5 / 3.0)
+    thrown = rows(kinetic=[1.0, 1.0, 1.0])
+    assert survival.energy_growth(thrown, moving_at_start=True) == 0
+    assert survival.energy_growth(thrown, moving_at_start=False) == 1
+    static = rows(elastic=[1.0, 2.0, 1.0], dissipated=[0.0, -0.5, 1.0], external_work=[1.0, 1.5, 2.0])
+    assert survival.energy_growth(static, moving_at_start=False) == pytest.approx(0.25)
+
+
+def test_what_is_measured_of_a_run(tmp_path: Path) -> None:
+    """A block stretched until all its edges along x break at once: the closed form and the counts."""
+    study = extremes.block(1.2, steps=8, strength=1e5, material={"energy": "corotated"})
+    run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
+    figures = survival.pulled(tmp_path / "run")
+    assert figures["finite"] and figures["error"] < 1e-6 and figures["break_off_by"] == 0
+    # 8 x 2 x 2 cubes have 8 x 3 x 3 edges along x; others follow where stress is left
+    assert figures["broken_in_a_step"] >= 72 and figures["steps"] == 8
+    assert figures["smallest_J"] == 1.0  # at rest: the body that is pulled swells, nu < 1/2
+
+
+def test_a_wrong_force_is_an_error(tmp_path: Path) -> None:
+    study = extremes.block(1.2, steps=2)
+    run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
+    history = survival.read_history(tmp_path / "run")
+    history["reaction_pull_x"] *= 1.01
+    error = closed_forms.stretch_error(survival.read_study(tmp_path / "run"), history)["error"]
+    assert error == pytest.approx(0.01, rel=1e-4)
+
+
+def test_nothing_is_measured_of_a_refusal(tmp_path: Path) -> None:
+    assert survival.survived(tmp_path) == {} and survival.pulled(tmp_path / "run") == {}
+
+
+def test_crack_of_a_bar_in_two(tmp_path: Path) -> None:
+    """A bar that came apart: its crack is at least as long as the ligament of 7 mm, and it carries nothing."""
+    study = slit.study(slit.BAR, slit.unstructured(slit.BAR, 1e-3), 0.0)
+    run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
+    figures = dependence.broken_bar(tmp_path / "run")
+    assert figures["broken_area"] >= 7e-3 and figures["left"] < 1e-3
+    assert 0 <= figures["stray"] < 20e-3 and figures["dissipated"] > 0
+
+
+def test_structured_slit_has_the_same_outline() -> None:
+    for specimen in slit.SPECIMENS.values():
+        for h in (5e-4, 2.5e-4):
+            mesh = slit.structured(specimen, h)
+            corners = mesh.points[mesh.cells]
+            area = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 2
+            cut = np.prod(np.subtract(*specimen.slit[::-1]))
+            assert area == pytest.approx(np.prod(specimen.size) - cut, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", list(written.MESHES))
+def test_written_studies_fit_their_meshes(name: str, tmp_path: Path) -> None:
+    from fracsim.meshes.write import write_mesh
+
+    mesh, study = written.MESHES[name]()
+    write_mesh(mesh, tmp_path / "mesh.msh")
+    study["mesh"] = {"file": str(tmp_path / "mesh.msh")}
+    assert check_study(validate(study, "x"))
+
+
+# --- the failed approaches ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("approach", failed.APPROACHES)
+def test_force_and_tangent_of_an_undamaged_bar(approach: str) -> None:
+    """All approaches agree while nothing is broken: f is the derivative of the energy, K that of f."""
+    bar = failed.lattice_bar(approach)
+    u = np.random.default_rng(2).normal(size=bar.points.shape) * 0.01
+    f, K = bar.force_and_tangent(u)
+    way, step = np.random.default_rng(3).normal(size=u.shape), 1e-6
+    slope = (bar.energy(u + step * way) - bar.energy(u - step * way)) / (2 * step)
+    assert f @ way.ravel() == pytest.approx(slope, rel=1e-6)
+    turn = (bar.force_and_tangent(u + step * way)[0] - bar.force_and_tangent(u - step * way)[0]) / (2 * step)
+    assert np.allclose(K @ way.ravel(), turn, atol=1e-6 * np.abs(turn).max())
+
+
+def test_two_approaches_fail_and_chi_holds() -> None:
+    assert failed.judged(failed.simulate("chi")) == "holds"
+    projected = failed.simulate("projected-stress")
+    assert projected["loop"] > 0.1 and projected["peak"] > 10 and "energy from nowhere" in failed.judged(projected)
+    inverse = failed.simulate("pseudo-inverse")
+    assert inverse["rest_stress"] > 0.1 and inverse["lowest"] < -0.01 and inverse["jump"] > 1
+
+
+# --- sections -------------------------------------------------------------------------------------------------------
+
+
+def record(case: str, name: str, ranks: int, **changes: Any) -> dict[str, Any]:
+    figures = {"finite": True, "growth": 0.0, "error": 1e-9, "broken": 3, "pieces": 2}
+    return {
+        "group": "stability", "case": case, "name": f"{name}-r{ranks}", "ranks": ranks, "settings": {"of": name},
+        "outcome": "done", "message": "", "wall": [1.0], "summary": None, "figures": figures,
+    } | changes  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "right"),
+        ({"figures": {"finite": True}}, "stable"),
+        ({"outcome": "refused", "message": "fracsim: strength = 0"}, "refused: strength = 0"),
+        ({"outcome": "refused"}, "WRONG: refused without a word"),
+        ({"outcome": "out of time"}, "WRONG: out of time"),
+        ({"figures": {"finite": False}}, "WRONG: not finite"),
+        ({"figures": {}}, "WRONG: not finite"),
+        ({"figures": {"finite": True, "growth": 0.2}}, "WRONG: energy grew"),
+        ({"figures": {"finite": True, "error": 0.5}}, "WRONG: far from the closed form"),
+        ({"figures": {"finite": True, "error": float("nan")}}, "WRONG: far from the closed form"),
+        ({"message": "fracsim: note: 3 cells are turned inside out"}, "warned: 3 cells are turned inside out"),
+    ],
+)
+def test_verdicts(changes: dict[str, Any], words: str) -> None:
+    assert stability.verdict(record("dt", "1e-6", 1, **changes)) == words
+
+
+def test_section_of_the_table() -> None:
+    """One row for both ranks; a difference between them and a hang are found."""
+    records = [record("dt", "a", 1), record("dt", "a", 2), record("young", "b", 1), record("young", "b", 2)]
+    (section,) = stability.sections(records)
+    assert [claim.holds for claim in section.claims] == [True] * 4
+    assert [row[:4] for row in section.tables[0].rows] == [("dt", "a", "right", True), ("young", "b", "right", True)]
+    assert all(len(row) == len(section.tables[0].columns) for row in section.tables[0].rows)
+    records[3] = record("young", "b", 2, outcome="out of time", figures={"broken": 4})
+    (section,) = stability.sections(records)
+    assert [claim.holds for claim in section.claims] == [False, True, False, False]
+    assert section.tables[0].rows[1][2] == "right; on 2 ranks WRONG: out of time"
+
+
+def test_section_of_the_failed_approaches() -> None:
+    figures = {"peak": 5.0, "rest_stress": 0.0, "loop": 1.0, "lowest": 0.0, "newton_failed_at": 0.1, "jump": 2.0}
+    found = stability.sections([record("failed", "projected-stress", 1, figures=figures | {"reach": 1.0})])[1]
+    assert found.tables[0].rows[0][-1] == "fails: energy from nowhere, no solution, a cycle does work"
+
+
+def test_section_of_dependence() -> None:
+    """Spread (max - min) / mean: (3 - 1) / 2 = 1; a run that failed stays in the table."""
+    records = []
+    for number, (pattern, h) in enumerate(dependence.MESHES[:3]):
+        figures = dict.fromkeys(dependence.FIGURES, 1.0 + number)
+        settings = {"h": h, "pattern": pattern, "radius": 0.0}
+        records.append(record("bar-local", str(number), 1, figures=figures, settings=settings))
+    records.append(record("bar-local", "3", 1, outcome="out of time", figures={}, settings=settings))
+    (section,) = dependence.sections(records)
+    spread, every = section.tables
+    assert spread.rows == (("bar-local", 3, 1.0, 1.0, 1.0, 1.0),)
+    assert len(every.rows) == 4 and every.rows[3][3] == "out of time"
+    assert section.plots[0].series[0].y == (1.0, 2.0, 3.0)
