@@ -64,7 +64,7 @@ class PlateHole:
         """The hole is taken for filled with the cells beside it, less its own share of them."""
         fine, full = self._sizing, (self.length, self.height)
         high = (*full, self.thickness) if self.thickness else full
-        inside = (self.radius, self.radius) + high[2:]
+        inside = (self.radius, self.radius, *high[2:])
         whole, hole = (cells_for(fine, (0.0,) * len(high), corner) for corner in (high, inside))
         return max(1, round(whole - pi / 4 * hole))
 
