@@ -173,6 +173,19 @@ def test_bilinear_curve() -> None:
     assert references.bilinear_stress(stress / E + plastic_strain, E, s, K) == pytest.approx(stress, rel=1e-12)
 
 
+def test_flow_at_a_finite_rate_against_its_equations() -> None:
+    """s = E (e - e_p), e_p' = rate (s - Y - K e_p) / (3 G + K) by explicit Euler of 1e5 steps."""
+    E, nu, Y, K, rate, end, n = 200.0, 0.3, 1.0, 20.0, 3.0, 0.03, 100000
+    plastic_strain, shear = 0.0, E / (2 * (1 + nu))
+    for strain in np.linspace(0, end, n, endpoint=False):
+        excess = E * (strain - plastic_strain) - Y - K * plastic_strain
+        plastic_strain += rate * max(excess, 0.0) / (3 * shear + K) / n
+    found = references.flowing_stress(end, end, (E, nu), np.array([Y, K, rate]))
+    assert found == pytest.approx(E * (end - plastic_strain), rel=1e-4)
+    fast = references.flowing_stress(end, end, (E, nu), np.array([Y, K, 1e9]))
+    assert fast == pytest.approx(references.bilinear_stress(end, E, Y, K), rel=1e-6)
+
+
 # --- trials ---
 
 

@@ -235,3 +235,19 @@ def bilinear_stress(strain: float, young: float, yield_stress: float, hardening:
     if young * strain <= yield_stress:
         return young * strain
     return yield_stress + (strain - yield_stress / young) * young * hardening / (young + hardening)
+
+
+def flowing_stress(strain: float, strain_rate: float, elastic: tuple[float, float], flow: Values) -> float:
+    """The same with flow at a finite rate; `elastic` = (E, nu), `flow` = (yield stress, K, rate in 1/s).
+
+    Held at a fixed deformation, the excess f = s - (Y + K e_p) falls by exp(-rate dt): a flow e_p' takes 3 G e_p' from
+    the von Mises stress then, so that e_p' = rate f / (3 G + K). A bar is free sideways, s = E (e - e_p):
+    f' = E e' - f / T with T = (3 G + K) / (rate (E + K)), hence f = E e' T (1 - exp(-t / T)) at a time t after yield,
+    and with e_p = (E e - Y - f) / (E + K) the stress is the bilinear one plus f E / (E + K).
+    """
+    young, poisson = elastic
+    yield_stress, hardening, rate = flow
+    fall = (3 * lame(young, poisson)[0] + hardening) / (rate * (young + hardening))  # T, s
+    since = max(strain - yield_stress / young, 0.0) / strain_rate
+    excess = young * strain_rate * fall * (1 - np.exp(-since / fall))
+    return float(bilinear_stress(strain, young, yield_stress, hardening) + excess * young / (young + hardening))

@@ -58,7 +58,7 @@ def measure_break(run: Path) -> dict[str, float]:
 
 RISE, FORCE, AFTER = 6.0, 1.1e-3, 1.1  # s, N/m^3, s after the break
 WINDOW = 0.3  # s after the break from which the velocity is taken
-CELLS = (16, 32, 64, 128)
+CELLS = (16, 32, 64, 96)
 SCHEMES = ("newmark", "generalized-alpha", "explicit", "backward-euler")
 
 
@@ -117,7 +117,7 @@ def trials() -> list[Trial]:
     )  # fmt: skip
     found += [
         trial("recoil", f"{scheme}-{cells}", torn(cells, scheme), "fracture:measure_recoil",
-              {"scheme": scheme, "h": 1 / cells}, full=cells == CELLS[-1] and scheme != "explicit")
+              {"scheme": scheme, "h": 1 / cells})
         for scheme in SCHEMES
         for cells in CELLS
     ]  # fmt: skip

@@ -20,12 +20,12 @@ SIDE, RADIUS, PULL = 0.05, 0.01, 1e6  # m, m, Pa: quarter plate
 STEEL = {"young": YOUNG, "poisson": POISSON, "density": 7850.0}
 ONE_STEP = {"scheme": "quasi-static", "step": 1.0, "end": 1.0}
 
-QUADRATIC = {"cantilever": (0.05, 0.025, 0.0125), "plate": (0.003, 0.0015, 0.00075)}  # last: long report
+QUADRATIC = {"cantilever": (0.05, 0.025, 0.0125), "plate": (0.002, 0.001, 0.0005)}  # last: long report
 SIZES = {
-    "cantilever": (0.025, 0.0125, 0.01, 0.00625, 0.005, 0.004),
-    "plate": (0.008, 0.006, 0.004, 0.003, 0.002, 0.0015, 0.001),
+    "cantilever": (0.025, 0.0125, 0.01, 0.00625, 0.0045, 0.004),
+    "plate": (0.008, 0.006, 0.004, 0.003, 0.002, 0.0015, 0.001, 0.00075),
 }
-FULL = {"cantilever": 0.004, "plate": 0.001}  # this size is for the long report
+FULL = {"cantilever": 0.004, "plate": 0.00075}  # this size is for the long report
 
 
 def cantilever(h: float, energy: str = "linear") -> Study:
