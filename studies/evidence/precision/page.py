@@ -14,7 +14,7 @@ Records = list[dict[str, Any]]
 Errors = Callable[[Records], dict[str, dict[str, float]]]
 
 WITHIN = 0.2  # of an order of theory
-NOISE = 1.25  # times of single runs on a machine with other work differ by as much: no setting is better for less
+NOISE = 1.25  # no setting is better for less: times of single runs differ by a good part of it
 LIMITS = (0.05, 0.01)
 
 
@@ -70,9 +70,12 @@ class Row:
 
     @property
     def core_seconds(self) -> float:
-        """Ranks times the time in steps (a script: in its work), s."""
-        stepping = self.record["stepping"] or [self.record["figures"].get("seconds", 0.0)]
-        return float(self.record["ranks"] * median(stepping))
+        """Processor seconds of all ranks in the loop over steps; a script: seconds in its work.
+
+        Processor time hardly feels what else a machine does, as wall time in steps times ranks would.
+        """
+        summary = self.record["summary"] or {}
+        return float(summary.get("cpu", self.record["figures"].get("seconds", 0.0)))
 
 
 def figure(records: Records, name: str, key: str) -> float:
@@ -238,7 +241,7 @@ def _default_claim(case: Case, advice: Advice) -> Claim:
 def _table(case: Case, rows: list[Row], marked: list[int]) -> Table:
     front = _front(case, rows)
     columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors),
-               "wall s", "core-seconds in steps", "front", "outcome")  # fmt: skip
+               "wall s", "core-seconds", "front", "outcome")  # fmt: skip
     caption = f"{case.title}: relative errors and times. Marked: recommended for 5 % and 1 %; *: on the front."
     cells = tuple(_cells(case, row, number in front) for number, row in enumerate(rows))
     return Table(f"precision-{case.name}", caption, columns, cells, marked=tuple(marked))
@@ -270,7 +273,7 @@ def _plots(case: Case, rows: list[Row]) -> tuple[Plot, ...]:
     return tuple(
         Plot(f"{case.title}: {label}", label, f"error of {case.errors[0]}", _series(case, usable, cost), "loglog",
              pareto=True, levels=LIMITS)
-        for label, cost in (("wall time of the run, s", "wall"), ("core-seconds in steps", "core_seconds"))
+        for label, cost in (("wall time of the run, s", "wall"), ("core-seconds in the steps", "core_seconds"))
     )  # fmt: skip
 
 
