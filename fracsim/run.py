@@ -132,6 +132,7 @@ class Run:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged or Stopped after a checkpoint."""
         self._setup_seconds = time.perf_counter() - self._began
+        self._cpu_began = time.process_time()
         progress = Progress(self.comm, self.scene.study)
         try:
             with self._interrupt, progress:
@@ -225,6 +226,7 @@ class Run:
         broken, split, pieces = self._figures()
         sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
         memory = total(self.comm, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)[0]
+        cpu = total(self.comm, time.process_time() - self._cpu_began)[0]  # of all ranks, s: hardly feels other work
         seconds = {"setup": self._setup_seconds, **stepper.phases, "output": self.output_seconds}
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
@@ -233,7 +235,8 @@ class Run:
             "smallest_J": self.inverted.least, "inverted_cells": self.inverted.count,
             "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
             "seconds": {key: round(value, 4) for key, value in seconds.items()},
-            "wall": round(time.perf_counter() - self._began, 3), "peak_memory_MiB": round(float(memory), 1),
+            "wall": round(time.perf_counter() - self._began, 3), "cpu": round(float(cpu), 4),
+            "peak_memory_MiB": round(float(memory), 1),
             "ranks": self.comm.size, "versions": versions(self.comm),
         }  # fmt: skip
 

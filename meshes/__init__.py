@@ -19,6 +19,7 @@ from .loaf import Loaf
 from .notched_bar import NotchedBar
 from .notched_plate import NotchedPlate
 from .parameters import Builder
+from .plate_hole import PlateHole
 
 BUILDERS: dict[str, type[Builder]] = {
     "box": Box,
@@ -27,6 +28,7 @@ BUILDERS: dict[str, type[Builder]] = {
     "loaf": Loaf,
     "notched-bar": NotchedBar,
     "notched-plate": NotchedPlate,
+    "plate-hole": PlateHole,
 }
 
 __all__ = ["BUILDERS", "Builder", "MeshData", "MeshError"]

@@ -29,6 +29,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("cylinder", {"h": 0.015}),
     ("cylinder", {"h": 0.015, "axis": "x"}),
     ("disk", {}),
+    ("disk", {"arc": 10.0}),
     ("loaf", {"h": 0.012}),
     ("notched-bar", {"h": 0.002, "h_notch": 0.0004}),
     ("notched-bar", {"thickness": 0.0}),
@@ -36,6 +37,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("notched-bar", {"thickness": 0.0, "notch": "slit", "refined": 0.004}),
     ("notched-plate", {}),
     ("notched-plate", {"thickness": 0.004, "h": 0.003, "h_tip": 0.001}),
+    ("plate-hole", {}),
+    ("plate-hole", {"length": 0.04, "thickness": 0.01, "h_hole": 0.002}),
     ("notched-plate", {"length": 1e-3, "height": 1e-3, "notch_length": 5e-4, "notch_width": 5e-6, "h": 4e-5}),
 ]
 
@@ -228,6 +231,30 @@ def test_cells_are_fine_ahead_of_the_tip_only() -> None:
     assert np.median(size[middles[:, 0] < 0.03]) == pytest.approx(0.002, rel=0.25)
 
 
+def test_disk_with_arcs_has_its_platens() -> None:
+    """Arcs of angle a: chords that miss the arc by a share of (h / r)^2 / 24; their ends and the axes' are nodes."""
+    r, h, arc = 0.05, 0.004, 10.0
+    mesh = BUILDERS["disk"](radius=r, h=h, arc=arc).build()
+    for name, sign in (("top", 1), ("bottom", -1)):
+        facets = mesh.facet_groups[name]
+        assert facet_measures(mesh.points, facets).sum() == pytest.approx(r * radians(arc), rel=(h / r) ** 2 / 6)
+        ends = r * np.array([sin(radians(arc / 2)), sign * cos(radians(arc / 2))])
+        for wanted in (ends, ends * [-1, 1], [0, sign * r]):
+            assert np.linalg.norm(mesh.points[facets].reshape(-1, 2) - wanted, axis=1).min() < 1e-12
+    for wanted in ([r, 0], [-r, 0]):
+        assert np.linalg.norm(mesh.points - wanted, axis=1).min() < 1e-12
+
+
+def test_plate_with_a_hole_lacks_a_quarter_circle() -> None:
+    """Area L H - pi r^2 / 4; the hole's polygon of chords h takes a share of about (h / r)^2 / 6 less."""
+    r, fine = 0.01, 0.0005
+    mesh = BUILDERS["plate-hole"](length=0.05, height=0.04, radius=r, h=0.004, h_hole=fine).build()
+    assert volume(mesh) == pytest.approx(0.05 * 0.04 - pi * r**2 / 4, abs=pi * r**2 / 4 * (fine / r) ** 2 / 3)
+    hole = mesh.points[np.unique(mesh.facet_groups["hole"])]
+    np.testing.assert_allclose(np.linalg.norm(hole, axis=1), r, rtol=1e-9)
+    assert facet_measures(mesh.points, mesh.facet_groups["hole"]).mean() == pytest.approx(fine, rel=0.2)
+
+
 def test_loaf_without_dome_is_a_block_with_round_edges() -> None:
     """Steiner's formula for a box with edges p, q, s thickened by r: pqs + 2r(pq + qs + sp) + pi r^2 (p + q + s)
     + 4/3 pi r^3. Facets on the round parts cut off a share of about (h / r)^2 / 24 of their volume."""
@@ -298,6 +325,9 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("notched-plate", {"notch_position": 0.04}, "does not lie within height = 0.04"),
     ("notched-plate", {"notch_width": 0.0}, "notch_width = 0.0 must be a positive number"),
     ("notched-plate", {"thickness": -1.0}, "thickness = -1.0 must be zero or a positive number"),
+    ("disk", {"arc": 180.0}, "arc = 180.0 must be at least 0 and less than 180 degrees"),
+    ("plate-hole", {"radius": 0.05}, "radius = 0.05 must be less than length = 0.05 and height = 0.05"),
+    ("plate-hole", {"h_hole": -1.0}, "h_hole = -1.0 must be a positive number"),
     ("loaf", {"rounding": 0.06}, "rounding = 0.06 .* do not fit a block"),
     ("loaf", {"grip": 0.2}, "grip = 0.2 must be less than half of the length"),
     ("loaf", {"dome": 2.0}, "dome = 2.0 must lie between 0 and 1"),

@@ -1,0 +1,26 @@
+"""What the studies of this group share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..trial import Setting, Trial
+
+GROUP = "precision"
+QUIET: dict[str, Any] = {"every": 1_000_000, "fields": [], "picture": False}  # only the first and the last frame
+SCRIPTS = "fracsim.studies.evidence.precision"
+TIGHT: dict[str, Any] = {"snes_rtol": 1e-10, "ksp_rtol": 1e-8}  # leaves the error of h and dt alone
+
+Study = dict[str, Any]
+Settings = dict[str, Setting]
+
+
+def trial(case: str, name: str, study: Study, measure: str, settings: Settings, **more: Any) -> Trial:
+    """A run of a study; `measure` is a function of this group as "module:function"."""
+    return Trial(GROUP, case, name, study=study, settings=settings, measure=f"precision.{measure}", **more)
+
+
+def script(case: str, name: str, module: str, arguments: dict[str, Any], settings: Settings, **more: Any) -> Trial:
+    """A run of a script of this group that writes figures.json; `arguments` as --key value."""
+    words = [str(word) for key, value in arguments.items() for word in (f"--{key}", value)]
+    return Trial(GROUP, case, name, script=(f"{SCRIPTS}.{module}", *words), settings=settings, **more)

@@ -1,0 +1,289 @@
+"""From the records of a case to its section: errors against seconds, the front, fitted orders, recommended settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from ..section import Cell, Claim, Plot, Point, Section, Series, Table, fitted_order, pareto_front, recommended
+from ..trial import Setting
+
+Records = list[dict[str, Any]]
+Errors = Callable[[Records], dict[str, dict[str, float]]]
+
+WITHIN = 0.2  # of an order of theory
+NOISE = 1.25  # no setting is better for less: times of single runs differ by a good part of it
+LIMITS = (0.05, 0.01)
+
+
+@dataclass(frozen=True)
+class Order:
+    """A fit over trials: error = C variable^theory."""
+
+    error: str
+    variable: str  # key of the settings
+    theory: float
+    names: tuple[str, ...]  # trials in the asymptotic range
+    of: str = ""  # what is fitted, where the error alone does not say
+    least: bool = False  # the order of theory is the least to expect
+
+
+@dataclass(frozen=True)
+class Case:
+    """How the records of a case become a section.
+
+    Attributes:
+        text: words from the records.    columns: settings that are shown.
+        compare: trial name -> error name -> relative error.    errors: names of errors; the first one is the target.
+        orders: fits.    split: a setting whose values are series of the plots.
+        apart: values of settings that are no candidates for a default (explicit steps, a Newton step without a test).
+        share: of a limit that the error may take; less than 1 where errors of mesh and step come on top.
+        claims: what else must hold.
+    """
+
+    name: str
+    title: str
+    text: Callable[[Records], str]
+    columns: tuple[str, ...]
+    compare: Errors
+    errors: tuple[str, ...]
+    orders: tuple[Order, ...] = ()
+    split: str = ""
+    apart: tuple[Setting, ...] = ()
+    share: float = 1.0
+    claims: Callable[[Records], tuple[Claim, ...]] = lambda records: ()
+
+
+@dataclass(frozen=True)
+class Row:
+    """A trial in the table."""
+
+    record: dict[str, Any]
+    errors: dict[str, float]
+
+    @property
+    def wall(self) -> float:
+        """Wall time of the whole process, s."""
+        return median(self.record["wall"])
+
+    @property
+    def core_seconds(self) -> float:
+        """Processor seconds of all ranks in the loop over steps; a script: seconds in its work.
+
+        Processor time hardly feels what else a machine does, as wall time in steps times ranks would.
+        """
+        summary = self.record["summary"] or {}
+        return float(summary.get("cpu", self.record["figures"].get("seconds", 0.0)))
+
+
+def figure(records: Records, name: str, key: str) -> float:
+    """A figure of one trial; KeyError names it where it was not measured."""
+    figures: dict[str, float] = next((record["figures"] for record in records if record["name"] == name), {})
+    if key not in figures:
+        raise KeyError(f"{name} has no {key}")
+    return float(figures[key])
+
+
+def relative(value: float, exact: float) -> float:
+    """|value / exact - 1|."""
+    return abs(value / exact - 1)
+
+
+def by_figures(*keys: str) -> Errors:
+    """Errors that the measurement itself took against a closed form."""
+    return lambda records: {
+        record["name"]: {key: float(record["figures"][key]) for key in keys if key in record["figures"]}
+        for record in records
+    }
+
+
+def section(case: Case, records: Records) -> Section:
+    """The section of one case; where its reference is missing, a section that says so."""
+    mine = [record for record in records if record["case"] == case.name]
+    try:
+        errors, text = case.compare(mine), case.text(mine)
+        claims = case.claims(mine)
+    except (KeyError, StopIteration) as error:
+        return Section(case.title, f"Not run, or its reference is missing: {error}.", tables=(_outcomes(case, mine),))
+    rows = [Row(record, errors.get(record["name"], {})) for record in mine]
+    advice, marked = _advice(case, rows)
+    orders = tuple(_order_claim(order, rows) for order in case.orders)
+    tables = (_table(case, rows, marked),)
+    return Section(case.title, f"{text}\n\n{_words(advice, case)}", (*orders, *claims, *_default_claims(case, advice)),
+                   tables, _plots(case, rows))  # fmt: skip
+
+
+# --- orders ---
+
+
+def _order_claim(order: Order, rows: list[Row]) -> Claim:
+    chosen = [row for row in rows if row.record["name"] in order.names and order.error in row.errors]
+    what = " ".join(word for word in (order.of, order.error) if word)
+    words = f"at least {order.theory:.3g}" if order.least else f"{order.theory:.3g}"
+    text = f"{what}: order {words} in {order.variable}, within {WITHIN}"
+    sizes = [float(row.record["settings"][order.variable]) for row in chosen]
+    if len(set(sizes)) < 3:
+        return Claim(text, "not run: fewer than three sizes", None)
+    found = fitted_order(sizes, [row.errors[order.error] for row in chosen])
+    measured = f"{found:.2f} from {order.variable} = {max(sizes):.3g} to {min(sizes):.3g} ({len(sizes)} runs)"
+    return Claim(text, measured, found >= order.theory - WITHIN if order.least else abs(found - order.theory) <= WITHIN)
+
+
+# --- recommended settings ---
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to take for a limit: the cheapest setting, or the cheapest default one where it costs hardly more."""
+
+    limit: float
+    chosen: Row | None
+    candidate: Row | None  # cheapest of those that could be defaults
+    default: Row | None  # cheapest of those with the program's defaults
+
+
+def _advice(case: Case, rows: list[Row]) -> tuple[list[Advice], list[int]]:
+    usable = [row for row in rows if _counts(case, row)]
+    found = [_for_limit(case, usable, limit) for limit in LIMITS]
+    return found, sorted({rows.index(each.chosen) for each in found if each.chosen is not None})
+
+
+def _counts(case: Case, row: Row) -> bool:
+    """Reference runs and failed ones are not recommended."""
+    return row.record["outcome"] == "done" and case.errors[0] in row.errors and "elements" not in row.record["settings"]
+
+
+def _for_limit(case: Case, rows: list[Row], limit: float) -> Advice:
+    cheapest = _cheapest(case, rows, limit)
+    candidate = _cheapest(case, [row for row in rows if not _apart(case, row)], limit)
+    default = _cheapest(case, [row for row in rows if is_default(row.record["settings"])], limit)
+    chosen = default if default is not None and _as_good(default, cheapest) else cheapest
+    return Advice(limit, chosen, candidate, default)
+
+
+def _as_good(row: Row, other: Row | None) -> bool:
+    return other is not None and row.core_seconds <= NOISE * other.core_seconds
+
+
+def _apart(case: Case, row: Row) -> bool:
+    return any(value in case.apart for value in row.record["settings"].values() if isinstance(value, str))
+
+
+def _cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
+    points = [Point(row.core_seconds, row.errors[case.errors[0]], {"row": number}) for number, row in enumerate(rows)]
+    best = recommended(points, limit * case.share)
+    return None if best is None else rows[int(best.settings["row"])]
+
+
+def defaults() -> dict[str, Any]:
+    """Settings that trials vary and for which the program has a default."""
+    from ....solve import DEFAULTS, MULTIGRID
+    from ....study import Time
+
+    ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}
+    fields = {key: Time.model_fields[key].default for key in ("scheme", "mass", "rho")}
+    return ours | fields | {"pc_type": MULTIGRID["pc_type"]}
+
+
+def is_default(settings: dict[str, Any]) -> bool:
+    """Whether every setting that has a default is at it."""
+    known = defaults()
+    return all(value == known[key] for key, value in settings.items() if key in known)
+
+
+def _words(advice: list[Advice], case: Case) -> str:
+    why = ""
+    if case.share < 1:
+        why = f" The solver may take {case.share:.0%} of a limit: errors of mesh and step come on top."
+    if case.apart:
+        why += f" No candidate for a default: {', '.join(map(str, case.apart))}."
+    return " ".join(_sentence(each, case) for each in advice) + why
+
+
+def _sentence(advice: Advice, case: Case) -> str:
+    head = f"For {advice.limit:.0%} of {case.errors[0]}:"
+    if advice.chosen is None:
+        return f"{head} no setting here is good enough."
+    row = advice.chosen
+    return f"{head} {_setting(row)} (error {row.errors[case.errors[0]]:.2g}, {row.core_seconds:.2g} core-seconds)."
+
+
+def _setting(row: Row) -> str:
+    settings = row.record["settings"].items()
+    return ", ".join(f"{key} = {f'{value:.4g}' if isinstance(value, float) else value}" for key, value in settings)
+
+
+def _default_claims(case: Case, advice: list[Advice]) -> tuple[Claim, ...]:
+    """Where a case varies what has a default: whether the default is what is recommended."""
+    known = defaults()
+    if not any(column in known for column in case.columns):
+        return ()
+    return tuple(_default_claim(case, each) for each in advice)
+
+
+def _default_claim(case: Case, advice: Advice) -> Claim:
+    text = f"the setting recommended for {advice.limit:.0%} of {case.errors[0]} is the program's default"
+    if advice.candidate is None:
+        return Claim(text, "no setting reaches it", None)
+    best = f"cheapest: {_setting(advice.candidate)}, {advice.candidate.core_seconds:.3g} core-seconds"
+    if advice.default is None:
+        return Claim(text, f"{best}; the default does not reach it here", False)
+    measured = f"{best}; default: {_setting(advice.default)}, {advice.default.core_seconds:.3g}"
+    holds = _as_good(advice.default, advice.candidate)
+    return Claim(text, f"{measured} (a factor below {NOISE:g} is noise)", holds)
+
+
+# --- table and plots ---
+
+
+def _table(case: Case, rows: list[Row], marked: list[int]) -> Table:
+    front = _front(case, rows)
+    columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors),
+               "wall s", "core-seconds", "front", "outcome")  # fmt: skip
+    caption = f"{case.title}: relative errors and times. Marked: recommended for 5 % and 1 %; *: on the front."
+    cells = tuple(_cells(case, row, number in front) for number, row in enumerate(rows))
+    return Table(f"precision-{case.name}", caption, columns, cells, marked=tuple(marked))
+
+
+def _cells(case: Case, row: Row, best: bool) -> tuple[Cell, ...]:
+    record = row.record
+    settings = (record["settings"].get(key) for key in case.columns)
+    errors = (row.errors.get(name) for name in case.errors)
+    return (record["name"], *settings, record["ranks"], *errors, row.wall, row.core_seconds, "*" if best else "",
+            record["outcome"])  # fmt: skip
+
+
+def _outcomes(case: Case, records: Records) -> Table:
+    rows = tuple((record["name"], record["outcome"], record["message"]) for record in records)
+    return Table(f"precision-{case.name}", case.title, ("trial", "outcome", "message"), rows)
+
+
+def _front(case: Case, rows: list[Row]) -> set[int]:
+    numbers = [number for number, row in enumerate(rows) if _counts(case, row)]
+    points = [(rows[number].core_seconds, rows[number].errors[case.errors[0]]) for number in numbers]
+    return {numbers[place] for place in pareto_front(points)}
+
+
+def _plots(case: Case, rows: list[Row]) -> tuple[Plot, ...]:
+    usable = [row for row in rows if _counts(case, row)]
+    if not usable:
+        return ()
+    return tuple(
+        Plot(f"{case.title}: {label}", label, f"error of {case.errors[0]}", _series(case, usable, cost), "loglog",
+             pareto=True, levels=LIMITS)
+        for label, cost in (("wall time of the run, s", "wall"), ("core-seconds in the steps", "core_seconds"))
+    )  # fmt: skip
+
+
+def _series(case: Case, rows: list[Row], cost: str) -> tuple[Series, ...]:
+    groups: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda row: float(getattr(row, cost))):
+        groups.setdefault(str(row.record["settings"].get(case.split, "")), []).append(row)
+    return tuple(
+        Series(label, tuple(float(getattr(row, cost)) for row in group),
+               tuple(max(row.errors[case.errors[0]], 1e-16) for row in group), "points",
+               tuple(row.record["name"] for row in group))
+        for label, group in groups.items()
+    )  # fmt: skip

@@ -1,0 +1,176 @@
+"""Linear statics: a cantilever under a force at its end, and a pulled plate with a hole.
+
+Reference: the same study with quadratic elements (quadratic.py) on two meshes, whose difference shows that it has
+converged. Beam theory and Howland's series stand beside it: they are not solutions of the same equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ..references import howland_factor, timoshenko_deflection
+from ..results import history, last_frame
+from ..trial import Trial
+from .common import QUIET, Study, script, trial
+from .page import Case, Order, Records, relative
+
+LENGTH, DEPTH, YOUNG, POISSON, TRACTION = 1.0, 0.1, 210e9, 0.3, 1e5  # m, m, Pa, -, Pa
+SIDE, RADIUS, PULL = 0.05, 0.01, 1e6  # m, m, Pa: quarter plate
+STEEL = {"young": YOUNG, "poisson": POISSON, "density": 7850.0}
+ONE_STEP = {"scheme": "quasi-static", "step": 1.0, "end": 1.0}
+
+QUADRATIC = {"cantilever": (0.05, 0.025, 0.0125), "plate": (0.002, 0.001, 0.0005)}  # last: long report
+SIZES = {
+    "cantilever": (0.025, 0.0125, 0.01, 0.00625, 0.0045, 0.004),
+    "plate": (0.008, 0.006, 0.004, 0.003, 0.002, 0.0015, 0.001, 0.00075),
+}
+FULL = {"cantilever": 0.004, "plate": 0.00075}  # this size is for the long report
+
+
+def cantilever(h: float, energy: str = "linear") -> Study:
+    """1 x 0.1 x 0.1 m of steel, clamped at x = 0, a shear traction on its end."""
+    return {
+        "title": "A cantilever under a force at its end",
+        "mesh": {"builder": "box", "size": [LENGTH, DEPTH, DEPTH], "h": h},
+        "material": STEEL | {"energy": energy},
+        "boundary": [{"on": "left", "fix": "xyz"}, {"on": "right", "traction": [0.0, 0.0, -TRACTION]}],
+        "time": ONE_STEP,
+        "output": QUIET,
+    }
+
+
+def plate(h: float) -> Study:
+    """A quarter of a 0.1 x 0.1 m plate with a hole of 0.02 m in plane stress, pulled along x."""
+    return {
+        "title": "A plate with a hole",
+        "mesh": {"builder": "plate-hole", "length": SIDE, "height": SIDE, "radius": RADIUS, "h": h},
+        "material": STEEL | {"energy": "linear", "plane": "stress"},
+        "boundary": [
+            {"on": "left", "fix": "x"},
+            {"on": "bottom", "fix": "y"},
+            {"on": "right", "traction": [PULL, 0.0]},
+        ],
+        "time": ONE_STEP,
+        "output": QUIET | {"fields": ["stress"]},
+    }
+
+
+STUDIES: dict[str, Callable[..., Study]] = {"cantilever": cantilever, "plate": plate}
+
+
+def trials() -> list[Trial]:
+    """Both cases over h; the cantilever with every energy and on two ranks too."""
+    found = [
+        trial(case, f"h-{h:g}", STUDIES[case](h), f"statics:measure_{case}", _settings(h), full=h == FULL[case])
+        for case, sizes in SIZES.items()
+        for h in sizes
+    ]
+    found += [
+        trial("cantilever", f"{energy}-h-0.0125", cantilever(0.0125, energy), "statics:measure_cantilever",
+              _settings(0.0125, energy))
+        for energy in ("corotated", "stvk", "neo-hookean")
+    ]  # fmt: skip
+    found.append(
+        trial("cantilever", "h-0.00625-ranks-2", cantilever(0.00625), "statics:measure_cantilever", _settings(0.00625),
+              ranks=2)
+    )  # fmt: skip
+    found += [
+        script(case, f"quadratic-h-{h:g}", "quadratic", {"case": case, "h": h}, {"h": h, "elements": "quadratic"},
+               full=h == sizes[-1])
+        for case, sizes in QUADRATIC.items()
+        for h in sizes
+    ]  # fmt: skip
+    return found
+
+
+def _settings(h: float, energy: str = "linear") -> dict[str, str | float | int | bool]:
+    return {"h": h, "energy": energy}
+
+
+def measure_cantilever(run: Path) -> dict[str, float]:
+    """Deflection of the end under its force, m: the force is there from the start and works over the whole of it."""
+    return {"deflection": float(history(run)["external_work"][-1] / (TRACTION * DEPTH**2))}
+
+
+def measure_plate(run: Path) -> dict[str, float]:
+    """Mean displacement of the pulled edge, m, and the greatest sigma_xx over the traction."""
+    stress = last_frame(run)["stress"][:, 0]
+    work = history(run)["external_work"][-1]
+    return {"deflection": float(work / (PULL * SIDE)), "peak": float(stress.max() / PULL)}
+
+
+def _references(records: Records, key: str) -> list[tuple[float, float]]:
+    """(h, figure) of the runs with quadratic elements, the finest last."""
+    found = [record for record in records if record["settings"].get("elements") and key in record["figures"]]
+    if len(found) < 2:
+        raise KeyError(f"{key} with quadratic elements on two meshes")
+    return sorted(((record["settings"]["h"], record["figures"][key]) for record in found), reverse=True)
+
+
+def _converged(records: Records, key: str) -> float:
+    return _references(records, key)[-1][1]
+
+
+def _moves(records: Records, key: str) -> str:
+    """The reference, and how far it is from converged, in words."""
+    (coarse, before), (fine, value) = _references(records, key)[-2:]
+    return f"{value:.6g}, which moves by {relative(before, value):.1e} of itself from h = {coarse:g} to {fine:g} m"
+
+
+def _cantilever_errors(records: Records) -> dict[str, dict[str, float]]:
+    exact = _converged(records, "deflection")
+    measured = {record["name"]: record["figures"]["deflection"] for record in records if record["figures"]}
+    return {name: {"deflection": relative(value, exact)} for name, value in measured.items()}
+
+
+def _plate_errors(records: Records) -> dict[str, dict[str, float]]:
+    """The error of the stress in the energy norm, squared, is the energy that is missing: a(u, u) - a(u_h, u_h)."""
+    exact, peak = (_converged(records, key) for key in ("deflection", "peak"))
+    found = {}
+    for record in records:
+        if figures := record["figures"]:
+            missing = relative(figures["deflection"], exact)
+            found[record["name"]] = {
+                "stress": missing**0.5,
+                "edge displacement": missing,
+                "peak stress": relative(figures["peak"], peak),
+            }
+    return found
+
+
+def _cantilever_text(records: Records) -> str:
+    beam = timoshenko_deflection(TRACTION * DEPTH**2, LENGTH, DEPTH, DEPTH, YOUNG, POISSON)
+    return (
+        f"Reference: quadratic elements, {_moves(records, 'deflection')}. Timoshenko's beam, {beam:.6g} m, lies "
+        f"{relative(beam, _converged(records, 'deflection')):.2%} from it: its clamp lets the section contract and "
+        "warp. Theory: order 2 (the energy of linear elements; the singular edges of the clamp, order 1.4 for "
+        "nu = 0.3, take over only later)."
+    )
+
+
+def _plate_text(records: Records) -> str:
+    strip, peak = howland_factor(RADIUS / SIDE), _converged(records, "peak")
+    return (
+        f"Reference: quadratic elements, peak stress over traction {_moves(records, 'peak')}; Howland's long strip has "
+        f"{strip:.4f}, {relative(strip, peak):.1%} off: the plate is square. Stress: in the energy norm, which the "
+        "missing work of the load tells. Theory: order 1 for the stress, 2 for the displacement. h is the size away "
+        "from the hole, a fourth of it at the hole."
+    )
+
+
+SWEPT = {case: tuple(f"h-{h:g}" for h in sizes[1:]) for case, sizes in SIZES.items()}  # fitted: all but the coarsest
+CASES = [
+    Case(
+        "cantilever", "Static cantilever", _cantilever_text, ("h", "energy"), _cantilever_errors, ("deflection",),
+        (Order("deflection", "h", 2.0, SWEPT["cantilever"]),),
+    ),
+    Case(
+        "plate", "Plate with a hole", _plate_text, ("h",), _plate_errors,
+        ("stress", "edge displacement", "peak stress"),
+        (
+            Order("edge displacement", "h", 2.0, SWEPT["plate"]),
+            Order("stress", "h", 1.0, SWEPT["plate"]),
+        ),
+    ),
+]  # fmt: skip
