@@ -8,11 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from .data import Indices, MeshData, Points
-from .fill import fill_shells
-from .level_set import level_surface
 from .parameters import affordable, not_negative, positive, require
 from .sizing import cells_for_body
-from .surface import joined_shells
 from .topology import Floats, boundary_facets, facets_except, facets_where
 
 Place = tuple[float, float, float]
@@ -106,9 +103,13 @@ class Figure:
         not_negative("figure", wall=self.wall)
         thinnest = self.height * min(part.end_radius for part in PARTS)
         require(
-            self.wall < thinnest,
-            f"figure: wall = {self.wall!r} must be less than {thinnest:.3g} m, the radius of the thinnest part; 0 makes "
-            "it solid.",
+            self.wall <= 0.75 * thinnest,
+            f"figure: wall = {self.wall!r} must be no more than {0.75 * thinnest:.3g} m, three quarters of the thinnest "
+            "part's radius; 0 makes it solid.",
+        )
+        require(
+            not self.wall or self.h <= 1.5 * self.wall,
+            f"figure: h = {self.h!r} must be no more than {1.5 * self.wall:.3g} m, 1.5 times the wall.",
         )
         require(
             self.h < 1.6 * thinnest,
@@ -149,6 +150,9 @@ class Figure:
         return float(np.prod(high - low) * filled.mean())
 
     def build(self) -> MeshData:
+        from .fill import fill_shells  # SciPy
+        from .surface import joined_shells
+
         shells = [self._shell(0.0), self._shell(self.wall)] if self.wall else [self._shell(0.0)]
         surface = joined_shells(shells, "figure")
         parts = [surface.part(number) for number in range(int(surface.shell.max()) + 1)]
@@ -156,6 +160,8 @@ class Figure:
         return MeshData(points, cells, self._groups(points, boundary_facets(cells)))
 
     def _shell(self, level: float) -> tuple[Points, Indices]:
+        from .level_set import level_surface
+
         def below(points: Points) -> tuple[Floats, Floats]:
             depth, gradient = self.depth(points)
             return depth - level, gradient

@@ -56,7 +56,7 @@ def fill_shells(
     points, cells = _filled(shells, bodies, _inner_size(shells, h), source)
     volume = float(signed_measures(points, cells).sum())
     _check_filled(shells, bodies, volume, source)
-    return points, _peeled(points, cells), volume
+    return points, peeled(points, cells), volume
 
 
 def _remeshed_shells(surface: ClosedSurface, h: float) -> tuple[list[Shell], tuple[str, ...]]:
@@ -138,7 +138,7 @@ def _add_shell(gmsh: Any, tag: int, points: Points, triangles: Indices) -> None:
     gmsh.model.mesh.addElementsByType(tag, TRIANGLE, [], numbers[triangles].ravel())
 
 
-def _peeled(points: Points, cells: Indices) -> Indices:
+def peeled(points: Points, cells: Indices, thin: float = SLIVER) -> Indices:
     """Cells without the flat ones on the boundary: four nodes of one face, almost in a plane, that nobody misses.
 
     Without such a cell the face is cut along its other diagonal.
@@ -147,7 +147,7 @@ def _peeled(points: Points, cells: Indices) -> Indices:
         facets = np.sort(facets_of(cells), axis=2)
         _, counts, place = distinct_rows(facets.reshape(-1, 3))
         outside = (counts[place].reshape(-1, 4) == 1).any(axis=1)
-        peel = outside & flat_cells(points, cells, SLIVER)
+        peel = outside & flat_cells(points, cells, thin)
         if not peel.any():
             return cells
         cells = cells[~peel]

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from .data import Indices, MeshData
+from .data import MeshData
 from .gmsh_session import meshed
 from .parameters import affordable, not_negative, positive, require
 from .sizing import Sizing, cells_for_body
@@ -18,6 +18,8 @@ from .topology import boundary_facets, facets_except, facets_where, plane_groups
 # Heights of the control polygon of the profile are equal, so that r is a polynomial in z: a foot, a belly, a neck and a
 # lip. The unit is the radius of the belly.
 CONTROL = (0.50, 1.05, 1.50, 0.90, 0.05, 0.35, 0.55)
+
+FLAT = 2e-3  # volume over longest edge cubed of the cells that gmsh leaves between two faces of the side, now and then
 
 
 @dataclass(frozen=True)
@@ -85,17 +87,17 @@ class Vase:
         return cells_for_body(self.volume(), self.wall, self.h)
 
     def build(self) -> MeshData:
+        from .fill import peeled
+
         points, cells = meshed(self._draw, 3, Sizing(self.h))
+        cells = peeled(points, cells, FLAT)
         boundary = boundary_facets(cells)
         groups = plane_groups(points, boundary, {"base": (2, 0.0), "rim": (2, self.height)})
         if self.wall:
             within = np.hypot(points[:, 0], points[:, 1]) < self.outline()(points[:, 2]) - self.wall / 2
             inside = facets_where(boundary, within & (points[:, 2] > self.wall / 2))
             groups["inside"] = facets_except(inside, groups["rim"])
-        return MeshData(points, cells, self._with_side(boundary, groups))
-
-    def _with_side(self, boundary: Indices, groups: dict[str, Indices]) -> dict[str, Indices]:
-        return groups | {"side": facets_except(boundary, *groups.values())}
+        return MeshData(points, cells, groups | {"side": facets_except(boundary, *groups.values())})
 
     def _draw(self, gmsh: Any) -> None:
         """The half section, turned once around the axis."""
