@@ -14,6 +14,7 @@ from .topology import Floats, boundary_facets, facets_except, facets_where
 
 Place = tuple[float, float, float]
 
+
 @dataclass(frozen=True)
 class RoundCone:
     """The convex hull of two balls: centres and radii, neither ball inside the other."""
@@ -51,7 +52,7 @@ TORSO = (
     RoundCone((0.0, 0.0, 0.37), (0.0, 0.0, 0.60), 0.135, 0.115),
     RoundCone((0.0, 0.0, 0.65), (0.0, 0.0, 0.80), 0.060, 0.070),
     RoundCone((0.0, 0.01, 0.83), (0.0, -0.09, 0.80), 0.105, 0.060),
-    RoundCone((0.0, 0.05, 0.34), (0.0, 0.32, 0.20), 0.065, 0.028),
+    RoundCone((0.0, 0.05, 0.34), (0.0, 0.32, 0.20), 0.065, 0.032),
 )
 EAR = RoundCone((0.035, 0.015, 0.87), (0.115, 0.03, 0.965), 0.040, 0.035)
 ARM = RoundCone((0.05, 0.0, 0.60), (0.410, 0.0, 0.745), 0.060, 0.046)
@@ -76,8 +77,9 @@ class Figure:
     """A standing figure of rounded limbs, arms and legs spread in the x-z plane, its feet at z = 0.
 
     A smooth union of round cones (torso, neck, head, ears, tail, arms, hands, legs, feet): with d_i the depth of a
-    point in part i the depth in the body is s log(sum exp(d_i / s)), s = `BLEND` of the height, which rounds the joints.
-    It changes by no more than 1 per length, so that a wall between two of its levels is nowhere thinner than they differ.
+    point in part i the depth in the body is s log(sum exp(d_i / s)), s = `BLEND` of the height, which rounds the
+    joints. It changes by no more than 1 per length: a wall between two of its levels is nowhere thinner than they
+    differ.
 
     Attributes:
         height: [m], of the parts before blending.
@@ -104,8 +106,8 @@ class Figure:
         thinnest = self.height * min(part.end_radius for part in PARTS)
         require(
             self.wall <= 0.75 * thinnest,
-            f"figure: wall = {self.wall!r} must be no more than {0.75 * thinnest:.3g} m, three quarters of the thinnest "
-            "part's radius; 0 makes it solid.",
+            f"figure: wall = {self.wall!r} must be no more than {0.75 * thinnest:.3g} m, three quarters of the "
+            "thinnest part's radius; 0 makes it solid.",
         )
         require(
             not self.wall or self.h <= 1.5 * self.wall,

@@ -49,9 +49,7 @@ def fill_surface(path: str | Path, h: float) -> MeshData:
 Shell = tuple[Points, Indices]
 
 
-def fill_shells(
-    shells: list[Shell], bodies: list[list[int]], h: float, source: str
-) -> tuple[Points, Indices, float]:
+def fill_shells(shells: list[Shell], bodies: list[list[int]], h: float, source: str) -> tuple[Points, Indices, float]:
     """Points, tetrahedra and their volume [m^3] between shells as they are; `source` begins the message of an error."""
     points, cells = _filled(shells, bodies, _inner_size(shells, h), source)
     volume = float(signed_measures(points, cells).sum())

@@ -24,7 +24,7 @@ ROUNDS = 4  # of evening out
 def level_surface(depth: Depth, low: Floats, high: Floats, h: float) -> tuple[Points, Indices]:
     """Points on the surface depth = 0 within the box and triangles between them, closed, with edges of about h [m]."""
     nodes, tets = _lattice(low, high, SPACING * h)
-    value, gradient = depth(nodes)
+    value = depth(nodes)[0]
     near = _too_near(value, edges_of(tets[_meets(value, tets)]))
     nodes[near] = _projected(depth, nodes[near])
     value[near] = 0.0
@@ -75,7 +75,7 @@ def _cut(sign: Indices, tets: Indices) -> Indices:
     found = []
     patterns, which = np.unique(sign[tets], axis=0, return_inverse=True)
     for number, pattern in enumerate(patterns):
-        inside, on, outside = (np.flatnonzero(pattern == s).tolist() for s in (1, 0, -1))
+        inside, on, outside = ([int(i) for i in np.flatnonzero(pattern == s)] for s in (1, 0, -1))
         if not inside or len(on) + len(outside) == 0 or (not outside and len(on) < 3):
             continue
         ring = [(i, i) for i in on] + [(i, o) for i in inside for o in outside]
@@ -108,4 +108,3 @@ def _evened(depth: Depth, points: Points, triangles: Indices) -> tuple[Points, I
         sums = np.stack([np.bincount(edges[:, 0], column, len(points)) for column in points[edges[:, 1]].T], axis=1)
         points = _projected(depth, (points + sums / degree) / 2)
     return points, triangles
-

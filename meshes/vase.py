@@ -66,9 +66,8 @@ class Vase:
         """Outer radius over height, r(z) [m]."""
         degree = len(CONTROL) - 1
         unit = Polynomial([0.0, 1.0])
-        share = sum(
-            (c * comb(degree, i) * unit**i * (1 - unit) ** (degree - i) for i, c in enumerate(CONTROL)), Polynomial(0.0)
-        )
+        terms = [c * comb(degree, i) * unit**i * (1 - unit) ** (degree - i) for i, c in enumerate(CONTROL)]
+        share = sum(terms, Polynomial([0.0]))
         return self.radius / _greatest(share) * share(Polynomial([0.0, 1 / self.height]))
 
     def volume(self) -> float:

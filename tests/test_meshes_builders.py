@@ -111,7 +111,7 @@ def test_bounds_are_known_before_building(built: tuple[Any, MeshData]) -> None:
     # The blended figure reaches beyond its parts: at a tip of two deep parts, by up to blend * log(2).
     slack = builder.h**2 / (8 * builder.radius) if builder.name in ("cylinder", "disk", "vase") else 0.0
     if builder.name == "figure":
-        slack = builder.h**2 / (8 * builder.height * 0.028) + builder.height * BLEND * log(2)
+        slack = builder.h**2 / (8 * builder.height * 0.03) + builder.height * BLEND * log(2)
     np.testing.assert_allclose(mesh.points.min(axis=0), low, atol=slack + 1e-12 * size.max())
     np.testing.assert_allclose(mesh.points.max(axis=0), high, atol=slack + 1e-12 * size.max())
 
@@ -409,7 +409,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("loaf", {"grip": 0.2}, "grip = 0.2 must be less than half of the length"),
     ("vase", {"wall": 0.05}, "wall = 0.05 must be less than the radius of the neck"),
     ("vase", {"wall": -0.01}, "vase: wall = -0.01 must be zero or a positive number"),
-    ("figure", {"wall": 0.05}, "wall = 0.05 must be no more than .* of the thinnest part"),
+    ("figure", {"wall": 0.05}, "wall = 0.05 must be no more than .* of the thinnest"),
     ("figure", {"wall": 0.004}, "h = 0.01 must be no more than 0.006 m, 1.5 times the wall"),
     ("figure", {"h": 0.05}, "h = 0.05 must be less than .* of the thinnest part"),
     ("loaf", {"dome": 2.0}, "dome = 2.0 must lie between 0 and 1"),
