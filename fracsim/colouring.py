@@ -38,14 +38,17 @@ def select(mesh: Any, wanted: str) -> str:
     return name
 
 
-def shown_range(values: Values) -> tuple[float, float] | None:
-    """The range of the colours: symmetric around zero where values have both signs; None where there is nothing."""
+def shown_range(values: Values, *, signed: bool = False) -> tuple[float, float] | None:
+    """The range of the colours, None where there is nothing to show.
+
+    Symmetric around zero for what is signed, such as a component, and where both signs occur.
+    """
     values = values if values.ndim == 1 else np.linalg.norm(values, axis=1)
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return None
     low, high = np.percentile(values, [(100 - SHOWN) / 2, (100 + SHOWN) / 2])
-    if low < 0 < high:
-        most = max(-low, high)
+    if signed or low < 0 < high:
+        most = float(max(-low, high))
         return -most, most
     return (float(low), float(high)) if high > low else (float(values.min()), float(values.max()))

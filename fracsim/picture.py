@@ -179,7 +179,7 @@ def _add_coloured(plotter: Any, mesh: Any, field: str, *, lighting: bool) -> Non
         "position_y": 0.02, "n_labels": 3, "label_font_size": 16, "title_font_size": 18,
     }  # fmt: skip
     many = field == "piece"
-    limits = None if many else shown_range(np.asarray(mesh[field], float))
+    limits = None if many else shown_range(np.asarray(mesh[field], float), signed=":" in field)
     both_signs = limits is not None and limits[0] < 0 < limits[1]
     plotter.add_mesh(
         mesh, scalars=field, cmap="tab20" if many else "coolwarm" if both_signs else "viridis", clim=limits,
