@@ -47,7 +47,7 @@ def _lattice(low: Floats, high: Floats, step: float) -> tuple[Points, Indices]:
     origin = (low + high) / 2 - step * count / 2
     corner = np.arange(np.prod(count + 1)).reshape(count + 1)
     centre = np.arange(np.prod(count)).reshape(count) + corner.size
-    places = [np.stack(np.indices(shape), axis=-1).reshape(-1, 3) for shape in (count + 1, count)]
+    places = [np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count))]
     nodes = origin + step * np.concatenate([places[0], places[1] + 0.5])
     tets = []
     for axis in range(3):
