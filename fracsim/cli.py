@@ -88,7 +88,9 @@ def mesh(
 def render(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
     png: Annotated[Path | None, typer.Option("-o", "--out", help=".png, or .gif of all frames (OUT/last.png)")] = None,
-    colour: Annotated[str, typer.Option(help="crack, piece, age, von_mises, or another field of the run")] = "crack",
+    colour: Annotated[
+        str, typer.Option("--colour", "--field", help="crack, piece, age, or a field of the run: strain, stress:xx")
+    ] = "crack",
     explode: Annotated[float, typer.Option(min=0, help="move pieces apart by this share of their distance")] = 0.0,
     view: Annotated[str, typer.Option(help="iso, front, back, left, right, top, or x,y,z to look from")] = "iso",
     zoom: Annotated[float, typer.Option(min=0.01, help="above 1 is nearer")] = 1.0,

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from .meshes.data import MeshData
 
 Values = npt.NDArray[np.float64]
+TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
 _KINDS = {1: "Scalar", 3: "Vector", 6: "Tensor6"}
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from .colouring import select, shown_range
 from .errors import InputError
 from .screen import display
 from .surface.files import read_collection
@@ -35,7 +36,7 @@ class Look:
     """How to draw.
 
     Attributes:
-        colour: "crack" (the crack lighter than the old boundary), or a field: piece, age, von_mises, damage, ...
+        colour: "crack" (the crack lighter than the old boundary), or a field: piece, age, von_mises, stress:xx, ...
         explode: how far pieces are moved apart, as a share of their distance from the middle.
         view: a name of VIEWS, or a direction to look from.
         zoom: above 1 is nearer.
@@ -149,13 +150,11 @@ def _draw(plotter: Any, shot: Shot, look: Look) -> Values:
 def _add(plotter: Any, grid: Any, look: Look, *, lighting: bool) -> None:
     outline, grid = _parted(grid)
     body = _whole(grid)
-    if look.colour != "crack" and look.colour not in {*body.cell_data, *body.point_data}:
-        known = ", ".join(sorted({"crack", *body.cell_data, *body.point_data} - {"origin", "cell"}))
-        raise InputError(f"--colour {look.colour}: this run has: {known}")
-    if look.colour == "crack":
+    field = select(body, look.colour) if look.colour != "crack" else ""
+    if not field:
         _add_two_tone(plotter, body, lighting)
-    elif np.isfinite(np.asarray(body[look.colour], float)).any():
-        _add_coloured(plotter, body, look.colour, lighting=lighting)
+    elif shown_range(np.asarray(body[field], float)) is not None:
+        _add_coloured(plotter, body, field, lighting=lighting)
     else:  # what only the crack has, in a body without crack or on the lines of a 2D one
         plotter.add_mesh(body, color=OLD, lighting=lighting, ambient=AMBIENT)
     if outline is None:
@@ -176,13 +175,15 @@ def _parted(grid: Any) -> tuple[Any, Any]:
 
 def _add_coloured(plotter: Any, mesh: Any, field: str, *, lighting: bool) -> None:
     bar = {
-        "title": field.replace("_", " ") + "\n", "color": "black", "vertical": False, "height": 0.08,
+        "title": field.replace("_", " ").replace(":", " ") + "\n", "color": "black", "vertical": False, "height": 0.08,
         "position_y": 0.02, "n_labels": 3, "label_font_size": 16, "title_font_size": 18,
     }  # fmt: skip
     many = field == "piece"
+    limits = None if many else shown_range(np.asarray(mesh[field], float), signed=":" in field)
+    both_signs = limits is not None and limits[0] < 0 < limits[1]
     plotter.add_mesh(
-        mesh, scalars=field, cmap="tab20" if many else "viridis", nan_color=OLD, lighting=lighting, line_width=3,
-        ambient=AMBIENT, scalar_bar_args=bar, show_scalar_bar=not many,
+        mesh, scalars=field, cmap="tab20" if many else "coolwarm" if both_signs else "viridis", clim=limits,
+        nan_color=OLD, lighting=lighting, line_width=3, ambient=AMBIENT, scalar_bar_args=bar, show_scalar_bar=not many,
     )  # fmt: skip
 
 

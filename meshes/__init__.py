@@ -15,20 +15,24 @@ from __future__ import annotations
 from .box import Box
 from .cylinder import Cylinder, Disk
 from .data import MeshData, MeshError
+from .figure import Figure
 from .loaf import Loaf
 from .notched_bar import NotchedBar
 from .notched_plate import NotchedPlate
 from .parameters import Builder
 from .plate_hole import PlateHole
+from .vase import Vase
 
 BUILDERS: dict[str, type[Builder]] = {
     "box": Box,
     "cylinder": Cylinder,
     "disk": Disk,
+    "figure": Figure,
     "loaf": Loaf,
     "notched-bar": NotchedBar,
     "notched-plate": NotchedPlate,
     "plate-hole": PlateHole,
+    "vase": Vase,
 }
 
 __all__ = ["BUILDERS", "Builder", "MeshData", "MeshError"]

@@ -38,11 +38,8 @@ def fill_surface(path: str | Path, h: float) -> MeshData:
     surface = read_surface(path)
     affordable("surface", h, surface.volume / (SHARE[3] * h**3))
     shells, notes = _remeshed_shells(surface, h)
-    points, cells = _filled(shells, surface.bodies, _inner_size(shells, h), str(path))
-    volume = float(signed_measures(points, cells).sum())
-    _check_filled(shells, surface.bodies, volume, str(path))
+    points, cells, volume = fill_shells(shells, surface.bodies, h, f"Surface file '{path}'")
     notes += _volume_note(surface.volume, volume)
-    cells = _peeled(points, cells)
     mesh = MeshData(points, cells, {"surface": boundary_facets(cells)}, notes=surface.notes + notes)
     checked = check_mesh(mesh)
     # The surface's own notes tell of separate bodies already.
@@ -50,6 +47,14 @@ def fill_surface(path: str | Path, h: float) -> MeshData:
 
 
 Shell = tuple[Points, Indices]
+
+
+def fill_shells(shells: list[Shell], bodies: list[list[int]], h: float, source: str) -> tuple[Points, Indices, float]:
+    """Points, tetrahedra and their volume [m^3] between shells as they are; `source` begins the message of an error."""
+    points, cells = _filled(shells, bodies, _inner_size(shells, h), source)
+    volume = float(signed_measures(points, cells).sum())
+    _check_filled(shells, bodies, volume, source)
+    return points, peeled(points, cells), volume
 
 
 def _remeshed_shells(surface: ClosedSurface, h: float) -> tuple[list[Shell], tuple[str, ...]]:
@@ -104,7 +109,7 @@ def _inner_size(shells: list[Shell], h: float) -> float:
     return finest if finest < h / 2 else h
 
 
-def _filled(shells: list[Shell], bodies: list[list[int]], h: float, path: str) -> tuple[Points, Indices]:
+def _filled(shells: list[Shell], bodies: list[list[int]], h: float, source: str) -> tuple[Points, Indices]:
     try:
         with session() as gmsh:
             for number, shell in enumerate(shells, start=1):
@@ -117,7 +122,7 @@ def _filled(shells: list[Shell], bodies: list[list[int]], h: float, path: str) -
             points, cells = cells_in(gmsh, 3)
     except MeshError as error:
         raise MeshError(
-            f"Surface file '{path}' could not be filled with tetrahedra ({error}) Does the surface cut itself?"
+            f"{source} could not be filled with tetrahedra ({error}) Does the surface cut itself?"
         ) from error
     return points, cells
 
@@ -131,7 +136,7 @@ def _add_shell(gmsh: Any, tag: int, points: Points, triangles: Indices) -> None:
     gmsh.model.mesh.addElementsByType(tag, TRIANGLE, [], numbers[triangles].ravel())
 
 
-def _peeled(points: Points, cells: Indices) -> Indices:
+def peeled(points: Points, cells: Indices, thin: float = SLIVER) -> Indices:
     """Cells without the flat ones on the boundary: four nodes of one face, almost in a plane, that nobody misses.
 
     Without such a cell the face is cut along its other diagonal.
@@ -140,19 +145,19 @@ def _peeled(points: Points, cells: Indices) -> Indices:
         facets = np.sort(facets_of(cells), axis=2)
         _, counts, place = distinct_rows(facets.reshape(-1, 3))
         outside = (counts[place].reshape(-1, 4) == 1).any(axis=1)
-        peel = outside & flat_cells(points, cells, SLIVER)
+        peel = outside & flat_cells(points, cells, thin)
         if not peel.any():
             return cells
         cells = cells[~peel]
 
 
-def _check_filled(shells: list[Shell], bodies: list[list[int]], made: float, path: str) -> None:
+def _check_filled(shells: list[Shell], bodies: list[list[int]], made: float, source: str) -> None:
     """gmsh keeps the shells' triangles as they are, so that cells and shells enclose the same volume to rounding."""
     volumes = [float(enclosed_volumes(*shell).sum()) for shell in shells]
     wanted = sum(volumes[shell] for body in bodies for shell in body)
     if abs(made - wanted) > FILLED * wanted:
         raise MeshError(
-            f"Surface file '{path}' encloses {wanted:.4g} m^3, but its tetrahedra fill {made:.4g} m^3: mend the "
+            f"{source} encloses {wanted:.4g} m^3, but its tetrahedra fill {made:.4g} m^3: mend the "
             "surface where it cuts itself."
         )
 

@@ -77,3 +77,14 @@ def cells_for(sizing: Sizing, low: tuple[float, ...], high: tuple[float, ...], f
     points = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
     density = float(np.mean(1.0 / sizing.at(points) ** dim))
     return max(1, round(filled * float(np.prod(sides)) * density / SHARE[dim]))
+
+
+def cells_for_body(volume: float, wall: float, h: float) -> int:
+    """About how many cells gmsh makes of size h in a body of this volume [m^3], solid (wall 0) or a shell.
+
+    A wall no thicker than h has cells from one side to the other: three tetrahedra to a prism over a triangle of
+    0.433 h^2, whatever its thickness.
+    """
+    solid = volume / (SHARE[3] * h**3)
+    through = 3 * volume / wall / (0.433 * h**2) if wall else 0.0
+    return max(1, round(max(solid, through)))

@@ -69,6 +69,13 @@ def read_surface(path: str | Path) -> ClosedSurface:
     return closed_surface(contents.points, triangles, f"Surface file '{path}'")
 
 
+def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
+    """Closed shells, one inside another or apart, as one surface."""
+    starts = np.cumsum([0] + [len(points) for points, _ in shells])
+    triangles = [shell + start for (_, shell), start in zip(shells, starts, strict=False)]
+    return closed_surface(np.concatenate([points for points, _ in shells]), np.concatenate(triangles), source)
+
+
 def _triangles(block: Block) -> Indices:
     """The triangles of a block, quads cut in two."""
     if block.shape == "triangle":

@@ -13,14 +13,15 @@ import pyvista
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
+from fracsim.colouring import select, shown_range
 from fracsim.errors import InputError, Stopped
-from fracsim.picture import Look, exploded, find_frames, render
+from fracsim.picture import Look, Shot, exploded, find_frames, load, render
 from fracsim.run import Run
 from fracsim.scene import build_scene
 
 Data = dict[str, Any]
 SOLVER = {"snes_rtol": 1e-11, "ksp_rtol": 1e-9}
-TEARING = changed(STRIP, solver=SOLVER, output={"fields": ["damage", "von_mises", "strain"]})
+TEARING = changed(STRIP, solver=SOLVER, output={"fields": ["damage", "von_mises", "strain", "stress"]})
 
 
 def run(data: Data, folder: Path, **how: Any) -> Run:
@@ -118,10 +119,50 @@ def picture(path: Path) -> npt.NDArray[np.uint8]:
     return np.asarray(imread(path))
 
 
-@pytest.mark.parametrize("look", (Look(), Look("von_mises"), Look("piece", explode=0.5), Look("age", zoom=2.0)))
+@pytest.mark.parametrize(
+    "look",
+    (
+        Look(),
+        Look("von_mises"),
+        Look("piece", explode=0.5),
+        Look("age", zoom=2.0),
+        Look("stress:xy"),
+        Look("displacement"),
+        Look("displacement:y"),
+    ),
+)
 def test_looks_differ_and_show_something(torn: Run, look: Look, tmp_path: Path) -> None:
     pixels = picture(render(torn.folder, tmp_path / "shot.png", look))[..., :3]
     assert np.any(pixels != 255, axis=2).mean() > 0.02
+
+
+def test_components_are_those_of_the_mesh(torn: Run) -> None:
+    """stress:yy of the surface is the fourth column that fields.h5 has for the same cell, and says so to ParaView."""
+    grid = last(torn.folder)
+    wanted = np.asarray(load(Shot(0.0, torn.folder / "fields.h5", -1 + len(find_frames(torn.folder))))["stress"])
+    cells = np.asarray(grid.cell_data["cell"])
+    assert select(grid, "stress:yy") == "stress:yy"
+    np.testing.assert_array_equal(grid.cell_data["stress:yy"], wanted[cells, 3])
+    stress = grid.GetCellData().GetArray("stress")
+    assert [stress.GetComponentName(i) for i in range(6)] == ["xx", "xy", "xz", "yy", "yz", "zz"]
+
+
+def test_split_cells_have_no_strain(torn: Run) -> None:
+    """Their nodes belong to several pieces that fly apart: F of the cell says nothing about either."""
+    frame = load(Shot(0.0, torn.folder / "fields.h5", len(find_frames(torn.folder)) - 1))
+    assert torn.scene.fracture is not None
+    split = torn.scene.fracture.graph.split
+    assert split.any()
+    gathered = torn.scene.domain.gather_cells(split.astype(float))
+    assert np.all(np.asarray(frame["strain"])[gathered > 0] == 0) and np.asarray(frame["strain"]).max() > 0
+
+
+def test_the_range_of_the_colours() -> None:
+    """Symmetric where both signs occur; a few values beyond the rest do not stretch it."""
+    values = np.concatenate([np.linspace(-1.0, 2.0, 1001), [1e6]])
+    low, high = shown_range(values) or (0.0, 0.0)
+    assert -low == high == pytest.approx(2.0, rel=0.03)
+    assert shown_range(np.zeros(3)) == (0.0, 0.0) and shown_range(np.full(3, np.nan)) is None
 
 
 def test_an_animation_moves(torn: Run, tmp_path: Path) -> None:
@@ -134,7 +175,11 @@ def test_an_animation_moves(torn: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("look", "frame", "name", "message"),
     (
-        (Look("colour"), -1, "a.png", "--colour colour: this run has: "),
+        (Look("colour"), -1, "a.png", "--field colour: this run has: "),
+        (Look("stress"), -1, "a.png", "--field stress: stress is a tensor; add a component: stress:xx, stress:xy"),
+        (Look("stress:rr"), -1, "a.png", "stress has no component rr; its components are xx, xy, xz, yy, yz, zz"),
+        (Look("damage:x"), -1, "a.png", "damage has no component x; it has no components"),
+        (Look("origin"), -1, "a.png", "--field origin: this run has: "),
         (Look(view="below"), -1, "a.png", "--view below: must be one of iso, front"),
         (Look(view="0,0,0"), -1, "a.png", "--view 0,0,0: a direction must be finite and not zero"),
         (Look(), 99, "a.png", "--frame 99: "),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..fields_file import padded
+from ..fields_file import TENSOR, padded
 from .fragments import Fragments
 from .frame import Frame
 
@@ -117,6 +117,8 @@ def _grid(frame: Frame) -> Any:
     def array(values: npt.NDArray[np.generic], name: str = "") -> Any:
         made = numpy_to_vtk(np.ascontiguousarray(padded(values)), deep=True)
         made.SetName(name)
+        for i, axes in enumerate(TENSOR if made.GetNumberOfComponents() == len(TENSOR) else ()):
+            made.SetComponentName(i, axes)  # ParaView would take them for xx yy zz xy yz xz
         return made
 
     grid, points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
