@@ -1,0 +1,87 @@
+"""[mesh], [material] and [damping]: the body and what it is made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from .values import (
+    NonNegative,
+    Poisson,
+    Positive,
+    Strength,
+    Table,
+)
+
+
+class Mesh(BaseModel):
+    """`builder` with its own parameters, or `file` with named groups, or a closed `surface` filled at size `h`."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    builder: str | None = None
+    file: Path | None = None
+    surface: Path | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Mesh:
+        given = [key for key in ("builder", "file", "surface") if getattr(self, key) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none of them"
+            raise ValueError(f"give exactly one of builder, file, surface; found {found}")
+        return self
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything besides the source: the builder's parameters, or h of a surface."""
+        return dict(self.model_extra or {})
+
+
+class Elastic(Table):
+    """What may differ between the named regions of a mesh."""
+
+    young: Positive  # Pa
+    poisson: Poisson
+    density: Positive  # kg/m^3
+
+
+class Region(Table):
+    """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
+
+    young: Positive | None = None
+    poisson: Poisson | None = None
+    density: Positive | None = None
+    strength: Strength | None = None
+    yield_stress: Strength | None = None
+
+
+class Material(Elastic):
+    """[material]; tables inside it are regions."""
+
+    energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
+    plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
+    regions: dict[str, Region] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tables_are_regions(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "regions" in data:
+            return data
+        regions = {key: value for key, value in data.items() if isinstance(value, dict)}
+        rest = {key: value for key, value in data.items() if key not in regions}
+        return rest | ({"regions": regions} if regions else {})
+
+    @model_validator(mode="after")
+    def _plane_stress_needs_a_form(self) -> Material:
+        if self.plane == "stress" and self.energy not in ("linear", "stvk"):
+            raise ValueError(f'plane = "stress" is offered by the energies linear and stvk, not by {self.energy}')
+        return self
+
+
+class Damping(Table):
+    """Rayleigh damping a M + b K."""
+
+    mass: NonNegative = 0.0  # a, 1/s
+    stiffness: NonNegative = 0.0  # b, s

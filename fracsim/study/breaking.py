@@ -1,0 +1,94 @@
+"""[fracture], [plasticity] and [brittle]: how the body breaks and flows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from .values import (
+    Finite,
+    Flag,
+    NonNegative,
+    Positive,
+    Strength,
+    Table,
+    Vector,
+)
+
+
+class Heterogeneity(Table):
+    """Scatter of the strength from edge to edge, Weibull-distributed with mean 1; the same at any number of ranks."""
+
+    modulus: Positive  # Weibull's m: 5 scatters like stone, 50 hardly at all
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Fibre(Table):
+    """Strength that depends on direction: `ratio` times as high along the fibre as across it."""
+
+    direction: Vector
+    ratio: Positive = 1.0
+
+    @field_validator("direction")
+    @classmethod
+    def _has_a_direction(cls, direction: list[float]) -> list[float]:
+        if not any(direction):
+            raise ValueError("a direction must not be zero")
+        return direction
+
+
+class Fracture(Table):
+    """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
+
+    strength: Strength
+    approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
+    radius: NonNegative = 0.0  # m, of the non-local average; 0: local
+    kernel: Literal["linear", "constant", "gaussian"] = "linear"
+    tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
+    unilateral: Flag = False  # a broken edge shorter than at rest carries pressure: cracks close
+    passes: Annotated[int, Field(ge=1, strict=True)] = 1  # solve and break again within a step until nothing new breaks
+    cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
+    heterogeneity: Heterogeneity | None = None
+    fibre: Fibre | None = None
+
+
+class Plasticity(Table):
+    """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1."""
+
+    yield_stress: Strength  # Pa, of the Cauchy stress
+    measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too
+    flow_rate: Annotated[float, Field(gt=0, strict=True)] = float("inf")  # 1/s; inf: independent of the rate
+    hardening: Finite = 0.0  # K in Pa: what yield_stress gains with accumulated plastic strain; < 0 softens
+    update: Literal["implicit", "staggered"] = (
+        "implicit"  # solve a step with its flow; let flow follow it (small steps)
+    )
+
+
+class Grains(Table):
+    """Grain boundaries: regions of seeded points p_i by least k_i |x - p_i|, the same at any number of ranks."""
+
+    count: Annotated[int, Field(ge=2, strict=True)]
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+    spread: Annotated[Finite, Field(ge=0, lt=1)] = 0.0  # k_i from 1 - spread to 1 + spread; 0: all grains alike
+    mode: Literal["replace", "bias"] = "replace"  # a surface frees a grain; or runs along the boundaries nearest to it
+
+
+class Brittle(Table):
+    """[brittle]: instead of single edges, surfaces from the cells of highest averaged principal stress break."""
+
+    surfaces: Annotated[int, Field(ge=1, strict=True)]  # most surfaces of the run: more of them, more debris
+    spacing: Positive | None = None  # m between places where surfaces start; default: about two mesh edges
+    shape: Literal["planar", "curved"] = "planar"  # curved: turns with the principal direction
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0  # of the direction where several principal stresses are equal
+    per_pass: Annotated[int, Field(ge=1, strict=True)] | None = None  # most that start in one pass; default: no limit
+    grains: Grains | None = None
+
+    @model_validator(mode="after")
+    def _grains_have_their_shape(self) -> Brittle:
+        if self.grains is not None and self.grains.mode == "replace" and self.shape == "curved":
+            raise ValueError(
+                'shape = "curved" does nothing where grains.mode = "replace": surfaces are grain boundaries; '
+                'remove shape, or set grains.mode = "bias"'
+            )
+        return self

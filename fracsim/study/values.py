@@ -1,0 +1,61 @@
+"""What a key may hold: numbers in SI units, vectors, and tables over time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+
+# Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[Finite, Field(gt=0)]
+NonNegative = Annotated[Finite, Field(ge=0)]
+Strength = Annotated[float, Field(gt=0, strict=True)]  # Pa; inf never breaks
+Poisson = Annotated[Finite, Field(gt=-1, lt=0.5)]
+Flag = Annotated[bool, Field(strict=True)]
+Vector = Annotated[list[Finite], Field(min_length=2, max_length=3)]
+
+
+def _kind(value: Any) -> str:
+    """Tag of a component of a motion."""
+    return "<word>" if isinstance(value, str) else "<number>"
+
+
+Component = Annotated[
+    Annotated[Finite, Tag("<number>")] | Annotated[Literal["free"], Tag("<word>")], Discriminator(_kind)
+]
+Motion = Annotated[list[Component], Field(min_length=2, max_length=3)]
+
+
+class Table(BaseModel):
+    """A table of the study file: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
+
+
+class TimeTable[Value](Table):
+    """Values at times in s, linear in between and constant outside."""
+
+    time: Annotated[list[Finite], Field(min_length=1)]
+    value: list[Value]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> TimeTable[Value]:
+        if len(self.time) != len(self.value):
+            raise ValueError(f"{len(self.time)} times but {len(self.value)} values; give one value for each time")
+        if any(b <= a for a, b in zip(self.time, self.time[1:], strict=False)):
+            raise ValueError("times must increase")
+        return self
+
+
+def _shape(value: Any) -> str:
+    """Tag of a value that may be constant or tabulated."""
+    return "<table>" if isinstance(value, dict | TimeTable) else "<constant>"
+
+
+if TYPE_CHECKING:
+    type InTime[Value] = Value | TimeTable[Value]
+else:
+    type InTime[Value] = Annotated[
+        Annotated[Value, Tag("<constant>")] | Annotated[TimeTable[Value], Tag("<table>")], Discriminator(_shape)
+    ]

@@ -1,0 +1,137 @@
+"""A whole study, and what its tables ask of one another."""
+
+from __future__ import annotations
+
+from pydantic import Field, field_validator, model_validator
+
+from .body import Damping, Material, Mesh
+from .breaking import Brittle, Fracture, Plasticity
+from .loading import Boundary, Initial, Load
+from .running import FRACTURE_FIELDS, Output, Probe, Setting, Time
+from .values import (
+    Table,
+)
+
+
+def _moduli(material: Material) -> list[tuple[float, float]]:
+    """(Young, Poisson) of the material and of every region."""
+    regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
+    regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
+    return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
+
+
+class Study(Table):
+    """A whole study. A table that is absent costs nothing."""
+
+    title: str
+    mesh: Mesh
+    material: Material
+    time: Time
+    fracture: Fracture | None = None
+    plasticity: Plasticity | None = None
+    brittle: Brittle | None = None
+    damping: Damping | None = None
+    boundary: list[Boundary] = Field(default_factory=list)
+    load: Load | None = None
+    initial: Initial | None = None
+    solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options, given as they are
+    probe: list[Probe] = Field(default_factory=list)
+    output: Output = Output()
+
+    @field_validator("probe")
+    @classmethod
+    def _distinct(cls, probes: list[Probe]) -> list[Probe]:
+        names = [probe.name for probe in probes]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two probes have the name {twice[0]}")
+        return probes
+
+    @model_validator(mode="after")
+    def _fields_exist(self) -> Study:
+        wanted = [name for name in self.output.fields or [] if name in FRACTURE_FIELDS]
+        if wanted and self.fracture is None:
+            raise ValueError(f'output.fields has "{wanted[0]}", which needs a [fracture] table')
+        return self
+
+    @model_validator(mode="after")
+    def _strength_needs_fracture(self) -> Study:
+        special = [name for name, region in self.material.regions.items() if region.strength is not None]
+        if special and self.fracture is None:
+            raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
+        return self
+
+    @model_validator(mode="after")
+    def _flow_needs_plasticity(self) -> Study:
+        if self.plasticity is None:
+            special = [name for name, region in self.material.regions.items() if region.yield_stress is not None]
+            if special:
+                raise ValueError(f"material.{special[0]}.yield_stress needs a [plasticity] table")
+            if "plastic_strain" in (self.output.fields or []):
+                raise ValueError('output.fields has "plastic_strain", which needs a [plasticity] table')
+        return self
+
+    @model_validator(mode="after")
+    def _plasticity_fits(self) -> Study:
+        table, material = self.plasticity, self.material
+        if table is None:
+            return self
+        if material.energy == "linear":
+            raise ValueError(
+                "[plasticity] splits the deformation gradient, which the energy linear does not tell from small "
+                'strain; choose energy = "corotated", the same law at small strain'
+            )
+        if material.plane == "stress":
+            raise ValueError('[plasticity] is for 3D and plane strain; choose plane = "strain"')
+        if self.fracture is not None and self.fracture.approach == "edge":
+            raise ValueError(
+                'fracture.approach = "edge" projects strain on the edges at rest, which plastic flow leaves behind; '
+                'choose approach = "chi" with [plasticity]'
+            )
+        for young, poisson in _moduli(material):
+            if table.hardening <= (limit := -1.5 * young / (1 + poisson)):
+                raise ValueError(
+                    f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
+                    "that softens faster than it unloads has no equilibrium"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _surfaces_need_strength(self) -> Study:
+        if self.brittle is None:
+            return self
+        if self.fracture is None:
+            raise ValueError("[brittle] needs a [fracture] table: its strength decides where surfaces start")
+        if self.fracture.cap is not None:
+            raise ValueError(
+                "fracture.cap is a share of edges, [brittle] breaks surfaces: set brittle.per_pass instead"
+            )
+        if self.output.cut == "forces":
+            raise ValueError(
+                'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _projection_is_of_small_strains(self) -> Study:
+        if self.fracture is None or self.fracture.approach != "edge":
+            return self
+        if self.material.energy not in ("linear", "corotated"):
+            raise ValueError(
+                f'fracture.approach = "edge" is for the energies linear and corotated, not {self.material.energy}: '
+                'with a nonlinear strain split cells blow up; choose approach = "chi" or energy = "corotated"'
+            )
+        if "chi" in (self.output.fields or []):
+            raise ValueError('output.fields has "chi", which fracture.approach = "edge" does not have; remove it')
+        return self
+
+    @model_validator(mode="after")
+    def _explicit_steps_once(self) -> Study:
+        if self.time.scheme == "explicit" and self.fracture is not None and self.fracture.passes > 1:
+            raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
+        return self
+
+    @model_validator(mode="after")
+    def _rest_has_no_velocity(self) -> Study:
+        if self.time.scheme == "quasi-static" and self.initial is not None:
+            raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
+        return self
