@@ -22,6 +22,7 @@ class Scheme(Protocol):
 
     inertia: ClassVar[bool]
     implicit: ClassVar[bool]
+    rings: ClassVar[bool]  # a jump of a velocity that is prescribed by displacements does not die out
 
     @property
     def alpha_f(self) -> float: ...
@@ -40,6 +41,7 @@ class _AtTheEnd:
     """Schemes that balance forces at the end of the step: x is u_{n+1} itself."""
 
     implicit: ClassVar[bool] = True
+    rings: ClassVar[bool] = False
     alpha_f: ClassVar[float] = 0.0
 
     def finish(self: Any, dt: float, x: Array, u: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
@@ -89,6 +91,7 @@ class Newmark(_AtTheEnd):
     beta: float = 0.25
     gamma: float = 0.5
     inertia: ClassVar[bool] = True
+    rings: ClassVar[bool] = True
 
     def rates(self, dt: float) -> tuple[float, float]:
         """(1 / (beta dt^2), gamma / (beta dt))."""
@@ -111,6 +114,7 @@ class GeneralizedAlpha:
 
     rho: float = 0.8
     inertia: ClassVar[bool] = True
+    rings: ClassVar[bool] = True
     implicit: ClassVar[bool] = True
 
     @property

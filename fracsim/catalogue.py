@@ -14,9 +14,9 @@ ENERGIES = {
     "neo-hookean": "stable neo-Hookean; large strains, any compression (default)",
 }
 SCHEMES = {
-    "backward-euler": "first order, damps vibrations (default)",
+    "backward-euler": "first order, damps vibrations; at long steps as good as without inertia",
     "newmark": "second order; the trapezoidal rule unless beta and gamma say otherwise",
-    "generalized-alpha": "second order; rho sets how much of the fastest modes is left after a step",
+    "generalized-alpha": "second order; rho sets how much of the fastest modes is left after a step (default)",
     "explicit": "central differences, no system to solve; the step is cut to what the fastest cell allows",
     "quasi-static": "load stepping without inertia",
 }

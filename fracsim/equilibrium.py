@@ -233,7 +233,12 @@ class Equilibrium:
         if self.material.plastic is not None:
             self.material.plastic.begin((1 - late) * dt)
         held = (1 - late) * self.motion.at(t) + late * self.motion.at(t - dt)
-        self._refer(t - late * dt, held, start, *self.scheme.references(dt, start, v, a))
+        u_a, u_v = self.scheme.references(dt, start, v, a)
+        if self.scheme.rings and not late:
+            u, own = held[: len(self.held)], self.held
+            rate, change = driven(dt, u, start[own], v[own])
+            u_a[own], u_v[own] = u - change / self.c_a, u - rate / self.c_v
+        self._refer(t - late * dt, held, start, u_a, u_v)
 
     def hold(self, t: float, u: Values, v: Values, a: Values | None = None) -> None:
         """Put the body at u with velocity v and acceleration a (none where not given) at time t."""
@@ -416,6 +421,15 @@ class Equilibrium:
         dofs = domain.space.dofmap.index_map.size_global * domain.dim
         young = domain.comm.allreduce(float(np.max(self.material.young, initial=0.0)), op=MPI.MAX)
         return float(young * domain.mean_edge ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
+
+
+def driven(dt: float, u: Values, start: Values, v: Values) -> tuple[Values, Values]:
+    """(velocity, acceleration) of prescribed dofs over a step, from u at its ends and the velocity before.
+
+    They move by their own law: Newmark's formulae would swing about a velocity that jumps for ever.
+    """
+    rate = (u - start) / dt
+    return rate, (rate - v) / dt
 
 
 # Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large

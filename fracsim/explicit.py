@@ -25,7 +25,6 @@ class ExplicitStepper(Stepper):
 
     _frequencies: Values | None = None
     _arrival: tuple[Values, Values, Values]
-    _gained: float  # kinetic energy of prescribed dofs in the last step, on this rank, J
 
     def _fit(self, state: State) -> float:
         """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
@@ -57,18 +56,12 @@ class ExplicitStepper(Stepper):
         a: Values = np.asarray(-unbalanced / (equations.mass * (1 + drag * dt / 2)), np.float64)
         a[held] = 0.0
         self._arrival = u, half + dt / 2 * a, a
-        self._gained = 0.5 * float(equations.mass[held] @ (half[held] ** 2 - state.v[held] ** 2))
         self.phases["solve"] += time.perf_counter() - began
         finite = self.comm.allreduce(bool(np.isfinite(unbalanced).all()), op=MPI.LAND)
         return Outcome(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         return self._arrival
-
-    def _work(self, state: State, increment: Values) -> tuple[float, float]:
-        """Reactions are without the inertia of the prescribed dofs themselves: what moves those is work as well."""
-        work, viscous = super()._work(state, increment)
-        return work + self._gained, viscous
 
 
 def stable_step(highest: float, equations: Equilibrium) -> float:

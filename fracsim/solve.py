@@ -19,12 +19,12 @@ DEFAULTS: Options = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
     "snes_max_it": 25,
-    "snes_rtol": 1e-6,
+    "snes_rtol": 1e-4,
     "snes_stol": 0.0,
     "snes_lag_preconditioner": -2,  # made at the first tangent, then kept
     "snes_lag_preconditioner_persists": True,
     "ksp_type": "cg",
-    "ksp_rtol": 1e-5,
+    "ksp_rtol": 1e-3,
     "ksp_max_it": 500,
 }
 MULTIGRID: Options = {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .equilibrium import Equilibrium
+from .equilibrium import Equilibrium, driven
 from .errors import NotConverged
 from .laws import of_size
 from .parallel import total
@@ -42,6 +42,7 @@ class Stepper:
         self.smallest = timing.smallest or timing.step / 1024
         self.passes = fracture.passes if fracture is not None else 1
         self.comm = equations.domain.comm
+        self._lumped = timing.mass == "lumped" and equations.scheme.inertia
         self.flow: Any = None  # fracsim.plasticity.Flow of a body that yields
         self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
         self.failed = 0  # attempts that did not converge
@@ -158,11 +159,11 @@ class Stepper:
         self, state: State, dt: float, outcome: Outcome, began: float, broken_before: int, released_before: float
     ) -> Report:
         equations = self.equations
-        old = state.u
+        old, before = state.u, state.v
         state.u, state.v, state.a = self._arrive(state, dt)
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
-        work, viscous = self._work(state, state.u - old)
+        work, viscous = self._work(state, state.u - old, before)
         flowed = self._flow()
         broken, released, elastic = self._break(state)
         broken, released = broken + broken_before, released + released_before + flowed
@@ -182,6 +183,8 @@ class Stepper:
         equations = self.equations
         x = equations.u.x.array[: len(state.u)].copy()
         u, v, a = equations.scheme.finish(dt, x, state.u, state.v, state.a)
+        if equations.scheme.rings:
+            v[equations.held], a[equations.held] = driven(dt, *(each[equations.held] for each in (u, state.u, state.v)))
         if equations.scheme.alpha_f:
             if self.flow is not None:
                 self.flow.begin(dt)
@@ -189,14 +192,23 @@ class Stepper:
             equations.update_reactions()
         return u, v, a
 
-    def _work(self, state: State, increment: Values) -> tuple[float, float]:
-        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in it."""
+    def _work(self, state: State, increment: Values, v: Values) -> tuple[float, float]:
+        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in it.
+
+        But for the inertia of prescribed dofs, whose velocity (`v` at the start) may jump: what moves them is the gain
+        of their kinetic energy.
+        """
         equations = self.equations
         forces = equations.applied_force().copy()
         held = equations.held
         forces[held] += equations.unbalanced[held]
         drag = equations.viscous_force()
-        work = 0.5 * float((state.forces + forces) @ increment)
+        gained = 0.0
+        if self._lumped:
+            mass = equations.mass[held]
+            forces[held] -= mass * state.a[held]
+            gained = 0.5 * float(mass @ (state.v[held] ** 2 - v[held] ** 2))
+        work = 0.5 * float((state.forces + forces) @ increment) + gained
         viscous = 0.0
         if drag is not None:
             viscous = 0.5 * float((drag + (state.drag if state.drag is not None else 0.0)) @ increment)

@@ -38,7 +38,7 @@ def study(n: int) -> dict[str, Any]:
         "fracture": {"strength": 4e6},
         "boundary": [{"on": "bottom", "fix": "xyz"}, {"on": "top", "velocity": [0.0, 0.0, 1.0]}],
         "load": {"gravity": [0.0, 0.0, -9.81]},
-        "time": {"step": 5e-3, "end": 1.0},
+        "time": {"scheme": "backward-euler", "step": 5e-3, "end": 1.0},
         "solver": OPTIONS,
         "output": {"every": 1000, "picture": False},
     }

@@ -50,7 +50,7 @@ def test_check_tells_what_is_built_and_what_is_not() -> None:
     assert "fracture    off: no damage field, no graph, no average" in lines
     assert "plasticity  off: no plastic strain, no flow" in lines
     assert "damping     off" in lines
-    assert "time        backward-euler, 3 steps of 0.01 s, halved where a step fails" in lines
+    assert "time        generalized-alpha, 3 steps of 0.01 s, halved where a step fails" in lines
     assert "probes      grip (reaction)" in lines
 
 

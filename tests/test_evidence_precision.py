@@ -300,7 +300,7 @@ MADE = page.Case(
     apart=("explicit",),
 )  # fmt: skip
 EULER = [
-    record(name, 0.2 * dt, 1 / dt, scheme="backward-euler", dt=dt)
+    record(name, 0.2 * dt, 1 / dt, scheme="generalized-alpha", dt=dt)
     for name, dt in zip("abc", (0.4, 0.2, 0.1), strict=True)
 ]
 

@@ -269,3 +269,23 @@ def test_make_scheme_passes_the_parameters() -> None:
     scene, _ = make_scene(time={"scheme": "newmark", "step": 0.1, "end": 1.0, "beta": 0.3025, "gamma": 0.6})
     assert make_scheme(scene.study.time) == Newmark(0.3025, 0.6)
     assert make_scheme(scene.study.time.model_copy(update={"scheme": "backward-euler"})) == BackwardEuler()
+
+
+@pytest.mark.parametrize("scheme", ("backward-euler", "newmark", "generalized-alpha", "explicit"))
+def test_a_grip_that_starts_at_once_moves_as_it_is_told(scheme: str) -> None:
+    """A strip whose end is driven at 0.3 m/s from the first step on: that end has this velocity in every step, and
+    work = elastic + kinetic to first order of the step, but for what backward Euler damps."""
+    gaps = []
+    for dt in (0.02, 0.01):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
+            boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.3, 0.0]}],
+            time={"scheme": scheme, "step": dt, "end": 1.0},
+        )
+        grip = scene.domain.nodes[: scene.domain.node_count, 0] > 1 - 1e-9
+        for report in each_step(scene, state):
+            np.testing.assert_allclose(state.v.reshape(-1, 2)[grip], [[0.3, 0.0]] * grip.sum(), atol=1e-12)
+            gap = abs(state.work - report.elastic - report.kinetic) / state.work
+        gaps.append(gap)
+    assert gaps[1] < 0.6 * gaps[0] or gaps[1] < 1e-9
+    assert gaps[1] < (0.2 if scheme == "backward-euler" else 5e-3)

@@ -133,7 +133,7 @@ def test_every_default_is_written() -> None:
 
     data = tomllib.loads(study_text(study(STRIP)))
     assert data["time"] == {
-        "scheme": "backward-euler", "step": 0.005, "end": 0.05, "adapt": True, "mass": "lumped",
+        "scheme": "generalized-alpha", "step": 0.005, "end": 0.05, "adapt": True, "mass": "lumped",
         "beta": 0.25, "gamma": 0.5, "rho": 0.8
     }  # fmt: skip
     assert data["fracture"] == {

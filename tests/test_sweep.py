@@ -99,13 +99,13 @@ def test_a_changed_study_is_run_again(tmp_path: Path) -> None:
 
 
 def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
-    """A solver that may take no Krylov iteration does not converge; the next one does."""
+    """A solver that may take no Newton iteration does not converge; the next one does."""
     out = tmp_path / "out"
-    options = ("--set", "solver.ksp_max_it=1,200", "--set", "time.adapt=false")
+    options = ("--set", "solver.snes_max_it=0,20", "--set", "time.adapt=false")
     done = fracsim("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
     assert done.returncode == 3
     assert (
-        "1 of 2 runs did not end well: ksp_max_it-1_adapt-false (not converged: no solution at t = 0.01" in done.stderr
+        "1 of 2 runs did not end well: snes_max_it-0_adapt-false (not converged: no solution at t = 0.01" in done.stderr
     )
     assert [row["outcome"].partition(":")[0] for row in rows(out)] == ["not converged", "done"]
 

@@ -19,7 +19,7 @@ from .values import (
 class Time(Table):
     """[time]: scheme and steps."""
 
-    scheme: Literal["backward-euler", "newmark", "generalized-alpha", "explicit", "quasi-static"] = "backward-euler"
+    scheme: Literal["backward-euler", "newmark", "generalized-alpha", "explicit", "quasi-static"] = "generalized-alpha"
     step: Positive  # s
     end: Positive  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones

@@ -46,14 +46,14 @@ def thrown(step: float, *, scheme: str = "backward-euler", steps: int = 40, mate
 
 def torn(
     mesh: Data, *, speed: float, step: float, steps: int, strength: float, ends: tuple[str, str] = ("left", "right"),
-    material: Data | None = None, approach: str = "chi", axis: int = 0,
+    material: Data | None = None, approach: str = "chi", axis: int = 0, scheme: str = "generalized-alpha",
 ) -> Data:  # fmt: skip
     """A body held at one end and pulled at the other until it tears, with inertia."""
     study = bare("a body torn", mesh, material, steps)
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
     study["boundary"] = [{"on": ends[0], "fix": "xyz"}, {"on": ends[1], "velocity": velocity}]
-    study["time"] = {"step": step, "end": steps * step}
+    study["time"] = {"scheme": scheme, "step": step, "end": steps * step}
     return breaking(study, strength, approach)
 
 

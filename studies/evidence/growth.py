@@ -92,7 +92,7 @@ def scene_study(case: str) -> dict[str, Any]:
         "boundary": [{"on": held, "fix": "xyz"}, {"on": drawn, "velocity": [0.1, 0.0, 0.0]}],
         "load": {"gravity": [0.0, 0.0, -9.81]},
         "solver": OPTIONS,
-        "time": {"step": 5e-3, "end": 100.0},
+        "time": {"scheme": "backward-euler", "step": 5e-3, "end": 100.0},
         "output": {"every": 1000000, "picture": False, "surface": False},
     }
 

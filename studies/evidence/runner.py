@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +28,45 @@ def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
     folder = out / trial.group / trial.case / trial.name
     path = folder / "record.json"
     digest = fingerprint(trial)
-    if path.exists() and (record := json.loads(path.read_text()))["digest"] == digest:
-        return dict(record)
-    folder.mkdir(parents=True, exist_ok=True)
-    command = _command(trial, folder)
-    runs = [_once(command, folder, trial.limit) for _ in range(trial.repeats)]
-    record = {**_about(trial, command), "digest": digest, **_joined(runs)}
-    _measure(trial, folder, record)
-    path.write_text(json.dumps(record, indent=1) + "\n")
+    record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    if record.get("digest") != digest:
+        folder.mkdir(parents=True, exist_ok=True)
+        command = _command(trial, folder)
+        runs = [_once(command, folder, trial.limit) for _ in range(trial.repeats)]
+        record = {**_about(trial, command), "digest": digest, **_joined(runs)}
+    if record.get("measured by") != measuring():
+        _measure(trial, folder, record)
+        path.write_text(json.dumps(record, indent=1) + "\n")
     return record
 
 
 def fingerprint(trial: Trial) -> str:
-    """Name of what a trial is: it changes with any part of it."""
-    return hashlib.sha256(json.dumps(asdict(trial), sort_keys=True).encode()).hexdigest()[:16]
+    """Name of a run: it changes with any part of the trial and with the program (and the script) that is run."""
+    code = program() + (measuring() if trial.script else "")
+    return hashlib.sha256((json.dumps(asdict(trial), sort_keys=True) + code).encode()).hexdigest()[:16]
+
+
+@cache
+def program() -> str:
+    """Name of the code that a study runs through: the page that is made of it afterwards is not part of it."""
+    package = Path(str(importlib.import_module("fracsim").__file__)).parent
+    modules = [path for path in package.rglob("*.py") if not {"report", "studies"} & set(path.parts[-3:])]
+    for name in ("forms", "meshes"):
+        modules += Path(str(importlib.import_module(f"fracsim.{name}").__file__)).parent.rglob("*.py")
+    return _name_of(modules)
+
+
+@cache
+def measuring() -> str:
+    """Name of the code of the evidence: what was measured by an older one is measured again, from the same run."""
+    return _name_of(list(Path(__file__).parent.rglob("*.py")))
+
+
+def _name_of(modules: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(modules):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _about(trial: Trial, command: list[str]) -> dict[str, Any]:
@@ -88,7 +114,7 @@ def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
 def _joined(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Worst outcome, last summary, and the times of all runs, s: `wall` of the process, `stepping` inside it."""
     summaries = [run["summary"] for run in runs if run["summary"] is not None]
-    phases = ("solve", "fracture", "energies")
+    phases = ("solve", "fracture", "energies", "plasticity")
     return {
         "outcome": next((run["outcome"] for run in runs if run["outcome"] != "done"), "done"),
         "message": runs[-1]["message"],
@@ -100,7 +126,9 @@ def _joined(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _measure(trial: Trial, folder: Path, record: dict[str, Any]) -> None:
     """Figures of the run into the record; a measurement that fails makes the trial a failed one, not a hole."""
-    record["figures"] = {}
+    record["figures"], record["measured by"] = {}, measuring()
+    if record["outcome"] == "not measured":
+        record["outcome"] = "done"
     if record["outcome"] != "done" and not trial.always:
         return
     try:

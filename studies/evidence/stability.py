@@ -13,6 +13,7 @@ from .trial import Setting, Trial
 
 GROUP = "stability"
 Record = dict[str, Any]
+STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # s
 GROWN, OFF = 0.05, 0.02  # more energy from nowhere, or a larger relative error, is no right answer
 
 
@@ -45,10 +46,12 @@ def _script(case: str, name: str, module: str, *arguments: str, measure: str = "
 
 
 def _steps() -> list[Trial]:
-    long = [_trial("dt", f"{step:.0e}-s", x.thrown(step), "thrown") for step in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)]
+    long = [_trial("dt", f"{step:.0e}-s", x.thrown(step), "thrown") for step in STEPS]
     long += [_trial("dt", "1e-06-s-flying", x.flying(1e3, 1e-6), "drifting")]
-    schemes = ("newmark", "generalized-alpha", "explicit")
-    return long + [_trial("dt", f"1e-2-s-{name}", x.thrown(1e-2, scheme=name), "thrown") for name in schemes]
+    second = "generalized-alpha"
+    long += [_trial("dt", f"{step:.0e}-s-{second}", x.thrown(step, scheme=second), "thrown") for step in STEPS]
+    others = ("newmark", "explicit")
+    return long + [_trial("dt", f"1e-2-s-{name}", x.thrown(1e-2, scheme=name), "thrown") for name in others]
 
 
 def _stiffness() -> list[Trial]:
