@@ -8,7 +8,6 @@ M is made once (fracsim.mass) and added; as a term of the form it would be integ
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -21,17 +20,15 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .domain import Domain
-from .forms.balance import elastic_energy, internal_work, pressure_work, traction_work, viscous_work
-from .forms.energies import Energy
-from .forms.kinematics import deformation_gradient
+from .forms.balance import pressure_work, traction_work, viscous_work
 from .forms.schemes import Scheme
+from .internal import InternalForces
 from .kernels import compile_form
 from .loads import Forces, Motion
 from .mass import ConsistentMass, LumpedMass, Mass
 from .material import MaterialFields, _coefficient
 from .parallel import total
-from .rotation import RotationField
-from .study import Fracture, Study
+from .study import Study
 
 Values = npt.NDArray[np.float64]
 
@@ -41,10 +38,7 @@ class Equilibrium:
 
     Attributes:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
-        chi: degradation field of the approach "chi", None otherwise.
-        integrity: 1 or 0 for each edge of each cell in the approach "edge" or where cracks close, None otherwise.
-        unilateral: whether broken edges resist being shortened.
-        energy: the energy that is assembled; material.energy is that of the undamaged body.
+        internal: the stress, with the fields of damage: chi, integrity, energy and rotation are its own.
         inertia: the mass matrix.    mass: (owned dofs,) lumped mass of each dof, kg.
         held: owned dofs whose motion is prescribed.
         unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
@@ -55,11 +49,9 @@ class Equilibrium:
         self.domain, self.material, self.scheme = domain, material, scheme
         self.u = fem.Function(domain.space, name="displacement")
         self.c_a, self.c_v = scheme.rates(study.time.step)
-        self.chi: fem.Function | None = None
-        self.integrity: fem.Function | None = None
-        self.unilateral = study.fracture is not None and study.fracture.unilateral
-        self.energy: Energy = material.energy if study.fracture is None else self._damaged(study.fracture)
-        self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
+        self.internal = InternalForces(domain, self.u, study, material, scheme.inertia)
+        self.chi, self.integrity, self.energy = self.internal.chi, self.internal.integrity, self.internal.energy
+        self.rotation = self.internal.rotation
         self.damping = study.damping
         self.u_n: Any = None
         self.u_v: Any = None
@@ -76,101 +68,25 @@ class Equilibrium:
 
     # --- set-up ---
 
-    def _whole_cells(self, name: str, components: int) -> fem.Function:
-        """A DG0 field of ones: nothing is broken yet."""
-        space = self.domain.cell_scalar if components == 1 else self.domain.cell_vector(components)
-        field = fem.Function(space, name=name)
-        field.x.array[:] = 1.0
-        return field
-
-    def _damaged(self, fracture: Fracture) -> Energy:
-        """The energy with the fields of damage that the study's approach needs."""
-        whole: Any = self.material.energy
-        if fracture.approach == "chi":
-            self.chi = self._whole_cells("chi", 1)
-            if not fracture.unilateral:
-                return self.material.energy
-        from .graph import local_edges
-
-        edges: list[Any] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
-        self.integrity = self._whole_cells("integrity", len(edges))
-        if fracture.approach == "edge":
-            from .forms.damage import EdgeProjected
-
-            whole = EdgeProjected(whole, self.integrity, edges, 0.0 if self.scheme.inertia else RESIDUAL_STIFFNESS)
-        if not fracture.unilateral:
-            return whole
-        from .forms.closing import Closing
-
-        share = 1.0 if self.chi is None else 1 - self.chi
-        return Closing(whole, self._floored(self.chi), share, self.integrity, edges)
-
     def _compile(self, study: Study, density: Any) -> None:
-        domain, energy = self.domain, self.energy
+        domain, internal = self.domain, self.internal
         w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
-        chi, damping = self._floored(self.factor), self._floored(self.chi)
-        rotation = self.rotation.field if self.rotation is not None else None
-        internal, springs = self._internal(w, dx, chi), self._springs(w, dx)
-        self._internal_form = compile_form(internal + springs)
-        self._energy = compile_form(elastic_energy(energy, self.u, dx, chi=chi, rotation=rotation))
-        viscous, pressure = self._viscous(w, dx, damping), self._pressure(w)
+        work = internal.work(w, dx)
+        self._internal_form, self._energy = compile_form(work), compile_form(internal.stored(dx))
+        viscous, pressure = self._viscous(w, dx), self._pressure(w)
         self._viscous_form = compile_form(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
-        others = viscous + pressure + springs
-        self._residual = compile_form(internal + others)
+        others = viscous + pressure
+        self._residual = compile_form(work + others)
         near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
-        at_supports = self._internal(w, near, chi)
-        self._reactions = compile_form(
-            at_supports + self._viscous(w, near, damping) + pressure + self._springs(w, near)
-        )
+        self._reactions = compile_form(internal.work(w, near) + self._viscous(w, near) + pressure)
         if self.scheme.implicit:
-            self._tangent = compile_form(self._stiffness(internal, others, w, dx))
+            v = ufl.TrialFunction(domain.space)
+            tangent = internal.stiffness(v, w, dx)
+            self._tangent = compile_form(tangent + (ufl.derivative(others, self.u, v) if others else 0))
         self._dead = self._dead_loads(w, dx)
 
-    @property
-    def factor(self) -> fem.Function | None:
-        """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
-        return self.chi if self.energy is self.material.energy else None
-
-    def _elastic_part(self) -> Any:
-        """What the energy takes of F: all of it, or what plastic flow left (d x d)."""
-        F = deformation_gradient(self.u)
-        if self.material.plastic is None:
-            return F
-        part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
-        return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
-
-    def _internal(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form:
-        """Virtual work of the stress, as flow within the step leaves it."""
-        rotation = self.rotation.field if self.rotation is not None else None
-        if self.material.plastic is None:
-            return internal_work(self.energy, self.u, w, dx, chi=chi, rotation=rotation)
-        return self.material.plastic.relaxation.work(self.u, w, dx, chi=self._floored(self.chi), rotation=rotation)
-
-    def _springs(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
-        """Virtual work of closing cracks in a body that flows; else it is part of `_internal`."""
-        if self.material.plastic is None or not self.unilateral:
-            return 0
-        alone: Any = replace(self.energy, chi=0)  # type: ignore[type-var]
-        return internal_work(alone, self.u, w, dx)
-
-    def _stiffness(self, internal: ufl.Form, others: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
-        """Derivative of the forces in the direction of the trial function."""
-        v = ufl.TrialFunction(self.domain.space)
-        if self.material.plastic is None:
-            return ufl.derivative(internal + others, self.u, v)
-        rotation = self.rotation.field if self.rotation is not None else None
-        floored = self._floored(self.chi)
-        tangent = self.material.plastic.relaxation.tangent(self.u, v, w, dx, chi=floored, rotation=rotation)
-        return tangent + (ufl.derivative(others, self.u, v) if others else 0)
-
-    def _floored(self, chi: Any) -> Any:
-        """chi; in a quasi-static study with a floor, so that detached pieces leave the tangent regular."""
-        if chi is None:
-            return 1.0
-        return chi if self.scheme.inertia else RESIDUAL_STIFFNESS + (1 - RESIDUAL_STIFFNESS) * chi
-
-    def _viscous(self, w: Any, dx: ufl.Measure, chi: Any) -> ufl.Form | int:
+    def _viscous(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
         """Stiffness-proportional damping; the start of the step and c_v are coefficients that `begin` moves."""
         if self.damping is None or self.damping.stiffness == 0:
             return 0
@@ -179,6 +95,7 @@ class Equilibrium:
             self.u_n, self.u_v = fem.Function(space), fem.Function(space)
             self._c_v = fem.Constant(self.domain.mesh, np.float64(0.0))
         rate = self._c_v * (self.u - self.u_v)
+        chi = self.internal.stiffness_left
         return viscous_work(self.material.energy, rate, self.u_n, w, dx, b=self.damping.stiffness, chi=chi)
 
     def _pressure(self, w: Any) -> ufl.Form | int:
@@ -428,10 +345,5 @@ def driven(dt: float, u: Values, start: Values, v: Values) -> tuple[Values, Valu
 
     They move by their own law: Newmark's formulae would swing about a velocity that jumps for ever.
     """
-    rate = (u - start) / dt
-    return rate, (rate - v) / dt
-
-
-# Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large
-# enough that the tangent stays regular (a condition number of 1e16 would not do).
-RESIDUAL_STIFFNESS = 1e-8
+    rate = np.asarray((u - start) / dt, np.float64)
+    return rate, np.asarray((rate - v) / dt, np.float64)

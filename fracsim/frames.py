@@ -77,7 +77,7 @@ class Frames:
                 self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
             )
         values = self._compiled[name]()
-        if (chi := self._equations.factor) is not None and name != "strain":
+        if (chi := self._equations.internal.factor) is not None and name != "strain":
             values *= chi.x.array[: self._domain.cell_count, None]
         if self._fracture is not None and name == "strain":
             values[self._fracture.graph.split] = 0.0  # nodes of several pieces have no strain in common

@@ -56,7 +56,7 @@ def damaged_frequencies(equations: Equilibrium, whole: Values) -> Values:
     intact = intact[damaged]
     if chi is None:
         squares[damaged] = projected_frequencies(equations, damaged, intact)
-    if equations.unilateral:
+    if equations.internal.unilateral:
         share = 1.0 if chi is None else 1 - chi.x.array[damaged]
         squares[damaged] += share * spring_frequencies(equations, damaged, ~intact)
     return np.asarray(squares)
