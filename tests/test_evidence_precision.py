@@ -347,3 +347,10 @@ def test_a_section_says_that_its_reference_is_missing() -> None:
 
 def test_all_sections_can_be_made_of_nothing() -> None:
     assert len(precision.sections([])) == sum(len(family.CASES) for family in precision.FAMILIES)
+
+
+def test_the_tolerances_called_default_are() -> None:
+    from fracsim.solve import DEFAULTS
+    from fracsim.studies.evidence.precision import finite
+
+    assert (DEFAULTS["snes_rtol"], DEFAULTS["ksp_rtol"]) == finite.DEFAULT

@@ -168,6 +168,10 @@ def _as_good(row: Row, other: Row | None) -> bool:
 
 
 def _apart(case: Case, row: Row) -> bool:
+    """No candidate for a default: of the case's own, or a looser CG, which fails on slender bodies (case "solver")."""
+    settings = row.record["settings"]
+    if settings.get("ksp_rtol", 0.0) > defaults()["ksp_rtol"]:
+        return True
     return any(value in case.apart for value in row.record["settings"].values() if isinstance(value, str))
 
 
@@ -199,6 +203,8 @@ def _words(advice: list[Advice], case: Case) -> str:
         why = f" The solver may take {case.share:.0%} of a limit: errors of mesh and step come on top."
     if case.apart:
         why += f" No candidate for a default: {', '.join(map(str, case.apart))}."
+    if "ksp_rtol" in case.columns:
+        why += " Nor is a looser CG: it fails on slender bodies (ksp-1e-3-slender among the solver settings)."
     return " ".join(_sentence(each, case) for each in advice) + why
 
 
