@@ -38,6 +38,8 @@ MULTIGRID: Options = {
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
+# Multigrid is made anew where CG takes this many times the iterations that it took when it was made, and two more.
+WORN_BY = 1.3
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
 # dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
@@ -69,7 +71,7 @@ class Solver:
     """SNES on an `Equilibrium`, set up once and kept for the whole run.
 
     The preconditioner is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a
-    Newton iteration. It is made anew where CG takes half as many iterations again as when it was fresh, and refreshed
+    Newton iteration. It is made anew where CG takes a third more iterations than when it was fresh (WORN_BY), and refreshed
     (new coarse operators and smoothers on the same coarse spaces) after edges broke.
     """
 
@@ -186,7 +188,7 @@ class Solver:
             self._fresh_its = self._fresh_its or ksp.its
             self._age = Age.FRESH if self._keep else Age.DATED
         # also where damage has dated it: coarse spaces from before a crack carry the motion of one side to the other
-        if self._fresh_its and ksp.its > 1.5 * self._fresh_its + 3:
+        if self._fresh_its and ksp.its > WORN_BY * self._fresh_its + 2:
             self._age = Age.WORN
         if self._age == Age.FRESH:
             return

@@ -18,6 +18,9 @@ from typing import Any
 
 import tomli_w
 
+import fracsim as root
+from fracsim import forms, meshes
+
 from .trial import Trial
 
 OUTCOMES = {0: "done", 2: "refused", 3: "not converged", 4: "stopped"}
@@ -49,10 +52,10 @@ def fingerprint(trial: Trial) -> str:
 @cache
 def program() -> str:
     """Name of the code that a study runs through: the page that is made of it afterwards is not part of it."""
-    package = Path(str(importlib.import_module("fracsim").__file__)).parent
+    package = Path(root.__file__).parent
     modules = [path for path in package.rglob("*.py") if not {"report", "studies"} & set(path.parts[-3:])]
-    for name in ("forms", "meshes"):
-        modules += Path(str(importlib.import_module(f"fracsim.{name}").__file__)).parent.rglob("*.py")
+    for part in (forms, meshes):
+        modules += Path(str(part.__file__)).parent.rglob("*.py")
     return _name_of(modules)
 
 
