@@ -71,8 +71,8 @@ class Solver:
     """SNES on an `Equilibrium`, set up once and kept for the whole run.
 
     The preconditioner is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a
-    Newton iteration. It is made anew where CG takes a third more iterations than when it was fresh (WORN_BY), and refreshed
-    (new coarse operators and smoothers on the same coarse spaces) after edges broke.
+    Newton iteration. It is made anew where CG takes a third more iterations than when it was fresh (WORN_BY), and
+    refreshed (new coarse operators and smoothers on the same coarse spaces) after edges broke.
     """
 
     def __init__(self, equations: Equilibrium, given: Options) -> None:
