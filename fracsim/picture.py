@@ -181,8 +181,9 @@ def _add_coloured(plotter: Any, mesh: Any, field: str, *, lighting: bool) -> Non
     }  # fmt: skip
     many = field == "piece"
     values = np.asarray(mesh[field])
+    limits: tuple[float, float] | None = (-0.5, PALETTE - 0.5)
     if many:  # numbers in the middle of their colours, or round-off speckles what lies between two
-        values, limits = values % PALETTE, (-0.5, PALETTE - 0.5)
+        values = values % PALETTE
     else:
         limits = shown_range(values.astype(float), signed=":" in field)
     both_signs = limits is not None and limits[0] < 0 < limits[1]
