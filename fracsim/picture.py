@@ -27,6 +27,7 @@ VIEWS = {
     "top": (0.0, -0.001, 1.0),
 }
 OLD, CRACK = "#b4bac4", "#e0762b"  # the old boundary and the crack, where no field colours them
+PALETTE = 20  # colours of pieces
 LINE = 3  # VTK's number of a segment
 AMBIENT = 0.25  # light in the shade, so that the side away from the lamp shows its crack too
 
@@ -179,11 +180,17 @@ def _add_coloured(plotter: Any, mesh: Any, field: str, *, lighting: bool) -> Non
         "position_y": 0.02, "n_labels": 3, "label_font_size": 16, "title_font_size": 18,
     }  # fmt: skip
     many = field == "piece"
-    limits = None if many else shown_range(np.asarray(mesh[field], float), signed=":" in field)
+    values = np.asarray(mesh[field])
+    limits: tuple[float, float] | None = (-0.5, PALETTE - 0.5)
+    if many:  # numbers in the middle of their colours, or round-off speckles what lies between two
+        values = values % PALETTE
+    else:
+        limits = shown_range(values.astype(float), signed=":" in field)
     both_signs = limits is not None and limits[0] < 0 < limits[1]
     plotter.add_mesh(
-        mesh, scalars=field, cmap="tab20" if many else "coolwarm" if both_signs else "viridis", clim=limits,
-        nan_color=OLD, lighting=lighting, line_width=3, ambient=AMBIENT, scalar_bar_args=bar, show_scalar_bar=not many,
+        mesh, scalars=values if many else field, clim=limits, nan_color=OLD,
+        cmap="tab20" if many else "coolwarm" if both_signs else "viridis",
+        lighting=lighting, line_width=3, ambient=AMBIENT, scalar_bar_args=bar, show_scalar_bar=not many,
     )  # fmt: skip
 
 

@@ -15,9 +15,10 @@ from pydantic import ValidationError
 from scipy.spatial.distance import cdist
 
 from cases import fracsim, write_study
+from fracsim.brittle.body import Body
 from fracsim.brittle.level_set import DirectionField
 from fracsim.brittle.principal import SAME, directions, largest, material_normals, upper_bound
-from fracsim.brittle.sheet import NEAREST
+from fracsim.brittle.sheet import NEAREST, settled, sides_of
 from fracsim.brittle.start import Starts
 from fracsim.errors import Stopped
 from fracsim.mesh_source import build_mesh
@@ -30,6 +31,7 @@ from support.laws import rotation
 from support.scenes import deform, make_scene, make_study, march, mesh_of
 
 EPS = np.finfo(float).eps
+UNSTRUCTURED = {"pattern": "unstructured"}
 ROUND_OFF = 1e3 * EPS  # of sums over some thousand triangles
 
 
@@ -453,3 +455,23 @@ def test_check_tells_and_a_typing_error_is_named(tmp_path: Path) -> None:
     assert "up to 7 surfaces, each frees one of 30 grains (seed 2" in " ".join(told.stdout.split()), told.stdout
     wrong = fracsim("check", path, "--set", "brittle.surfaecs=3")
     assert wrong.returncode == 2 and "did you mean surfaces?" in wrong.stderr
+
+
+def test_no_node_of_a_thin_plate_is_left_without_a_whole_cell() -> None:
+    """Planes at any angle through a plate about one cell thick, which as they are would leave two nodes each, or so."""
+    body = Body(build_mesh(Mesh.model_validate({"builder": "box", "size": [1.0, 0.8, 0.07], "h": 0.06} | UNSTRUCTURED)))
+    draw, every = np.random.default_rng(0), np.ones(len(body.cells), bool)
+    left = np.zeros((100, 2), int)
+    for trial in left:
+        origin, normal = draw.uniform(0.2, 0.8, 3) * [1.0, 0.8, 0.07], draw.normal(size=3) * [1.0, 1.0, 0.3]
+        plane = sides_of((body.points - origin) @ (normal / np.linalg.norm(normal)), body.tolerance)
+        moved = settled(body, plane, every)
+        assert moved.any() and not moved.all()
+        trial[:] = [without_a_cell(body, plane), without_a_cell(body, moved)]
+    assert left[:, 0].sum() > 100 and left[:, 1].sum() == 0
+
+
+def without_a_cell(body: Body, sides: Any) -> int:
+    """Nodes none of whose cells lie on their side as a whole."""
+    found = {node for cell in body.cells if len(set(sides[cell])) == 1 for node in cell}
+    return len(body.points) - len(found)

@@ -237,3 +237,24 @@ def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
     body = np.abs(pixels - pixels[0, 0]).max(axis=2) > 0.05
     assert 0.03 < body.mean() < 0.9
     assert len(np.unique((pixels[body] * 255).astype(int), axis=0)) > 20
+
+
+def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
+    """Not on which other pieces there are, so that it stays from frame to frame; the palette of 20 starts again."""
+    import pyvista
+
+    from fracsim.picture import _add_coloured
+    from fracsim.screen import display
+
+    corners = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.2, 1, 0.3]])
+    points = np.concatenate([corners, corners + [1.5, 0, 0], corners + [0, 1.5, 0]])
+    mesh = pyvista.PolyData(points, np.insert(np.arange(9).reshape(3, 3), 0, 3, axis=1).ravel())
+    mesh.point_data["piece"] = np.repeat([10, 0, 20], 3)
+    with display():
+        plotter = pyvista.Plotter(off_screen=True, window_size=(400, 300))
+        plotter.set_background("white")
+        _add_coloured(plotter, mesh, "piece", lighting=False)
+        pixels = plotter.screenshot(return_img=True)
+        plotter.close()
+    colours, count = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    assert np.count_nonzero(count > 200) == 3  # white; 10; 0 and 20, which share one

@@ -30,6 +30,7 @@ COARSE = {
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "struck-figure": ["mesh.h=0.013"],
     "struck-vase": ["mesh.h=0.012"],
+    "wall": ["mesh.h=0.12"],
 }
 QUIET = ["output.picture=false"]
 

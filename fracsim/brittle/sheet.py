@@ -81,26 +81,63 @@ def settled(body: Body, sides: Flags, usable: Flags, movable: Flags | None = Non
 
     `usable` (C,): cells that have not come apart. `movable` (N,): nodes that may move; None: all. A node without such a
     cell would drift off as a crumb without stiffness. It goes over where all other nodes of one of its cells are, so
-    that it has a whole cell there.
+    that it has a whole cell there; or else it draws those of one of its cells over to its own side, which is tried for
+    all such nodes of one side, then of the other, and kept where fewer are left.
     """
     near = np.zeros(len(sides), bool)
     near[body.cells[body.crossed(sides)]] = True
     if movable is not None:
         near &= movable
     cells = body.cells[np.flatnonzero(body.touching(near) & usable)]
-    sides, most = sides.copy(), body.dim
+    best = _gone_over(cells, sides, near)
+    fewest = np.count_nonzero(_loose(cells, best, near))
+    for attempt in range(2 * ROUNDS):
+        if not fewest:
+            break
+        trial = _gone_over(cells, _drawn(cells, best, near, bool(attempt % 2)), near)
+        count = np.count_nonzero(_loose(cells, trial, near))
+        if count < fewest:
+            best, fewest = trial, count
+    return best
+
+
+def _loose(cells: Ints, sides: Flags, near: Flags) -> Flags:
+    """(N,) nodes of cells (m, d + 1) that have none of them whole on their own side."""
+    above = np.count_nonzero(sides[cells], axis=1)
+    loose = np.zeros(len(sides), bool)
+    loose[cells] = True
+    loose[cells[(above == 0) | (above == cells.shape[1])]] = False
+    return np.asarray(loose & near)
+
+
+def _gone_over(cells: Ints, sides: Flags, near: Flags) -> Flags:
+    """The sides with loose nodes moved to where all other nodes of one of their cells are."""
+    sides, most = sides.copy(), cells.shape[1] - 1
     for _ in range(ROUNDS):
         side = sides[cells]
         above = np.count_nonzero(side, axis=1)
-        within = (above == 0) | (above == most + 1)
-        held = ~near
-        held[cells[within]] = True
         lone = np.flatnonzero((above == 1) | (above == most))
         odd = cells[lone][side[lone] == (above[lone] == 1)[:, None]]
-        over = odd[~held[odd]]
+        over = odd[_loose(cells, sides, near)[odd]]
         if not len(over):
             break
         sides[over] = ~sides[over]
+    return sides
+
+
+def _drawn(cells: Ints, sides: Flags, near: Flags, to: bool) -> Flags:
+    """The sides where each loose node of side `to` draws the others of one of its cells over to it.
+
+    The cell with the fewest to draw, of these the first.
+    """
+    side = sides[cells]
+    others = np.count_nonzero(side != to, axis=1)
+    wanting = (_loose(cells, sides, near) & (sides == to))[cells] & (near[cells] | (side == to)).all(axis=1)[:, None]
+    row, corner = np.nonzero(wanting)
+    order = np.lexsort((row, others[row]))
+    chosen = row[order[np.unique(cells[row, corner][order], return_index=True)[1]]]
+    sides = sides.copy()
+    sides[cells[chosen]] = to
     return sides
 
 
