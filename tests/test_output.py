@@ -247,7 +247,7 @@ def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
     from fracsim.screen import display
 
     corners = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.2, 1, 0.3]])
-    points = np.concatenate([corners, corners + [1.5, 0, 0], corners + [0, 1.5, 0]])
+    points = np.concatenate([corners + shift for shift in np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 1.5, 0]])])
     mesh = pyvista.PolyData(points, np.insert(np.arange(9).reshape(3, 3), 0, 3, axis=1).ravel())
     mesh.point_data["piece"] = np.repeat([10, 0, 20], 3)
     with display():
@@ -256,5 +256,5 @@ def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
         _add_coloured(plotter, mesh, "piece", lighting=False)
         pixels = plotter.screenshot(return_img=True)
         plotter.close()
-    colours, count = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    _, count = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
     assert np.count_nonzero(count > 200) == 3  # white; 10; 0 and 20, which share one
