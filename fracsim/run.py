@@ -18,6 +18,7 @@ from .checkpoint import read_checkpoint, write_checkpoint
 from .errors import NotConverged, Stopped
 from .fields_file import FieldsFile
 from .frames import Frames
+from .gained import Gained
 from .history import History
 from .interrupt import Interrupt
 from .inverted import Inverted
@@ -79,6 +80,7 @@ class Run:
         names = study.output.fields if study.output.fields is not None else default_fields(study)
         self.frames = Frames(self.scene.equations, names, self.scene.fracture)
         self.inverted = Inverted(self.scene.equations, self.scene.fracture)
+        self.gained = Gained(at_rest=study.initial is None and not restart)
         source = self.scene.domain.source
         self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
         self._open_surface(restart)
@@ -156,8 +158,9 @@ class Run:
         summary = self._summary(outcome)
         self.history.close()
         if self.comm.rank == 0:
-            if note := self.inverted.note(self.scene.study.material.energy):
-                print(f"fracsim: note: {note}", file=sys.stderr)
+            for note in (self.inverted.note(self.scene.study.material.energy), self.gained.note()):
+                if note:
+                    print(f"fracsim: note: {note}", file=sys.stderr)
             (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
             if self.scene.study.output.picture:
                 _draw(self.folder)
@@ -175,6 +178,7 @@ class Run:
                 self._damage = self._count_damage()
                 self._note_breaks()
             self.history.append(state, report, self._figures(), self.scene.probes())
+            self.gained.look(report, state)
             done = state.t >= end * (1 - 1e-12)
             if done or self._clock.due(state):
                 self._write_frame()

@@ -156,7 +156,8 @@ def alone(name: str, n: int, began: float) -> dict[str, Any]:
             take_step(started_)
         frame = timed(started_.comm, started_._write_frame)
         cells = started_.scene.domain.cell_count
-        modules = sorted(name for name in sys.modules if name.startswith("fracsim.") and ".studies" not in name)
+        own = ("fracsim.studies", "fracsim.report")  # those of this script
+        modules = sorted(name for name in sys.modules if name.startswith("fracsim.") and not name.startswith(own))
         fields = _fields()
     memory = (_memory("VmHWM") - before) / cells
     return {

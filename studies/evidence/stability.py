@@ -194,7 +194,7 @@ def verdict(record: Record) -> str:
         return f"WRONG: {outcome}"
     if not figures.get("finite", False):
         return "WRONG: not finite"
-    if message.startswith("note: ") and "turned inside out" in message:
+    if message.startswith("note: ") and any(word in message for word in ("turned inside out", "from nowhere")):
         return f"warned: {message.removeprefix('note: ')}"
     if figures.get("growth", 0.0) > GROWN:
         return "WRONG: energy grew"

@@ -168,9 +168,10 @@ def _as_good(row: Row, other: Row | None) -> bool:
 
 
 def _apart(case: Case, row: Row) -> bool:
-    """No candidate for a default: of the case's own, or a looser CG, which fails on slender bodies (case "solver")."""
-    settings = row.record["settings"]
-    if settings.get("ksp_rtol", 0.0) > defaults()["ksp_rtol"]:
+    """No candidate for a default: of the case's own; a looser CG, which fails on slender bodies, or a
+    looser Newton, which takes the first guess for the answer on slivers (both of case "solver")."""
+    settings, known = row.record["settings"], defaults()
+    if any(settings.get(key, 0.0) > known[key] for key in ("ksp_rtol", "snes_rtol")):
         return True
     return any(value in case.apart for value in row.record["settings"].values() if isinstance(value, str))
 
@@ -204,7 +205,10 @@ def _words(advice: list[Advice], case: Case) -> str:
     if case.apart:
         why += f" No candidate for a default: {', '.join(map(str, case.apart))}."
     if "ksp_rtol" in case.columns:
-        why += " Nor is a looser CG: it fails on slender bodies (ksp-1e-3-slender among the solver settings)."
+        why += (
+            " Nor is a looser CG, which fails on slender bodies (ksp-1e-3-slender among the solver settings), nor a "
+            "looser Newton, which takes the first guess for the answer on slivers (snes-1e-4-slivers)."
+        )
     return " ".join(_sentence(each, case) for each in advice) + why
 
 
