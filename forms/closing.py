@@ -22,7 +22,7 @@ import ufl
 from ufl.core.expr import Expr
 
 from .damage import edge_vectors, in_plane
-from .energies import Energy, Scalar
+from .energies import Around, Energy, Scalar
 from .kinematics import small_strain
 
 # Mean of cos^4 between an edge and a fixed direction over all directions: 3/8 in the plane, 1/5 in space.
@@ -38,43 +38,18 @@ def spring_modulus(energy: Any, dim: int, edges: int) -> Scalar:
 
 
 @dataclass(frozen=True)
-class Closing:
-    """A damaged energy, times `chi`, whose broken edges (integrity 0, else 1) resist being shortened, times `share`."""
+class Closing(Around):
+    """A damaged energy `whole` times `chi`, and `share` of the springs of broken edges (integrity 0, else 1)."""
 
-    damaged: Energy
+    whole: Energy
     chi: Any
     share: Any
     integrity: Any
     edges: Any
 
-    @property
-    def mu(self) -> Scalar:
-        """Lame's mu of the whole material, Pa."""
-        return self.damaged.mu
-
-    @property
-    def lmbda(self) -> Scalar:
-        """Lame's lambda of the whole material, Pa."""
-        return self.damaged.lmbda
-
-    @property
-    def reduced(self) -> bool:
-        """Whether lmbda is lambda* of plane stress."""
-        return self.damaged.reduced
-
-    @property
-    def needs_rotation(self) -> bool:
-        """As of the whole material."""
-        return self.damaged.needs_rotation
-
-    @property
-    def linear(self) -> bool:
-        """As of the whole material."""
-        return self.damaged.linear
-
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
-        return self.chi * self.damaged.psi(F, rotation) + self.share * self._springs(in_plane(F, self.edges))
+        return self.chi * self.whole.psi(F, rotation) + self.share * self._springs(in_plane(F, self.edges))
 
     def _springs(self, F: Expr) -> Expr:
         squares = [
@@ -89,7 +64,3 @@ class Closing:
         if self.linear:
             return ufl.dot(edge, small_strain(F) * edge) / square
         return (ufl.dot(F * edge, F * edge) / square - 1) / 2
-
-    def thickness_stretch(self, F: Expr) -> Expr | float:
-        """As of the whole material."""
-        return self.damaged.thickness_stretch(F)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import ufl
 from ufl.core.expr import Expr
 
-from .energies import Energy, Scalar, hooke
+from .energies import Around, Energy, hooke
 from .kinematics import embed
 
 
@@ -62,7 +62,7 @@ def in_plane(tensor: Expr, edges: Any) -> Expr:
 
 
 @dataclass(frozen=True)
-class EdgeProjected:
+class EdgeProjected(Around):
     """psi = 1/2 (D eps) : C : (D eps) + r psi_0: force and tangent of M22 eqs. 21-22, symmetric and positive.
 
     r is the share of the whole cell's stiffness that is left however damaged (0 but in quasi-static studies).
@@ -73,31 +73,6 @@ class EdgeProjected:
     edges: Any
     residual: float = 0.0
 
-    @property
-    def mu(self) -> Scalar:
-        """Lame's mu of the whole material, Pa."""
-        return self.whole.mu
-
-    @property
-    def lmbda(self) -> Scalar:
-        """Lame's lambda of the whole material, Pa."""
-        return self.whole.lmbda
-
-    @property
-    def reduced(self) -> bool:
-        """Whether lmbda is lambda* of plane stress."""
-        return self.whole.reduced
-
-    @property
-    def needs_rotation(self) -> bool:
-        """As of the whole material."""
-        return self.whole.needs_rotation
-
-    @property
-    def linear(self) -> bool:
-        """As of the whole material."""
-        return self.whole.linear
-
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
         strain = self.whole.strain(F, rotation)
@@ -106,7 +81,3 @@ class EdgeProjected:
         if plane is not strain:
             kept = embed(kept, strain[2, 2])
         return hooke(self, kept) + self.residual * hooke(self, strain)
-
-    def thickness_stretch(self, F: Expr) -> Expr | float:
-        """F33 = 1: small strain."""
-        return 1.0

@@ -60,6 +60,42 @@ class Energy(Protocol):
     def thickness_stretch(self, F: Expr) -> Expr | float: ...
 
 
+class Around:
+    """An energy made of another one, `whole`, with its moduli and its kind."""
+
+    whole: Any
+
+    @property
+    def mu(self) -> Scalar:
+        """Lame's mu of the whole material, Pa."""
+        return self.whole.mu
+
+    @property
+    def lmbda(self) -> Scalar:
+        """Lame's lambda of the whole material, Pa."""
+        return self.whole.lmbda
+
+    @property
+    def reduced(self) -> bool:
+        """Whether lmbda is lambda* of plane stress."""
+        return bool(self.whole.reduced)
+
+    @property
+    def needs_rotation(self) -> bool:
+        """Whether psi takes a polar rotation."""
+        return bool(self.whole.needs_rotation)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the stress is linear in u."""
+        return bool(self.whole.linear)
+
+    def thickness_stretch(self, F: Expr) -> Expr | float:
+        """F33, dimensionless."""
+        stretch: Expr | float = self.whole.thickness_stretch(F)
+        return stretch
+
+
 @dataclass(frozen=True)
 class _PlaneStrain:
     """F33 = 1: the out-of-plane stretch of an energy without a plane-stress form."""

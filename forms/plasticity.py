@@ -17,44 +17,26 @@ Cauchy stress.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import ufl
 from ufl.core.expr import Expr
 from ufl.form import Form
 
 from .balance import ONE_POINT
-from .energies import Energy, Scalar
+from .energies import Around, Energy
 from .kinematics import deformation_gradient, embed
 
 
 @dataclass(frozen=True)
-class Plastic:
+class Plastic(Around):
     """psi(F F_p^-1): the volume of a cell is that at rest for F_p too, so no factor stands before psi.
 
     P = d psi / d F = P_e F_p^-T, hence tau = P F^T = P_e F_e^T: the stress is that of the elastic part.
     """
 
-    elastic: Energy
+    whole: Energy
     inverse: Any  # F_p^-1, 3 x 3
-
-    linear: ClassVar[bool] = False
-    reduced: ClassVar[bool] = False
-
-    @property
-    def mu(self) -> Scalar:
-        """Lame's mu, Pa."""
-        return self.elastic.mu
-
-    @property
-    def lmbda(self) -> Scalar:
-        """Lame's lambda, Pa."""
-        return self.elastic.lmbda
-
-    @property
-    def needs_rotation(self) -> bool:
-        """Whether psi takes the polar rotation, which is that of F_e."""
-        return self.elastic.needs_rotation
 
     def elastic_part(self, F: Expr) -> Expr:
         """F_e = F F_p^-1, 3 x 3."""
@@ -62,11 +44,7 @@ class Plastic:
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
-        return self.elastic.psi(self.elastic_part(F), embed(rotation, 1.0) if rotation is not None else None)
-
-    def thickness_stretch(self, F: Expr) -> Expr | float:
-        """F33 = 1: plane strain."""
-        return 1.0
+        return self.whole.psi(self.elastic_part(F), embed(rotation, 1.0) if rotation is not None else None)
 
 
 class Trial:
@@ -80,7 +58,7 @@ class Trial:
     def __init__(self, energy: Plastic, u: Expr, rotation: Expr | None) -> None:
         self.part = energy.elastic_part(deformation_gradient(u))
         solid = ufl.variable(self.part)
-        self.psi = energy.elastic.psi(solid, embed(rotation, 1.0) if rotation is not None else None)
+        self.psi = energy.whole.psi(solid, embed(rotation, 1.0) if rotation is not None else None)
         self.P = ufl.diff(self.psi, solid)
         self.J, self.pull = ufl.det(self.part), ufl.inv(self.part).T
         tau = self.P * self.part.T
