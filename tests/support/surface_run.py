@@ -21,7 +21,7 @@ from .torn import RUNS, TIGHT, Found
 
 def run(name: str, folder: Path) -> Found:
     """A study to its end with a frame at every tenth step; the last frame."""
-    scene, state = make_scene(**RUNS[name], solver=TIGHT)
+    scene, state = make_scene(**{"solver": TIGHT} | RUNS[name])
     domain, graph = scene.domain, scene.fracture.graph
     record = EdgeRecord(graph)
     output = SurfaceOutput(folder, domain, scene.equations.material.density, record)
