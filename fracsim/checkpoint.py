@@ -24,7 +24,7 @@ from .state import State
 
 if TYPE_CHECKING:
     from .brittle.surfaces import BrittleSurfaces
-    from .surface.record import EdgeRecord
+    from .record import EdgeRecord
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")

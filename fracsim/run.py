@@ -31,8 +31,8 @@ from .study_file import study_text
 
 if TYPE_CHECKING:
     from .pieces import Pieces
+    from .record import EdgeRecord
     from .surface.output import SurfaceOutput
-    from .surface.record import EdgeRecord
 
 
 class Run:
@@ -102,7 +102,7 @@ class Run:
     def _make_record(self) -> EdgeRecord | None:
         if self._graph is None:
             return None
-        from .surface.record import EdgeRecord
+        from .record import EdgeRecord
 
         return EdgeRecord(self._graph)
 
@@ -118,7 +118,7 @@ class Run:
 
     def _cuts(self) -> npt.NDArray[np.float64]:
         """(edges,) cuts in inverse proportion to the nodal forces at the step's end (M22 fig. 12)."""
-        from .surface.record import cut_by_forces
+        from .record import cut_by_forces
 
         equations, domain, graph = self.scene.equations, self.scene.domain, self._graph
         force = equations.nodal_forces().reshape(-1, domain.dim)

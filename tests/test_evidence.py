@@ -185,7 +185,7 @@ def test_sections_show_what_failed() -> None:
 
 
 def test_modules_of_other_features_are_noticed() -> None:
-    modules = ["fracsim.run", "fracsim.surface", "fracsim.surface.record", "fracsim.graph", "fracsim.average"]
+    modules = ["fracsim.run", "fracsim.surface", "fracsim.record", "fracsim.graph", "fracsim.average"]
     assert ladder.strangers("elastic", 10, modules) == sorted(modules[1:])
     assert ladder.strangers("damage", 10, ["fracsim.graph", "fracsim.average"]) == ["fracsim.average"]
     assert ladder.strangers("average", 10, ["fracsim.graph", "fracsim.average"]) == []

@@ -16,10 +16,10 @@ import pyvista
 from fracsim.errors import NotConverged
 from fracsim.fields_file import Field
 from fracsim.meshes.data import MeshData
+from fracsim.record import cut_by_forces
 from fracsim.surface.files import SurfaceFiles, columns
 from fracsim.surface.fragments import PieceNames, fragments
 from fracsim.surface.frame import FARTHEST, Frame, Surface
-from fracsim.surface.record import cut_by_forces
 from support.ranks import Arrays, run_on_ranks
 from support.solids import Values, lattice, patterns, separated
 

@@ -12,10 +12,10 @@ from ..domain import Domain
 from ..fields_file import Field
 from ..material import PerCell
 from ..parallel import on_root
+from ..record import EdgeRecord
 from ..state import State
 from .files import SurfaceFiles
 from .frame import Surface
-from .record import EdgeRecord
 
 Values = npt.NDArray[np.float64]
 

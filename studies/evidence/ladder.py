@@ -30,7 +30,7 @@ WARM, STEPS = 3, 15
 SHORT, LONG = 10, 20  # cells along a metre: 24k and 192k tetrahedra
 LIMIT = 1.05  # what the elastic bar may cost over the bare loop
 DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never stressed enough to break by itself
-FRACTURE_MODULES = ("fracture", "graph", "degrade", "strength", "edge_stress", "pieces")
+FRACTURE_MODULES = ("fracture", "graph", "degrade", "strength", "edge_stress", "pieces", "record")
 OPTIONAL = (*FRACTURE_MODULES, "average", "surface", "forms.damage", "plasticity", "brittle", "picture", "report")
 
 

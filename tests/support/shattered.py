@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from fracsim.record import EdgeRecord
 from fracsim.scene import Scene
-from fracsim.surface.record import EdgeRecord
 
 from .scenes import make_scene, march
 from .torn import MESHES, TIGHT, Found, result_of

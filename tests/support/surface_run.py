@@ -12,8 +12,8 @@ import numpy as np
 from mpi4py import MPI
 
 from fracsim.pieces import find_pieces
+from fracsim.record import EdgeRecord
 from fracsim.surface.output import SurfaceOutput
-from fracsim.surface.record import EdgeRecord
 
 from .scenes import each_step, make_scene
 from .torn import RUNS, TIGHT, Found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..graph import EdgeGraph
+from .graph import EdgeGraph
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
