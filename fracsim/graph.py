@@ -7,6 +7,7 @@ tetrahedron and 8 for a triangle. What a pattern means is worked out once for al
 from __future__ import annotations
 
 from functools import cache, cached_property
+from typing import Any
 
 import basix
 import numpy as np
@@ -133,17 +134,37 @@ class EdgeGraph:
         """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
         return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
 
-    def broken_keys(self) -> npt.NDArray[np.int64] | None:
-        """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""
-        own = self.edge_keys(np.flatnonzero(self.broken[: self.edge_count]))
-        parts = self.domain.comm.gather(own)
+    def gather_broken(self, values: npt.NDArray[np.float64] | None = None) -> Any:
+        """(n, 2) sorted keys of all broken edges on rank 0 and, of (edges, m) values of local ones, their (n, m) rows.
+
+        None on the other ranks (collective).
+        """
+        own = np.flatnonzero(self.broken[: self.edge_count])
+        columns = np.empty((len(own), 0)) if values is None else values[own]
+        parts = self.domain.comm.gather((self.edge_keys(own), columns))
         if parts is None:
             return None
-        keys = np.concatenate(parts)
-        return keys[np.lexsort(keys.T[::-1])]
+        keys, rows = (np.concatenate(each) for each in zip(*parts, strict=True))
+        order = np.lexsort(keys.T[::-1])
+        return keys[order], rows[order]
+
+    def broken_keys(self) -> npt.NDArray[np.int64] | None:
+        """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""
+        gathered = self.gather_broken()
+        return None if gathered is None else gathered[0]
+
+    def find_keys(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Local edges whose keys are among the (n, 2) sorted ones, and the row of each of them there."""
+        own = self.edge_keys(np.arange(len(self.broken)))
+        factor = np.array([int(max(keys.max(initial=0), own.max(initial=0))) + 1, 1])
+        known, wanted = keys @ factor, own @ factor
+        place = np.searchsorted(known, wanted)
+        local = np.flatnonzero(place < len(known))
+        local = local[known[place[local]] == wanted[local]]
+        return local, place[local]
 
     def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the local edges whose keys are among those given."""
-        own = self.edge_keys(np.arange(len(self.broken)))
-        factor = int(max(keys.max(initial=0), own.max(initial=0))) + 1
-        return np.isin(own @ np.array([factor, 1]), keys @ np.array([factor, 1]))
+        """(edges,) flags of the local edges whose keys are among those given, in any order."""
+        flags = np.zeros(len(self.broken), bool)
+        flags[self.find_keys(keys[np.lexsort(keys.T[::-1])])[0]] = True
+        return flags

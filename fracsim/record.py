@@ -34,23 +34,13 @@ class EdgeRecord:
 
     def gathered(self) -> tuple[Ints, Values] | None:
         """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
-        graph = self.graph
-        own = np.flatnonzero(graph.broken[: graph.edge_count])
-        parts = graph.domain.comm.gather((graph.edge_keys(own), np.column_stack([self.at[own], self.cut[own]])))
-        if parts is None:
-            return None
-        keys, values = (np.concatenate(each) for each in zip(*parts, strict=True))
-        order = np.lexsort(keys.T[::-1])
-        return keys[order], values[order]
+        gathered: tuple[Ints, Values] | None = self.graph.gather_broken(np.column_stack([self.at, self.cut]))
+        return gathered
 
     def restore(self, keys: Ints, values: Values) -> None:
         """Take up what `gathered` gave, on every rank."""
-        own = self.graph.edge_keys(np.arange(len(self.at)))
-        factor = np.array([int(max(keys.max(initial=0), own.max(initial=0))) + 1, 1])
-        known, wanted = keys @ factor, own @ factor
-        place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
-        found = np.flatnonzero(known[place] == wanted) if len(known) else np.empty(0, np.int64)
-        self.at[found], self.cut[found] = values[place[found]].T
+        local, place = self.graph.find_keys(keys)
+        self.at[local], self.cut[local] = values[place].T
 
 
 def cut_by_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:

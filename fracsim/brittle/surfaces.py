@@ -105,15 +105,6 @@ class BrittleSurfaces:
     def _cut_edges(self, opened: Opened) -> npt.NDArray[np.bool_]:
         """Flags of local edges; where they are cut is kept."""
         flags = np.zeros(len(self.cut), bool)
-        if not len(opened.keys):
-            return flags
-        graph = self._graph
-        factor = np.array([int(opened.keys.max()) + 1, 1])
-        own = graph.edge_keys(np.arange(len(flags)))
-        local = np.flatnonzero(own[:, 1] < factor[0])
-        known = opened.keys @ factor  # ascending, as the edges of the input mesh are
-        place = np.minimum(np.searchsorted(known, own[local] @ factor), len(known) - 1)
-        found = known[place] == own[local] @ factor
-        flags[local[found]] = True
-        self.cut[local[found]] = opened.cut[place[found]]
+        local, place = self._graph.find_keys(opened.keys)
+        flags[local], self.cut[local] = True, opened.cut[place]
         return flags
