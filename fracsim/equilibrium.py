@@ -29,6 +29,7 @@ from .mass import ConsistentMass, LumpedMass, Mass
 from .material import MaterialFields, _coefficient
 from .parallel import total
 from .study import Study
+from .tangent import Assembly
 
 Values = npt.NDArray[np.float64]
 
@@ -83,7 +84,9 @@ class Equilibrium:
         if self.scheme.implicit:
             v = ufl.TrialFunction(domain.space)
             tangent = internal.stiffness(v, w, dx)
-            self._tangent = compile_form(tangent + (ufl.derivative(others, self.u, v) if others else 0))
+            whole = compile_form(tangent + (ufl.derivative(others, self.u, v) if others else 0))
+            self._assembly = Assembly(whole)
+            self.tangent = self._assembly.matrix
         self._dead = self._dead_loads(w, dx)
 
     def _viscous(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
@@ -110,8 +113,6 @@ class Equilibrium:
         return compile_form(sum(terms)) if terms else None
 
     def _make_vectors(self) -> None:
-        if self.scheme.implicit:
-            self.tangent = fem_petsc.create_matrix(self._tangent)
         self.residual = fem_petsc.create_vector(self._residual)
         self._work = fem_petsc.create_vector(self._residual)
         self.external: Values = np.zeros(self._owned)
@@ -220,7 +221,7 @@ class Equilibrium:
         with b.localForm() as local:
             local.set(0.0)
         fem_petsc.assemble_vector(b, self._residual)
-        fem_petsc.apply_lifting(b, [self._tangent], [self.bcs], x0=[self.u.x.petsc_vec], alpha=-1.0)
+        fem_petsc.apply_lifting(b, [self._assembly.form], [self.bcs], x0=[self.u.x.petsc_vec], alpha=-1.0)
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         self._add_inertia(b)
         b.array_w[self.held] = 0.0
@@ -261,9 +262,7 @@ class Equilibrium:
 
     def assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         """K(u) into A, rows and columns of prescribed dofs replaced by the identity's."""
-        A.zeroEntries()
-        fem_petsc.assemble_matrix_mat(A, self._tangent, bcs=self.bcs)
-        A.assemble()
+        self._assembly(self.bcs)
         c_mass, c_drag = self._mass_factors
         if c_mass or c_drag:
             self.inertia.add_to(A, c_mass + c_drag)
