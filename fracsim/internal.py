@@ -104,23 +104,29 @@ class InternalForces:
     def _R(self) -> Any:
         return self.rotation.field if self.rotation is not None else None
 
+    @property
+    def _relaxation(self) -> Any:
+        """Forms of a body that flows while a step is solved, None for all others."""
+        plastic = self._material.plastic
+        return plastic.relaxation.form if plastic is not None and plastic.relaxation is not None else None
+
     def stored(self, dx: ufl.Measure) -> ufl.Form:
         """Elastic energy, J."""
         return elastic_energy(self.energy, self._u, dx, chi=self._floored(self.factor), rotation=self._R)
 
     def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, as flow within the step leaves it."""
-        plastic = self._material.plastic
-        if plastic is None:
+        relaxed = self._relaxation
+        if relaxed is None:
             return internal_work(self.energy, self._u, w, dx, chi=self._floored(self.factor), rotation=self._R)
-        return plastic.relaxation.work(self._u, w, dx, chi=self.stiffness_left, rotation=self._R) + self._springs(w, dx)
+        return relaxed.work(self._u, w, dx, chi=self.stiffness_left, rotation=self._R) + self._springs(w, dx)
 
     def stiffness(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
-        plastic = self._material.plastic
-        if plastic is None:
+        relaxed = self._relaxation
+        if relaxed is None:
             return ufl.derivative(self.work(w, dx), self._u, v)
-        tangent = plastic.relaxation.tangent(self._u, v, w, dx, chi=self.stiffness_left, rotation=self._R)
+        tangent = relaxed.tangent(self._u, v, w, dx, chi=self.stiffness_left, rotation=self._R)
         springs = self._springs(w, dx)
         return tangent + (ufl.derivative(springs, self._u, v) if springs else 0)
 

@@ -53,7 +53,7 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     solver = Solver(equations, study.solver) if scheme.implicit else None
     stepper = make_stepper(equations, solver, study.time, fracture)
     if study.plasticity is not None:
-        from .plasticity import Flow
+        from .flow import Flow
 
         stepper.flow = Flow(equations)
     return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))

@@ -25,7 +25,7 @@ def eigenvalues(C: Values) -> Values:
     J2 = (x * x + y * y + z * z) / 2 + xy * xy + xz * xz + yz * yz
     J3 = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
     radius = np.sqrt(J2 / 3)
-    cosine = np.divide(J3, 2 * radius**3, out=np.zeros_like(J3), where=radius > 0)
+    cosine = np.divide(J3, 2 * radius * radius * radius, out=np.zeros_like(J3), where=radius > 0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0)) / 3
     first, last = 2 * np.cos(angle), 2 * np.cos(angle + 2 * np.pi / 3)
     return mean + radius * np.stack([first, -first - last, last])

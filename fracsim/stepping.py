@@ -43,7 +43,7 @@ class Stepper:
         self.passes = fracture.passes if fracture is not None else 1
         self.comm = equations.domain.comm
         self._lumped = timing.mass == "lumped" and equations.scheme.inertia
-        self.flow: Any = None  # fracsim.plasticity.Flow of a body that yields
+        self.flow: Any = None  # fracsim.flow.Flow of a body that yields
         self._before: Values | None = None  # displacement a step ago, to extrapolate a quasi-static load path
         self.failed = 0  # attempts that did not converge
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
@@ -228,7 +228,7 @@ class Stepper:
         """(edges broken, energy released, elastic energy left) of the step; the energies on this rank, J."""
         began = time.perf_counter()
         if self.fracture is None:
-            elastic = self.equations.elastic_energy()
+            elastic = self.equations.elastic_energy() if self.flow is None else self.flow.stored
             self.phases["energies"] += time.perf_counter() - began
             return 0, 0.0, elastic
         result = self.fracture()

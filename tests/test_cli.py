@@ -62,7 +62,7 @@ def test_check_tells_of_fracture() -> None:
 
 def test_check_tells_of_plasticity() -> None:
     lines = check_study(study(STRIP, plasticity={"yield_stress": 1e4, "hardening": -5.0, "flow_rate": 20.0}))
-    assert "plasticity  von-mises stress above 10000 Pa, flow rate 20 1/s, hardening -5 Pa, implicit" in lines
+    assert "plasticity  von-mises stress above 10000 Pa, flow rate 20 1/s, hardening -5 Pa, extrapolated" in lines
 
 
 # --- a scene costs only what it uses --------------------------------------------------------------------------------

@@ -143,7 +143,8 @@ def test_every_default_is_written() -> None:
     assert "plasticity" not in data
     data = tomllib.loads(study_text(study(STRIP, plasticity={"yield_stress": 1e4})))
     assert data["plasticity"] == {
-        "yield_stress": 1e4, "measure": "von-mises", "flow_rate": float("inf"), "hardening": 0.0, "update": "implicit"
+        "yield_stress": 1e4, "measure": "von-mises", "flow_rate": float("inf"), "hardening": 0.0,
+        "update": "extrapolated",
     }  # fmt: skip
     assert data["mesh"]["pattern"] == "structured"
     assert data["material"]["plane"] == "strain"

@@ -60,9 +60,8 @@ class Plasticity(Table):
     measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too
     flow_rate: Annotated[float, Field(gt=0, strict=True)] = float("inf")  # 1/s; inf: independent of the rate
     hardening: Finite = 0.0  # K in Pa: what yield_stress gains with accumulated plastic strain; < 0 softens
-    update: Literal["implicit", "staggered"] = (
-        "implicit"  # solve a step with its flow; let flow follow it (small steps)
-    )
+    # what a step is solved with: the flow of the step before; its own; none, flow follows it (small steps)
+    update: Literal["extrapolated", "implicit", "staggered"] = "extrapolated"
 
 
 class Grains(Table):

@@ -185,10 +185,11 @@ def _cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
 def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
     from ....solve import DEFAULTS, MULTIGRID
-    from ....study import Time
+    from ....study import Plasticity, Time
 
     ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}
     fields = {key: Time.model_fields[key].default for key in ("scheme", "mass", "rho")}
+    fields["update"] = Plasticity.model_fields["update"].default
     return ours | fields | {"pc_type": MULTIGRID["pc_type"]}
 
 
