@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from .forms.kinematics import SYMMETRIC_COMPONENTS
 from .graph import local_edges
-from .small_matrices import inverse_transpose
+from .small_matrices import barycentric_gradients
 
 Values = npt.NDArray[np.float64]
 
@@ -50,13 +50,6 @@ def normal_stress(components: Values, vectors: Values) -> Values:
     length2 = np.einsum("nki,nki->nk", vectors, vectors)
     form = quadratic_form(components, vectors)
     return np.divide(form, length2, out=np.zeros_like(form), where=length2 > 0)
-
-
-def barycentric_gradients(corners: Values) -> Values:
-    """(n, d + 1, d) gradients g_i of the barycentric coordinates of (n, d + 1, d) corners, 1/m."""
-    basis = corners[:, 1:] - corners[:, :1]
-    others = inverse_transpose(basis)
-    return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
 
 def carried_by(components: Values, corners: Values, intact: npt.NDArray[np.bool_]) -> Values:

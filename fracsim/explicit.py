@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,9 @@ from .solve import Outcome
 from .state import State
 from .stepping import Stepper
 
+if TYPE_CHECKING:
+    from .edge_frequencies import EdgeFrequencies
+
 Values = npt.NDArray[np.float64]
 
 SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on the current shape
@@ -24,19 +28,38 @@ class ExplicitStepper(Stepper):
     """Central differences (forms.schemes.CentralDifference); the study's step is an upper bound."""
 
     _frequencies: Values | None = None
+    _by_edges: EdgeFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
     _arrival: tuple[Values, Values, Values]
 
     def _fit(self, state: State) -> float:
         """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
         if self._frequencies is None or state.step % REFRESH == 0:
             self._frequencies = cell_frequencies(self.equations)
-        squares = damaged_frequencies(self.equations, self._frequencies)
+        squares = damaged_frequencies(self.equations, self._frequencies, self._of_edges())
         highest = float(np.sqrt(self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)))
         stable = SAFETY * stable_step(highest, self.equations)
         left = self.timing.end - state.t
         # equal steps to the end rather than a sliver: rounding up never exceeds the bound
         dt = min(state.dt, stable)
         return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
+
+    def _of_edges(self) -> EdgeFrequencies | None:
+        """What broken edges make of their cells; None where damage has no integrity."""
+        if self._by_edges is None and self.equations.integrity is not None:
+            from .edge_frequencies import edge_frequencies
+
+            self._by_edges = edge_frequencies(self.equations)
+        return self._by_edges
+
+    def settle(self, state: State) -> None:
+        """As any stepper; the body's damage may have been changed from outside before, as by a restart."""
+        self._by_edges = None
+        super().settle(state)
+
+    def _release(self, state: State) -> None:
+        """Edges broke: reactions, and from here on other cells set the step."""
+        self._by_edges = None
+        super()._release(state)
 
     def _attempt(self, state: State, dt: float) -> Outcome:
         """u by v and a of the start, then a from the forces there."""

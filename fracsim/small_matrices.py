@@ -1,4 +1,4 @@
-"""Arrays of 2 x 2 and 3 x 3 matrices, all at once: LAPACK's call per matrix costs more than the arithmetic."""
+"""Arrays of 2 x 2 and 3 x 3 matrices, those of simplices, all at once: a LAPACK call each costs more than the sums."""
 
 from __future__ import annotations
 
@@ -28,3 +28,10 @@ def inverse_transpose(A: Matrices) -> Matrices:
     cofactor = cofactors(A)
     determinant = np.einsum("nj,nj->n", A[:, 0], cofactor[:, 0])
     return cofactor / determinant[:, None, None]
+
+
+def barycentric_gradients(corners: Matrices) -> Matrices:
+    """(n, d + 1, d) gradients g_i of the barycentric coordinates of (n, d + 1, d) corners, 1/m."""
+    basis = corners[:, 1:] - corners[:, :1]
+    others = inverse_transpose(basis)
+    return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)

@@ -20,9 +20,9 @@ from typing import Any
 
 from .check import check_study
 from .errors import Exit, InputError, NotConverged, Stopped
+from .outcome import OUTCOMES, SPEAKER, last_words
 from .study_file import load_study, study_text
 
-OUTCOMES = {Exit.DONE: "done", Exit.BAD_INPUT: "refused", Exit.NOT_CONVERGED: "not converged", Exit.STOPPED: "stopped"}
 LONGEST_NAME = 100
 
 
@@ -193,8 +193,10 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
         code = process.wait()
     if forward[1:]:
         return "interrupted"
-    outcome = OUTCOMES.get(code, f"failed with exit code {code}")  # type: ignore[call-overload]
-    return str(outcome) if code == Exit.DONE else f"{outcome}: {_last_words(log)}"
+    outcome = OUTCOMES.get(code, f"failed with exit code {code}")
+    if code == Exit.DONE:
+        return outcome
+    return f"{outcome}: {last_words(log).removeprefix(SPEAKER) or 'it said nothing'}"
 
 
 @contextmanager
@@ -218,13 +220,6 @@ def _forwarding() -> Iterator[list[Any]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _last_words(log: Path) -> str:
-    """What the run said of its failure."""
-    said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    own = [line.removeprefix("fracsim: ") for line in said if line.startswith("fracsim: ")]
-    return (own or said or ["it said nothing"])[-1]
 
 
 # --- the table ------------------------------------------------------------------------------------------------------

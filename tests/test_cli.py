@@ -68,8 +68,9 @@ def test_check_tells_of_plasticity() -> None:
 # --- a scene costs only what it uses --------------------------------------------------------------------------------
 
 
-def test_a_scene_without_fracture_builds_none_of_it(tmp_path: Path) -> None:
-    bar = write_study(tmp_path / "bar.toml", BAR)
+@pytest.mark.parametrize("scheme", ("backward-euler", "explicit"))
+def test_a_scene_without_fracture_builds_none_of_it(tmp_path: Path, scheme: str) -> None:
+    bar = write_study(tmp_path / "bar.toml", BAR, time={"scheme": scheme})
     code = f"""
 import sys
 from pathlib import Path
@@ -80,7 +81,7 @@ from fracsim.scene import build_scene
 scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
 Run(scene, Path({str(tmp_path / "out")!r}))()
 parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")
-parts += ("plasticity", "spectrum", "forms.plasticity")
+parts += ("plasticity", "spectrum", "forms.plasticity", "edge_frequencies", "forms.closing", "forms.damage")
 print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

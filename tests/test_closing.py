@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fracsim.edge_frequencies import projected_frequencies, spring_frequencies
 from fracsim.forms.closing import spring_modulus
 from fracsim.forms.energies import lame
-from fracsim.frequencies import projected_frequencies, spring_frequencies
 from fracsim.graph import local_edges
 from fracsim.scene import Scene
 from fracsim.state import State

@@ -11,7 +11,17 @@ from mpi4py import MPI
 from fracsim.check import check_study
 from fracsim.errors import InputError
 from fracsim.run import run_study
-from fracsim.studies.evidence import closed_forms, dependence, extremes, failed, slit, stability, survival, written
+from fracsim.studies.evidence import (
+    closed_forms,
+    dependence,
+    extremes,
+    failed,
+    results,
+    slit,
+    stability,
+    survival,
+    written,
+)
 from fracsim.studies.evidence.trial import Trial
 from fracsim.study_file import validate
 
@@ -130,9 +140,9 @@ def test_what_is_measured_of_a_run(tmp_path: Path) -> None:
 def test_a_wrong_force_is_an_error(tmp_path: Path) -> None:
     study = extremes.block(1.2, steps=2) | {"solver": {"snes_rtol": 1e-8}}
     run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
-    history = survival.read_history(tmp_path / "run")
+    history = results.history(tmp_path / "run")
     history["reaction_pull_x"] *= 1.01
-    error = closed_forms.stretch_error(survival.read_study(tmp_path / "run"), history)["error"]
+    error = closed_forms.stretch_error(results.study(tmp_path / "run"), history)["error"]
     assert error == pytest.approx(0.01, rel=1e-4)
 
 

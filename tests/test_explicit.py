@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from fracsim.explicit import ExplicitStepper
+from fracsim import edge_frequencies
+from fracsim.explicit import SAFETY, ExplicitStepper, stable_step
 from fracsim.forms.energies import lame
-from fracsim.frequencies import cell_frequencies
+from fracsim.frequencies import cell_frequencies, damaged_frequencies
 from fracsim.scene import Scene
 from fracsim.state import State
 from support.reference import lumped_mass, modes, stiffness
@@ -94,6 +95,30 @@ def test_a_torn_body_goes_on() -> None:
     assert sum(report.broken for report in reports) > 0
     assert np.isfinite(state.u).all() and np.isfinite(reports[-1].elastic)
     assert state.work >= state.dissipated
+
+
+@pytest.mark.parametrize(("approach", "unilateral"), [("edge", False), ("edge", True), ("chi", True)])
+def test_the_stable_step_follows_every_break(approach: str, unilateral: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step is that of the damage it starts from, to the last bit; what edges do to it is worked out after breaks
+    alone, though chi falls in other steps too."""
+    scene, state = make_scene(
+        mesh=MESH,
+        boundary=[{"on": "left", "velocity": [-0.5, 0.0]}, {"on": "right", "velocity": [0.5, 0.0]}],
+        fracture={"strength": 0.2, "approach": approach, "unilateral": unilateral},
+        time={"scheme": "explicit", "step": 1.0, "end": 100.0},
+    )
+    evaluate, evaluations = edge_frequencies.edge_frequencies, []
+    monkeypatch.setattr(edge_frequencies, "edge_frequencies", lambda e: evaluations.append(e) or evaluate(e))
+    broke, steps = 1, []
+    for _ in range(80):
+        squares = damaged_frequencies(scene.equations, cell_frequencies(scene.equations), evaluate(scene.equations))
+        expected, before = SAFETY * stable_step(np.sqrt(squares.max()), scene.equations), len(evaluations)
+        (report,) = march(scene, state, 1)
+        assert report.dt == expected
+        assert len(evaluations) - before == (broke > 0)
+        broke = report.broken
+        steps.append(report.dt)
+    assert len(set(steps)) > 1 and 2 <= len(evaluations) < 80
 
 
 def test_work_moves_the_grips_as_well() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cases import BAR, STRIP, fracsim, write_study
+from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, write_study
 from fracsim.errors import InputError
 from fracsim.report.content import Claim, Picture, Plot, Section, Series, Table, from_data, to_data
 from fracsim.report.make import make_report
@@ -96,6 +96,17 @@ def test_the_numbers_are_those_of_the_runs(runs: Path, tmp_path: Path) -> None:
         assert float(row["solve s"]) == summary["seconds"]["solve"]
     assert int(found["strip"]["broken edges"]) > 0
     assert {found[name]["mesh.h"] for name in found} == {"0.25", "0.125"}
+
+
+def test_every_phase_that_a_run_times_is_in_the_table(tmp_path: Path) -> None:
+    """A strip that yields and breaks goes through all of them."""
+    tables = {**DUCTILE_TABLES, "time": {"end": 0.02}}
+    assert fracsim("run", write_study(tmp_path / "strip.toml", STRIP, **tables), "-o", tmp_path / "run").returncode == 0
+    seconds = json.loads((tmp_path / "run" / "summary.json").read_text())["seconds"]
+    assert {"plasticity", "fracture"} < set(seconds)
+    make_report([tmp_path / "run"], tmp_path / "page.html", references=[])
+    (row,) = table(tmp_path / "page" / "runs.csv")
+    assert {phase: float(row.get(f"{phase} s") or "nan") for phase in seconds} == seconds
 
 
 def test_error_against_run_time(runs: Path, tmp_path: Path) -> None:

@@ -115,6 +115,27 @@ def test_a_restart_gives_the_same_run(tmp_path: Path, whole: Path) -> None:
         assert_same_run(folder, whole)
 
 
+@pytest.mark.parametrize("unilateral", [False, True])
+def test_a_restart_takes_the_explicit_step_of_its_damage(tmp_path: Path, unilateral: bool) -> None:
+    """Cells that lost edges are faster or slower: the first step after a restart is that of the body that went on."""
+    data = changed(
+        STRIP, fracture={"approach": "edge", "unilateral": unilateral, "strength": 1e9}, material={"energy": "linear"},
+        mesh={"pattern": "unstructured"}, time={"scheme": "explicit", "step": 1.0, "end": 10.0},
+        output={"fields": ["damage"]},
+    )  # fmt: skip
+    going = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path)
+    stepper, state = going.scene.stepper, going.state
+    whole = stepper.advance(state).dt
+    going._graph.break_edges(np.random.default_rng(3).uniform(size=len(going._graph.broken)) < 0.4)
+    going.scene.fracture.degradation.restore()
+    stepper.settle(state)
+    going._note_breaks()
+    going._checkpoint()
+    again = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path, restart=True)
+    assert again.state.step == state.step > 0
+    assert again.scene.stepper._fit(again.state) == stepper._fit(state) != whole
+
+
 @pytest.mark.parametrize("scheme", ["newmark", "quasi-static"])
 def test_a_restart_with_other_schemes(tmp_path: Path, scheme: str) -> None:
     data = changed(BAR, time={"scheme": scheme, "end": 0.06}, solver=SOLVER, material={"energy": "corotated"})

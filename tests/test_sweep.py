@@ -15,6 +15,7 @@ import pytest
 
 from cases import BAR, command, fracsim, mpirun, write_study
 from fracsim.errors import InputError
+from fracsim.outcome import last_words
 from fracsim.sweep import combinations, name_of, split_list
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
@@ -108,6 +109,19 @@ def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
         "1 of 2 runs did not end well: snes_max_it-0_adapt-false (not converged: no solution at t = 0.01" in done.stderr
     )
     assert [row["outcome"].partition(":")[0] for row in rows(out)] == ["not converged", "done"]
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        ("fracsim: note: a\nfracsim: no solution\nmpirun: one process ended\n\n", "fracsim: no solution"),
+        ("Traceback\n  fracsim: indented\nboom\n \n", "boom"),
+        ("\n  \n", ""),
+    ],
+)
+def test_the_last_words_are_the_programs_own_where_it_spoke(log: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "log.txt").write_text(log)
+    assert last_words(tmp_path / "log.txt") == words
 
 
 def test_nothing_runs_where_one_combination_is_wrong(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
-PHASES = ("setup", "solve", "fracture", "energies", "output")
+PHASES = ("setup", "solve", "plasticity", "fracture", "energies", "output")
 
 
 @dataclass(frozen=True)

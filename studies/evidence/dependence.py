@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from . import slit
+from . import results, slit
 from .section import Cell, Picture, Plot, Section, Series, Table, folder_of
-from .survival import read_history, read_surface
+from .survival import read_surface
 from .trial import Trial
 
 GROUP = "dependence"
@@ -62,7 +62,7 @@ def broken_plate(run: Path) -> dict[str, float]:
 
 def broken(run: Path, specimen: slit.Specimen) -> dict[str, float]:
     """Peak load, new surface, energy and path of the crack, all for a thickness of 1 m."""
-    rows = read_history(run)
+    rows = results.history(run)
     area, centres = crack_faces(run)
     stray = np.abs(centres[:, specimen.axis] - specimen.plane)
     load = np.abs(rows[f"reaction_load_{specimen.pull}"])

@@ -1,4 +1,4 @@
-"""Reading what a run wrote: history.csv, frames of fields.h5, study.toml."""
+"""Reading what a run wrote: history.csv and other tables, frames of fields.h5, study.toml."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ Values = npt.NDArray[Any]
 
 def history(run: Path) -> dict[str, Values]:
     """Columns of history.csv by name: (steps,) each."""
-    with (run / "history.csv").open(newline="") as file:
+    return columns(run / "history.csv")
+
+
+def columns(path: Path) -> dict[str, Values]:
+    """Columns of a table of numbers by name: (rows,) each."""
+    with path.open(newline="") as file:
         rows = list(csv.reader(file))
     table = np.array(rows[1:], float).reshape(-1, len(rows[0]))
     return dict(zip(rows[0], table.T, strict=True))

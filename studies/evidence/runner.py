@@ -20,10 +20,9 @@ import tomli_w
 
 import fracsim as root
 from fracsim import forms, meshes
+from fracsim.outcome import OUTCOMES, last_words
 
 from .trial import Trial
-
-OUTCOMES = {0: "done", 2: "refused", 3: "not converged", 4: "stopped"}
 
 
 def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
@@ -103,13 +102,11 @@ def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             outcome = "out of time"
-    said = [line for line in (folder / "log.txt").read_text(errors="replace").splitlines() if line.strip()]
-    messages = [line for line in said if line.startswith("fracsim:")] or said[-1:]
     summary = folder / "run" / "summary.json"
     return {
         "outcome": outcome,
         "wall": time.perf_counter() - began,
-        "message": messages[-1] if messages else "",
+        "message": last_words(folder / "log.txt"),
         "summary": json.loads(summary.read_text()) if summary.exists() else None,
     }
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from . import closed_forms, extremes
+from . import closed_forms, extremes, results
 
 Values = npt.NDArray[np.float64]
 Figures = dict[str, float | int | bool]
@@ -21,7 +19,7 @@ def survived(run: Path) -> Figures:
     """Figures of an output folder; of a study that was refused there is none, and no figure."""
     if not (run / "history.csv").exists():
         return {}
-    rows, frames = read_history(run), _frames(run)
+    rows, frames = results.history(run), _frames(run)
     figures: Figures = {
         "finite": all(np.isfinite(column).all() for column in rows.values()) and frames[0] and surface_is_finite(run),
         "smallest_J": frames[1],
@@ -30,7 +28,7 @@ def survived(run: Path) -> Figures:
     if len(rows["time"]):
         figures |= {
             "steps": len(rows["time"]),
-            "growth": energy_growth(rows, moving_at_start="initial" in read_study(run)),
+            "growth": energy_growth(rows, moving_at_start="initial" in results.study(run)),
             "newton_max": int(rows["newton_its"].max()),
             "newton_mean": float(rows["newton_its"].mean()),
             "broken": int(rows["broken_edges"][-1]),
@@ -42,16 +40,16 @@ def survived(run: Path) -> Figures:
 
 def pulled(run: Path) -> Figures:
     """As `survived`, and the error of a uniaxial or confined stretch against its closed form."""
-    return survived(run) | closed_forms.stretch_error(read_study(run), read_history(run)) if run.exists() else {}
+    return survived(run) | closed_forms.stretch_error(results.study(run), results.history(run)) if run.exists() else {}
 
 
 def thrown(run: Path) -> Figures:
     """As `survived`, and the error of the momentum, p = F t with a dead load F on a free body, whatever breaks."""
     if not run.exists():
         return {}
-    study = read_study(run)
+    study = results.study(run)
     area, traction = np.prod(extremes.BAR["size"][1:]), np.array(study["boundary"][0]["traction"])
-    pieces = _columns(run / "pieces.csv")
+    pieces = results.columns(run / "pieces.csv")
     last = pieces["time"] == pieces["time"].max()
     momentum = np.array([(pieces["mass"] * pieces[f"velocity_{axis}"])[last].sum() for axis in "xyz"])
     exact = traction * area * pieces["time"].max()
@@ -62,8 +60,8 @@ def hung(run: Path) -> Figures:
     """As `survived`, and the error of the force at the support against the weight of the body."""
     if not run.exists():
         return {}
-    pieces, rows = _columns(run / "pieces.csv"), read_history(run)
-    weight = -pieces["mass"][pieces["time"] == 0].sum() * read_study(run)["load"]["gravity"][2]
+    pieces, rows = results.columns(run / "pieces.csv"), results.history(run)
+    weight = -pieces["mass"][pieces["time"] == 0].sum() * results.study(run)["load"]["gravity"][2]
     return survived(run) | {"error": float(abs(rows["reaction_grip_z"][-1] / weight - 1))}
 
 
@@ -71,7 +69,7 @@ def drifting(run: Path) -> Figures:
     """As `survived`, and what a body that no force acts on gains in momentum, over its mass times its fastest speed."""
     if not run.exists():
         return {}
-    start, pieces = read_study(run)["initial"].get("velocity", [0.0, 0.0, 0.0]), _columns(run / "pieces.csv")
+    start, pieces = results.study(run)["initial"].get("velocity", [0.0, 0.0, 0.0]), results.columns(run / "pieces.csv")
     last = pieces["time"] == pieces["time"].max()
     mass, v = pieces["mass"][last], np.stack([pieces[f"velocity_{axis}"][last] for axis in "xyz"])
     gained = v @ mass - mass.sum() * np.array(start)
@@ -79,23 +77,6 @@ def drifting(run: Path) -> Figures:
 
 
 # --- reading an output folder ---------------------------------------------------------------------------------------
-
-
-def read_history(run: Path) -> dict[str, Values]:
-    """history.csv by columns."""
-    return _columns(run / "history.csv")
-
-
-def _columns(path: Path) -> dict[str, Values]:
-    with path.open(newline="") as file:
-        rows = list(csv.reader(file))
-    table = np.array([[float(value) for value in row] for row in rows[1:]]).reshape(-1, len(rows[0]))
-    return dict(zip(rows[0], table.T, strict=True))
-
-
-def read_study(run: Path) -> dict[str, Any]:
-    """The study as it was run, every default written out."""
-    return tomllib.loads((run / "study.toml").read_text())
 
 
 def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:
