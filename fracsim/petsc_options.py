@@ -32,10 +32,15 @@ class OptionSet:
 
     def __init__(self, options: Options) -> None:
         self.prefix = f"fracsim{next(_prefixes)}_"
-        self._keys = list(options)
+        self._keys: list[str] = []
+        self.change(options)
+
+    def change(self, options: Options) -> None:
+        """Other values, or more options, for what is set up from now on."""
         database = PETSc.Options()
         for key, value in options.items():
             database[self.prefix + key] = str(value).lower() if isinstance(value, bool) else str(value)
+        self._keys += [key for key in options if key not in self._keys]
 
     def check(self, given: Options, set_up: Callable[[], None]) -> None:
         """InputError for an option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""

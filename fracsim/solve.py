@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from .domain import Domain
 from .equilibrium import Equilibrium
 from .errors import InputError
 from .petsc_options import Options, OptionSet, refusing
+from .preconditioner import MULTIGRID, Age, Preconditioner
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -27,19 +27,10 @@ DEFAULTS: Options = {
     "ksp_rtol": 1e-5,  # 1e-3 is no descent of the residual where a body is badly conditioned: a cantilever fails
     "ksp_max_it": 500,
 }
-MULTIGRID: Options = {
-    "pc_type": "gamg",
-    "pc_gamg_reuse_interpolation": True,
-    "mg_levels_ksp_type": "chebyshev",
-    "mg_levels_ksp_max_it": 2,
-    "mg_levels_pc_type": "jacobi",
-}
 
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
-# Multigrid is made anew where CG takes this many times the iterations that it took when it was made, and two more.
-WORN_BY = 1.3
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
 # dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
@@ -47,14 +38,6 @@ FACTORISED = 100_000
 
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
-
-
-class Age(IntEnum):
-    """State of the preconditioner."""
-
-    FRESH = 0
-    DATED = 1  # same coarse spaces, new operators
-    WORN = 2  # everything anew
 
 
 @dataclass(frozen=True)
@@ -68,12 +51,7 @@ class Outcome:
 
 
 class Solver:
-    """SNES on an `Equilibrium`, set up once and kept for the whole run.
-
-    The preconditioner is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a
-    Newton iteration. It is made anew where CG takes a third more iterations than when it was fresh (WORN_BY), and
-    refreshed (new coarse operators and smoothers on the same coarse spaces) after edges broke.
-    """
+    """SNES on an `Equilibrium`, set up once and kept for the whole run."""
 
     def __init__(self, equations: Equilibrium, given: Options) -> None:
         self.equations = equations
@@ -91,7 +69,10 @@ class Solver:
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
-        self._age, self._keep, self._fresh_its, self._first = Age.WORN, self._iterative, 0, 0.0
+        self._preconditioner = Preconditioner(
+            snes.ksp, equations.tangent, self._options, keep=self._iterative, may_change=_may_change(equations, given)
+        )
+        self._first = 0.0
 
     def _configure(self, given: Options) -> None:
         try:
@@ -112,9 +93,9 @@ class Solver:
         outcome = self._attempt(guess)
         if self._linear_failure(outcome):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
-            self._age, self._keep = Age.WORN, False
+            self._preconditioner.age, self._preconditioner.keep = Age.WORN, False
             outcome = self._attempt(guess)
-            self._keep = self._iterative
+            self._preconditioner.keep = self._iterative
         tired = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
         if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg" and not tired:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
@@ -140,18 +121,18 @@ class Solver:
         ksp.pc.reset()
         ksp.pc.setType("lu")
         ksp.pc.setFactorSolverType("mumps")
-        self._age, self._keep = Age.WORN, False
+        self._preconditioner.age, self._preconditioner.keep = Age.WORN, False
         outcome = self._attempt(guess)
         ksp.pc.reset()
         ksp.pc.setType(preconditioner)
         ksp.pc.setFromOptions()
         ksp.setType(kind)
-        self._age, self._keep = Age.WORN, True
+        self._preconditioner.age, self._preconditioner.keep = Age.WORN, True
         return outcome
 
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
-        self._age = max(self._age, Age.DATED)
+        self._preconditioner.damage_changed()
 
     def _linear_failure(self, outcome: Outcome) -> bool:
         return not outcome.converged and self.snes.ksp.reason < 0
@@ -180,25 +161,7 @@ class Solver:
 
     def _assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         self.equations.assemble_tangent(snes, x, A, P)
-        self._refresh(self.snes.ksp)
-
-    def _refresh(self, ksp: PETSc.KSP) -> None:
-        """Set the preconditioner up if it has aged. Done here, since SNES has no more than a fixed lag."""
-        if self._age == Age.FRESH:
-            self._fresh_its = self._fresh_its or ksp.its
-            self._age = Age.FRESH if self._keep else Age.DATED
-        # also where damage has dated it: coarse spaces from before a crack carry the motion of one side to the other
-        if self._fresh_its and ksp.its > WORN_BY * self._fresh_its + 2:
-            self._age = Age.WORN
-        if self._age == Age.FRESH:
-            return
-        if self._age == Age.WORN:
-            ksp.pc.reset()
-            self._fresh_its = 0
-        ksp.pc.setReusePreconditioner(False)
-        ksp.setOperators(self.equations.tangent)
-        ksp.setUp()
-        self._age = Age.FRESH
+        self._preconditioner.refresh()
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
@@ -239,6 +202,12 @@ def _chosen(equations: Equilibrium, given: Options) -> Options:
     if turned or (equations.forces.pressures and not equations.material.energy.linear):
         chosen |= {"ksp_type": "gmres"}  # the tangent of this or of a following pressure is not symmetric
     return chosen | given
+
+
+def _may_change(equations: Equilibrium, given: Options) -> bool:
+    """Whether multigrid of another kind may take over: nobody asked for this one, and inertia holds what hangs."""
+    own = not any(key.startswith(("pc_", "mg_")) for key in given)
+    return own and equations.scheme.inertia
 
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:

@@ -135,7 +135,8 @@ class Bare:
         from ..forms.balance import internal_work
         from ..forms.energies import NeoHookean, lame
         from ..kernels import jit_options
-        from ..solve import MULTIGRID, rigid_body_modes
+        from ..preconditioner import MULTIGRID
+        from ..solve import rigid_body_modes
 
         scene = study(n)
         V, mesh = domain.space, domain.mesh

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
-from fracsim.scene import build_scene
+from fracsim.scene import Scene, build_scene
+from fracsim.studies.evidence.growth import random_planes
 
 
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
@@ -23,12 +27,41 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
     scene = build_scene(MPI.COMM_SELF, data)
     state = scene.stepper.start(None)
     before = [scene.stepper.advance(state).outcome.krylov for _ in range(3)][-1]
-    graph = scene.fracture.graph
-    left = scene.domain.nodes[graph.edge_nodes][:, :, 0] < 0.31
-    graph.break_edges(left[:, 0] != left[:, 1])
-    assert scene.equations.chi is not None
-    scene.equations.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
-    assert scene.solver is not None
-    scene.solver.damage_changed()
+    cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])
     after = [scene.stepper.advance(state).outcome.krylov for _ in range(3)][-1]
-    assert graph.split.any() and after <= 1.25 * before + 2, f"{before} iterations before the crack, {after} after"
+    assert scene.fracture.graph.split.any()
+    assert after <= 1.25 * before + 2, f"{before} iterations before the crack, {after} after"
+
+
+def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
+    """Ten planes through a bar: CG takes a quarter less than with the aggregates of the whole body, which a user who
+    asks for them keeps."""
+    krylov = []
+    for given in ({}, {"pc_gamg_agg_nsmooths": 1}):
+        data = study(
+            BAR,
+            mesh={"size": [0.6, 0.2, 0.2], "h": 0.02},
+            material={"energy": "neo-hookean"},
+            fracture={"strength": 1e12},
+            time={"end": 1.0, "scheme": "backward-euler"},
+            solver={"snes_type": "ksponly", "ksp_rtol": 1e-6, **given},
+        )
+        scene = build_scene(MPI.COMM_SELF, data)
+        state = scene.stepper.start(None)
+        scene.stepper.advance(state)
+        cut(scene, random_planes(10, scene.domain.lower, scene.domain.upper))
+        krylov.append([scene.stepper.advance(state).outcome.krylov for _ in range(5)][-1])
+    assert krylov[0] < 0.85 * krylov[1], krylov
+
+
+def cut(scene: Scene, planes: list[Any]) -> None:
+    """Break all edges across the planes, and the cells that they come apart."""
+    graph = scene.fracture.graph
+    ends = scene.domain.nodes[graph.edge_nodes]
+    for normal, point in planes:
+        side = (ends - point) @ normal >= 0
+        graph.break_edges(side[:, 0] != side[:, 1])
+    graph.break_idle()
+    assert scene.equations.chi is not None and scene.solver is not None
+    scene.equations.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
+    scene.solver.damage_changed()
