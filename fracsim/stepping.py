@@ -66,11 +66,9 @@ class Stepper:
         if (drag := equations.viscous_force()) is not None:
             state.drag = drag
             unbalanced = unbalanced + drag
-        free = np.ones(len(unbalanced), bool)
-        free[equations.held] = False
-        if equations.scheme.inertia and self.timing.scheme != "backward-euler":
-            state.a = equations.inertia.solve(-unbalanced, free)
-        state.forces = equations.applied_force() + np.where(free, 0.0, unbalanced)
+        if equations.scheme.remembers:
+            state.a = equations.inertia.solve(-unbalanced, equations.free)
+        state.forces = equations.applied_force() + np.where(equations.free, 0.0, unbalanced)
 
     def advance(self, state: State) -> Report:
         """Take one step, as large as state.dt allows. Raises NotConverged at the smallest step."""
@@ -160,12 +158,13 @@ class Stepper:
     ) -> Report:
         equations = self.equations
         old, before = state.u, state.v
+        solved = equations.u.x.array[: len(old)].copy()
         state.u, state.v, state.a = self._arrive(state, dt)
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
         work, viscous = self._work(state, state.u - old, before)
         flowed = self._flow()
-        broken, released, elastic = self._break(state)
+        broken, released, elastic = self._break(state, solved)
         broken, released = broken + broken_before, released + released_before + flowed
         if not equations.scheme.inertia:
             # what is neither stored nor moving is gone: releases, and the body's relaxation after them
@@ -224,18 +223,40 @@ class Stepper:
         self.phases["plasticity"] = self.phases.get("plasticity", 0.0) + time.perf_counter() - began
         return lost
 
-    def _break(self, state: State) -> tuple[int, float, float]:
-        """(edges broken, energy released, elastic energy left) of the step; the energies on this rank, J."""
+    def _break(self, state: State, solved: Values) -> tuple[int, float, float]:
+        """(edges broken, energy released, elastic energy left) of the step; the energies on this rank, J.
+
+        `solved`: (owned dofs,) displacement at which the step's forces balance.
+        """
         began = time.perf_counter()
         if self.fracture is None:
             elastic = self.equations.elastic_energy()
             self.phases["energies"] += time.perf_counter() - began
             return 0, 0.0, elastic
+        damage = self.equations.internal.damage() if self.equations.scheme.remembers else []
         result = self.fracture()
         if result.broken:
+            if self.equations.scheme.remembers:
+                self._accelerate(state, solved, damage)
             self._release(state)
         self.phases["fracture"] += time.perf_counter() - began
         return result.broken, result.released, result.elastic
+
+    def _accelerate(self, state: State, solved: Values, damage: list[Values]) -> None:
+        """Take the forces that the breaks released off M a, which the next step starts from: they would push for a
+        part of it once more, with energy that is counted as dissipated.
+
+        At `solved`, where a balances them: the end of a step of generalized-alpha is an extrapolation, and far off
+        where a body is stiff (the pressure of a nearly incompressible one by lambda |grad du|^2). `damage`: as it was.
+        """
+        equations = self.equations
+        equations.displace(solved)
+        after = equations.internal_force()
+        damage = equations.internal.exchange_damage(damage)
+        released = equations.internal_force() - after
+        equations.internal.exchange_damage(damage)
+        equations.displace(state.u)
+        state.a = state.a + equations.inertia.solve(released, equations.free)
 
     def _release(self, state: State) -> None:
         """Reactions after the edges broke: the next step's work starts from them."""
