@@ -158,11 +158,11 @@ class Stepper:
     ) -> Report:
         equations = self.equations
         old, before = state.u, state.v
-        solved = equations.u.x.array[: len(old)].copy()
+        solved, acting = equations.u.x.array[: len(old)].copy(), self._acting()
         state.u, state.v, state.a = self._arrive(state, dt)
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
-        work, viscous = self._work(state, state.u - old, before)
+        work, viscous = self._work(state, state.u - old, before, *acting)
         flowed = self._flow()
         broken, released, elastic = self._break(state, solved)
         broken, released = broken + broken_before, released + released_before + flowed
@@ -191,26 +191,39 @@ class Stepper:
             equations.update_reactions()
         return u, v, a
 
-    def _work(self, state: State, increment: Values, v: Values) -> tuple[float, float]:
-        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in it.
+    def _acting(self) -> tuple[Values, Values | None]:
+        """(loads and reactions, damping forces) at the level of the step where they balance; (owned dofs,), N.
 
-        But for the inertia of prescribed dofs, whose velocity (`v` at the start) may jump: what moves them is the gain
-        of their kinetic energy.
+        Without the inertia of prescribed dofs where mass is lumped (`_work`).
         """
-        equations = self.equations
+        equations, held = self.equations, self.equations.held
         forces = equations.applied_force().copy()
-        held = equations.held
         forces[held] += equations.unbalanced[held]
-        drag = equations.viscous_force()
+        if self._lumped:
+            forces[held] -= equations.mass[held] * equations.rates()[1][held]
+        return forces, equations.viscous_force()
+
+    def _work(
+        self, state: State, increment: Values, v: Values, forces: Values, drag: Values | None
+    ) -> tuple[float, float]:
+        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in time.
+
+        Those of this step (`forces`, `drag`) belong to t + (1 - alpha_f) dt, those of the last one to t - alpha_f dt;
+        their line is taken at t + dt/2. Forces at the end of a step of generalized-alpha would not do, since they
+        balance nothing: the pressure of a nearly incompressible body is off there by lambda |grad du|^2.
+
+        The inertia of prescribed dofs, whose velocity (`v` at the start) may jump, is not among the forces: what moves
+        them is the gain of their kinetic energy.
+        """
+        late, held = self.equations.scheme.alpha_f, self.equations.held
         gained = 0.0
         if self._lumped:
-            mass = equations.mass[held]
-            forces[held] -= mass * state.a[held]
-            gained = 0.5 * float(mass @ (state.v[held] ** 2 - v[held] ** 2))
-        work = 0.5 * float((state.forces + forces) @ increment) + gained
+            gained = 0.5 * float(self.equations.mass[held] @ (state.v[held] ** 2 - v[held] ** 2))
+        work = float(((0.5 + late) * forces + (0.5 - late) * state.forces) @ increment) + gained
         viscous = 0.0
         if drag is not None:
-            viscous = 0.5 * float((drag + (state.drag if state.drag is not None else 0.0)) @ increment)
+            earlier = state.drag if state.drag is not None else 0.0
+            viscous = float(((0.5 + late) * drag + (0.5 - late) * earlier) @ increment)
         state.forces, state.drag = forces, drag
         return work, viscous
 
@@ -236,18 +249,31 @@ class Stepper:
         damage = self.equations.internal.damage() if self.equations.scheme.remembers else []
         result = self.fracture()
         if result.broken:
-            if self.equations.scheme.remembers:
-                self._accelerate(state, solved, damage)
-            self._release(state)
+            self._release(state, solved, damage)
         self.phases["fracture"] += time.perf_counter() - began
         return result.broken, result.released, result.elastic
 
-    def _accelerate(self, state: State, solved: Values, damage: list[Values]) -> None:
-        """Take the forces that the breaks released off M a, which the next step starts from: they would push for a
-        part of it once more, with energy that is counted as dissipated.
+    def _release(self, state: State, solved: Values, damage: list[Values]) -> None:
+        """What the broken edges no longer hold, of reactions and of M a: the next step starts from both.
 
-        At `solved`, where a balances them: the end of a step of generalized-alpha is an extrapolation, and far off
-        where a body is stiff (the pressure of a nearly incompressible one by lambda |grad du|^2). `damage`: as it was.
+        M a would push for a part of it once more, with energy that is counted as dissipated.
+        """
+        equations, held = self.equations, self.equations.held
+        before = equations.unbalanced[held]
+        equations.update_reactions()
+        if self.solver is not None:
+            self.solver.damage_changed()
+        if not equations.scheme.remembers:
+            state.forces[held] += equations.unbalanced[held] - before
+            return
+        released = self._released(state, solved, damage)
+        state.forces[held] -= released[held]
+        state.a = state.a + equations.inertia.solve(released, equations.free)
+
+    def _released(self, state: State, solved: Values, damage: list[Values]) -> Values:
+        """(owned dofs,) forces of the stress that breaks took away, N; `damage`: as it was before them.
+
+        At `solved`, where a balances them: the end of a step of generalized-alpha is an extrapolation (`_work`).
         """
         equations = self.equations
         equations.displace(solved)
@@ -256,16 +282,7 @@ class Stepper:
         released = equations.internal_force() - after
         equations.internal.exchange_damage(damage)
         equations.displace(state.u)
-        state.a = state.a + equations.inertia.solve(released, equations.free)
-
-    def _release(self, state: State) -> None:
-        """Reactions after the edges broke: the next step's work starts from them."""
-        equations, held = self.equations, self.equations.held
-        state.forces[held] -= equations.unbalanced[held]
-        equations.update_reactions()
-        if self.solver is not None:
-            self.solver.damage_changed()
-        state.forces[held] += equations.unbalanced[held]
+        return released
 
     def _grow(self, state: State) -> None:
         state.easy += 1
