@@ -104,7 +104,7 @@ def test_extremes_on_ranks(ranks: int, results: Callable[[int], Arrays]) -> None
         torn, alone = found[scheme], results(1)[scheme]
         assert torn[0] == 0 and torn[1] > 100
         assert torn[1] == alone[1]
-        assert torn[3] < 0.05 and torn[3] == pytest.approx(float(alone[3]), abs=1e-4)
+        assert torn[3] < 0.1 and torn[3] == pytest.approx(float(alone[3]), abs=1e-4)
     assert found["backward-euler"][2] == pytest.approx(float(results(1)["backward-euler"][2]), rel=1e-4)
     assert found["crushed"] == pytest.approx([192, -1.0, 1.0], rel=1e-6)
     assert found["flown"] == pytest.approx([0, 0.5 * 62.5 * 1e6], rel=1e-6)

@@ -436,18 +436,16 @@ def energy_gap(scheme: str, approach: str, dt: float) -> float:
     return float((report.kinetic + report.elastic + state.dissipated - state.work) / state.work)
 
 
+@pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha"))
 @pytest.mark.parametrize("approach", ("chi", "edge"))
-def test_energy_balance_of_dynamic_fracture(approach: str) -> None:
-    """The trapezoidal rule keeps the energy of a linear body between breaks, and a break takes from it what is counted
-    as dissipated: work = kinetic + elastic + dissipated at any step. Where the acceleration stays that of the stress
-    before the break, the next step is pushed by half of what was released: 1 % of the work at dt = 0.02.
-
-    generalized-alpha, whose forces balance inside the step, is of second order.
+def test_energy_balance_of_dynamic_fracture(scheme: str, approach: str) -> None:
+    """What a break takes from the body is what is counted as dissipated, work = kinetic + elastic + dissipated, with an
+    error that falls with dt^2 at least. Where the acceleration stays that of the stress before the break, the next step
+    is pushed by a part of what was released: first order, 1 % of the work at dt = 0.02 of the trapezoidal rule.
     """
-    for dt in (0.04, 0.02, 0.01):
-        assert abs(energy_gap("newmark", approach, dt)) < SOLVED
-    gaps = [abs(energy_gap("generalized-alpha", approach, dt)) for dt in (0.02, 0.01, 0.005)]
-    assert slopes(gaps)[-1] == pytest.approx(2, abs=0.2)
+    gaps = [abs(energy_gap(scheme, approach, dt)) for dt in (0.02, 0.01, 0.005)]
+    assert gaps[0] < 3e-5
+    assert slopes(gaps)[-1] > 1.8
 
 
 @pytest.mark.parametrize("dim", (2, 3))
