@@ -23,6 +23,7 @@ class Scheme(Protocol):
     inertia: ClassVar[bool]
     implicit: ClassVar[bool]
     rings: ClassVar[bool]  # a jump of a velocity that is prescribed by displacements does not die out
+    remembers: ClassVar[bool]  # a step goes on from the acceleration at its start
 
     @property
     def alpha_f(self) -> float: ...
@@ -42,6 +43,7 @@ class _AtTheEnd:
 
     implicit: ClassVar[bool] = True
     rings: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False
     alpha_f: ClassVar[float] = 0.0
 
     def finish(self: Any, dt: float, x: Array, u: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
@@ -92,6 +94,7 @@ class Newmark(_AtTheEnd):
     gamma: float = 0.5
     inertia: ClassVar[bool] = True
     rings: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
 
     def rates(self, dt: float) -> tuple[float, float]:
         """(1 / (beta dt^2), gamma / (beta dt))."""
@@ -115,6 +118,7 @@ class GeneralizedAlpha:
     rho: float = 0.8
     inertia: ClassVar[bool] = True
     rings: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
     implicit: ClassVar[bool] = True
 
     @property
@@ -163,6 +167,7 @@ class CentralDifference(_AtTheEnd):
 
     inertia: ClassVar[bool] = True
     implicit: ClassVar[bool] = False
+    remembers: ClassVar[bool] = True
 
     def rates(self, dt: float) -> tuple[float, float]:
         """(0, 1/dt): inertia is not part of the assembled forces."""

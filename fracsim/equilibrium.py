@@ -41,7 +41,7 @@ class Equilibrium:
         u: displacement (m), the unknown; u_n: the same at the start of the step (only with stiffness damping).
         internal: the stress, with the fields of damage: chi, integrity, energy and rotation are its own.
         inertia: the mass matrix.    mass: (owned dofs,) lumped mass of each dof, kg.
-        held: owned dofs whose motion is prescribed.
+        held: owned dofs whose motion is prescribed.    free: (owned dofs,) bool, all others.
         unbalanced: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
         external: (owned dofs,) dead loads, N.
     """
@@ -61,6 +61,8 @@ class Equilibrium:
         self.forces = Forces(domain, study, density)
         self._owned = domain.node_count * domain.dim
         self.held = self.motion.dofs[: self.motion.owned]
+        self.free = np.ones(self._owned, bool)
+        self.free[self.held] = False
         self._compile(study, density)
         self._make_vectors()
         self.inertia = self._make_mass(study, density)

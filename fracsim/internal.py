@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
@@ -22,6 +23,8 @@ from .forms.kinematics import deformation_gradient
 from .material import MaterialFields
 from .rotation import RotationField
 from .study import Fracture, Study
+
+Values = npt.NDArray[np.float64]
 
 # Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large
 # enough that the tangent stays regular (a condition number of 1e16 would not do).
@@ -76,6 +79,21 @@ class InternalForces:
         field = fem.Function(space, name=name)
         field.x.array[:] = 1.0
         return field
+
+    def damage(self) -> list[Values]:
+        """Copies of the values of chi and integrity, as far as there are any."""
+        return [field.x.array.copy() for field in self._fields]
+
+    def exchange_damage(self, values: list[Values]) -> list[Values]:
+        """Put in what `damage` has returned; returns what was there."""
+        found = self.damage()
+        for field, value in zip(self._fields, values, strict=True):
+            field.x.array[:] = value
+        return found
+
+    @property
+    def _fields(self) -> list[fem.Function]:
+        return [field for field in (self.chi, self.integrity) if field is not None]
 
     def _elastic_part(self) -> Any:
         """What the energy takes of F: all of it, or what plastic flow left (d x d)."""

@@ -130,6 +130,19 @@ class Solver:
         self._preconditioner.age, self._preconditioner.keep = Age.WORN, True
         return outcome
 
+    def yielding(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(owned dofs,) by how much the body at its present u yields to a force on free dofs in a step, linearly, m.
+
+        0 where the linear solve fails: near incompressibility tangents may be indefinite.
+        """
+        equations, ksp = self.equations, self.snes.ksp
+        b = equations.residual
+        b.array_w[:] = force
+        self._assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
+        ksp.setOperators(equations.tangent)
+        ksp.solve(b, self._correction)
+        return self._correction.array_r.copy() if ksp.reason > 0 else np.zeros_like(force)
+
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
         self._preconditioner.damage_changed()

@@ -20,6 +20,7 @@ class State:
         dissipated: energy lost to fracture and damping, J.    work: external work, J (both summed over ranks).
         easy: steps in a row that went without halving.
         elastic: elastic energy at t on this rank, J.
+        forces: loads and reactions where the last step balanced them, N.    drag: damping forces there, N.
     """
 
     u: Values
@@ -32,5 +33,5 @@ class State:
     work: float = 0.0
     easy: int = 0
     elastic: float = 0.0
-    forces: Values = field(default_factory=lambda: np.empty(0))  # loads and reactions at t, N
-    drag: Values | None = None  # damping forces at t, N
+    forces: Values = field(default_factory=lambda: np.empty(0))
+    drag: Values | None = None

@@ -128,7 +128,7 @@ def test_split_cells_keep_the_force_of_their_intact_edges() -> None:
 
 
 def test_energy_books_close_while_edges_break() -> None:
-    """Work = elastic + kinetic + dissipated to first order in dt, whatever sign a single release has."""
+    """Work = elastic + kinetic + dissipated to second order in dt, whatever sign a single release has."""
     gaps = []
     for dt in (0.02, 0.01):
         scene, state = make_scene(
@@ -141,7 +141,7 @@ def test_energy_books_close_while_edges_break() -> None:
         reports = march(scene, state)
         assert sum(report.broken for report in reports) > 0
         gaps.append(abs(state.work - state.dissipated - reports[-1].elastic - reports[-1].kinetic) / state.work)
-    assert gaps[1] < gaps[0] < 0.1
+    assert gaps[1] < gaps[0] / 3 < 1e-4  # 0.01 and more where breaks leave the acceleration as it was
 
 
 @pytest.mark.parametrize("energy", ("stvk", "neo-hookean"))

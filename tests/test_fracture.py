@@ -423,26 +423,29 @@ def cut(scene: Scene, x: float) -> None:
     scene.fracture()
 
 
-def test_energy_balance_of_dynamic_fracture() -> None:
-    """Trapezoidal rule: work = kinetic + elastic + dissipated while a bar is torn; the error falls with the step.
+def energy_gap(scheme: str, approach: str, dt: float) -> float:
+    """(kinetic + elastic + dissipated - work) / work of a bar torn by a grip that starts at once."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.05, 0.0]}],
+        fracture={"strength": 0.07, "approach": approach},
+        time={"scheme": scheme, "step": dt, "end": 2.4},
+    )
+    report = march(scene, state)[-1]
+    assert scene.fracture.graph.broken_count > 0
+    return float((report.kinetic + report.elastic + state.dissipated - state.work) / state.work)
 
-    A break leaves the acceleration of the step that it ended as it was before, so every break costs an imbalance of
-    the released nodal force times a displacement increment: first order in dt, half a per cent of the work at the last
-    step.
+
+@pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha"))
+@pytest.mark.parametrize("approach", ("chi", "edge"))
+def test_energy_balance_of_dynamic_fracture(scheme: str, approach: str) -> None:
+    """What a break takes from the body is what is counted as dissipated, work = kinetic + elastic + dissipated, with an
+    error that falls with dt^2 at least. Where the acceleration stays that of the stress before the break, the next step
+    is pushed by a part of what was released: first order, 1 % of the work at dt = 0.02 of the trapezoidal rule.
     """
-    errors = []
-    for dt in (0.04, 0.02, 0.01):
-        scene, state = make_scene(
-            mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
-            boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.05, 0.0]}],
-            fracture={"strength": 0.07},
-            time={"scheme": "newmark", "step": dt, "end": 2.4},
-        )
-        report = march(scene, state)[-1]
-        assert scene.fracture.graph.broken_count > 0
-        errors.append(abs(state.work - report.kinetic - report.elastic - state.dissipated) / state.work)
-    assert errors[-1] < 0.01
-    assert slopes(errors)[-1] == pytest.approx(1, abs=0.2)
+    gaps = [abs(energy_gap(scheme, approach, dt)) for dt in (0.02, 0.01, 0.005)]
+    assert gaps[0] < 3e-5
+    assert slopes(gaps)[-1] > 1.8
 
 
 @pytest.mark.parametrize("dim", (2, 3))
