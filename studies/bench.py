@@ -4,8 +4,8 @@
 
 A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
 steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
-solver options and the same policy for the preconditioner (made once: nothing in the body changes), so that the
-machine's moods hit both. Figures are medians over the steps.
+solver options, the same assembly of the tangent (fracsim.tangent) and the same policy for the preconditioner (made
+once: nothing in the body changes), so that the machine's moods hit both. Figures are medians over the steps.
 """
 
 from __future__ import annotations
@@ -137,6 +137,7 @@ class Bare:
         from ..kernels import jit_options
         from ..preconditioner import MULTIGRID
         from ..solve import rigid_body_modes
+        from ..tangent import Assembly
 
         scene = study(n)
         V, mesh = domain.space, domain.mesh
@@ -146,7 +147,8 @@ class Bare:
         w, dx = ufl.TestFunction(V), ufl.Measure("dx", domain=mesh)
         residual = internal_work(energy, self.u, w, dx)
         self.R = fem.form(residual, jit_options=jit_options())
-        self.K = fem.form(ufl.derivative(residual, self.u, ufl.TrialFunction(V)), jit_options=jit_options())
+        tangent = fem.form(ufl.derivative(residual, self.u, ufl.TrialFunction(V)), jit_options=jit_options())
+        self.assemble = Assembly(tangent)
         vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
         mass = fem_petsc.assemble_vector(fem.form(1000.0 * ufl.inner(fem.Constant(mesh, np.ones(3)), w) * vertex))
         mass.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
@@ -157,7 +159,7 @@ class Bare:
         self.bcs = [fem.dirichletbc(self.g, np.sort(np.concatenate([bottom, top])).astype(np.int32))]
         rows, owned = self.bcs[0].dof_indices()
         self.held = rows[:owned]
-        self.A, self.b = fem_petsc.create_matrix(self.K), fem_petsc.create_vector(self.R)
+        self.A, self.b = self.assemble.matrix, fem_petsc.create_vector(self.R)
         self.A.setNearNullSpace(rigid_body_modes(domain))
         self.diagonal, self.du = self.A.createVecLeft(), self.A.createVecLeft()
         self.ksp = PETSc.KSP().create(mesh.comm)
@@ -185,9 +187,7 @@ class Bare:
         rows = self.b.array_w
         rows += self.mass * (self.u.x.array[:n] - predicted) / self.dt**2 - self.weight
         rows[self.held] = 0.0
-        self.A.zeroEntries()
-        self.fem_petsc.assemble_matrix_mat(self.A, self.K, bcs=self.bcs)
-        self.A.assemble()
+        self.assemble(self.bcs)
         self.diagonal.array_w[:] = self.mass / self.dt**2
         self.A.setDiagonal(self.diagonal, PETSc.InsertMode.ADD)
         self.ksp.solve(self.b, self.du)

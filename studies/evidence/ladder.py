@@ -31,7 +31,12 @@ SHORT, LONG = 10, 20  # cells along a metre: 24k and 192k tetrahedra
 LIMIT = 1.05  # what the elastic bar may cost over the bare loop
 DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never stressed enough to break by itself
 FRACTURE_MODULES = ("fracture", "graph", "degrade", "strength", "edge_stress", "pieces", "record")
-OPTIONAL = (*FRACTURE_MODULES, "average", "surface", "forms.damage", "plasticity", "brittle", "picture", "report")
+PLASTIC_MODULES = ("plasticity", "forms.plasticity", "relaxation", "flow", "spectrum")
+OPTIONAL = (
+    *FRACTURE_MODULES, *PLASTIC_MODULES, "average", "surface", "forms.damage", "forms.closing", "edge_frequencies",
+    "brittle", "picture", "report",
+)  # fmt: skip
+YIELDING = 1.30  # what flow everywhere may cost over the elastic bar
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,11 @@ def rungs(n: int) -> dict[str, Rung]:
         "average": Rung(near, average),
         "average-cut": Rung(near, average, cut=True),
         "surface": Rung(DAMAGE | {"output": {"surface": True}}, (*FRACTURE_MODULES, "surface"), cut=True),
-        "plasticity": Rung({"plasticity": {"yield_stress": 2e4}}, ("plasticity",), needs="plasticity"),
+        # both with as many Newton iterations as they need; every cell yields after a few steps
+        "newton": Rung({"solver": None}),
+        "plasticity": Rung(
+            {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}, PLASTIC_MODULES, after="newton"
+        ),
         "brittle": Rung(
             DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, "brittle"), needs="brittle"
         ),
@@ -100,7 +109,9 @@ def rung_study(name: str, n: int) -> dict[str, Any]:
         data["boundary"] = [{"on": "bottom", "fix": "xy"}, {"on": "top", "velocity": [0.0, 1.0]}]
         data["load"] = {"gravity": [0.0, -9.81]}
     for key, table in rung.tables.items():
-        data[key] = data.get(key, {}) | table
+        data[key] = data.get(key, {}) | (table or {})
+        if table is None:
+            del data[key]
     return data
 
 
