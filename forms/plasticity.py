@@ -2,16 +2,14 @@
 within a step takes off the stress.
 
 F_p is 3 x 3 in 2D as well: under plane strain (F33 = 1) a body flows across the plane too. At the end of a step the
-elastic stretches flow back along their deviator (eq. 30, fracsim.flow). What balances in the step is the stress
-that this leaves, not the trial stress before it:
+elastic stretches flow back along their deviator (eq. 30, fracsim.flow). Where a step is solved with its own flow, what
+balances is the stress that this leaves, not the trial stress before it:
 
     tau = tau_t - beta s,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
 
-s = dev tau_t of the trial stress (F_p of the start of the step): `Implicit`. `Extrapolated` takes beta from the step
-before (IMPL-EX: Oliver, Huespe and Cante 2008), so that a step costs what an elastic one does. With neither, the trial
-stress balances, and that of a yielding bar is too high by 3 mu times the strain of a step (staggered). share is
-1 - exp(-nu dt) of the flow rate nu, softness 1 / (1 + K / (3 mu)) what hardening by K leaves of the return (Simo and
-Hughes 1998, box 3.1). The norms |s|, Y_s are of Cauchy stress.
+s = dev tau_t of the trial stress (F_p of the start of the step), share = 1 - exp(-nu dt) of the flow rate nu, softness
+1 / (1 + K / (3 mu)) what hardening by K leaves of the return (Simo and Hughes 1998, box 3.1). The norms |s|, Y_s are of
+Cauchy stress.
 """
 
 from __future__ import annotations
@@ -76,56 +74,9 @@ class Trial:
         return ufl.as_vector([*(self.measures()[k] for k in range(3)), *(stretch[k] for k in range(6))])
 
 
-class _Relaxation:
-    """Virtual work of the stress that flow leaves, tau = tau_t - beta s."""
-
-    energy: Plastic
-
-    def beta(self, trial: Trial) -> Expr:
-        """The part of the deviator that flow takes off, dimensionless."""
-        raise NotImplementedError
-
-    def work(self, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """int chi (tau_t - beta s) : grad w F^-1 dX in N m; grad w F_p^-1 is the variation of F_e."""
-        trial = Trial(self.energy, u, rotation)
-        return chi * ufl.inner(trial.P - self.beta(trial) * trial.s, self._part(w)) * dx(metadata=ONE_POINT)
-
-    def _held(self, trial: Trial, beta: Expr, u: Expr, v: Expr, w: Expr) -> Expr:
-        """Tangent at a beta that does not change: (1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)."""
-        of_v, of_w = self._part(v), self._part(w)
-        elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
-        kappa = self.energy.lmbda + 2 / 3 * self.energy.mu
-        return (1 - beta) * elastic + beta * kappa * ufl.inner(trial.pull, of_v) * ufl.inner(trial.pull, of_w)
-
-    def _part(self, field: Expr) -> Expr:
-        """grad field F_p^-1, 3 x 3."""
-        return embed(ufl.grad(field), 0.0) * self.energy.inverse
-
-
 @dataclass(frozen=True)
-class Extrapolated(_Relaxation):
-    """Virtual work and tangent with a beta known from the step before.
-
-    Attributes:
-        known: beta, a field.
-    """
-
-    energy: Plastic
-    known: Expr
-
-    def beta(self, trial: Trial) -> Expr:
-        """The one that is known."""
-        return self.known
-
-    def tangent(self, u: Expr, v: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """`_held`: an elastic body with a smaller shear modulus, but for terms as small as the elastic strain."""
-        trial = Trial(self.energy, u, rotation)
-        return chi * self._held(trial, self.known, u, v, w) * dx(metadata=ONE_POINT)
-
-
-@dataclass(frozen=True)
-class Implicit(_Relaxation):
-    """Virtual work and tangent with the flow of the step itself.
+class ImplicitFlow:
+    """Virtual work and tangent with flow within the step.
 
     Attributes:
         resistance: Y, the yield stress as it is now, Pa.
@@ -140,12 +91,13 @@ class Implicit(_Relaxation):
     share: Expr
     frobenius: bool
 
-    def beta(self, trial: Trial) -> Expr:
-        """share softness (1 - Y_s / |s|) past yield, 0 before it."""
-        return self._flow(trial)[0]
+    def work(self, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
+        """int chi (tau_t - beta s) : grad w F^-1 dX in N m; grad w F_p^-1 is the variation of F_e."""
+        trial = Trial(self.energy, u, rotation)
+        return chi * ufl.inner(trial.P - self._flow(trial)[0] * trial.s, self._part(w)) * dx(metadata=ONE_POINT)
 
     def tangent(self, u: Expr, v: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """Derivative of the work in direction v, with d tau_t = (2 mu dev + kappa I x I) : d(v) at small strain:
+        """Its derivative in direction v, for d tau_t = C : d with C = 2 mu dev + kappa I x I at small elastic strain:
 
             int chi [(1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)
                      - 2 mu share softness Y_s/|s| (n : d(v)) (n : d(w))] dX,    n = s / |s|,  d(v) = grad v F^-1.
@@ -155,12 +107,17 @@ class Implicit(_Relaxation):
         """
         trial, energy = Trial(self.energy, u, rotation), self.energy
         (beta, turning, rising), (of_v, of_w) = self._flow(trial), (self._part(field) for field in (v, w))
-        shapes = ufl.inner(trial.s, of_v) * ufl.inner(trial.s, of_w)
-        total = self._held(trial, beta, u, v, w) - 2 * energy.mu * turning * shapes
+        elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
+        kappa = energy.lmbda + 2 / 3 * energy.mu
+        volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.pull, trial.s))
+        total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes
         if self.frobenius:
-            kappa = energy.lmbda + 2 / 3 * energy.mu
             total -= rising * kappa * ufl.inner(trial.pull, of_v) * ufl.inner(trial.s, of_w)
         return chi * total * dx(metadata=ONE_POINT)
+
+    def _part(self, field: Expr) -> Expr:
+        """grad field F_p^-1, 3 x 3."""
+        return embed(ufl.grad(field), 0.0) * self.energy.inverse
 
     def _flow(self, trial: Trial) -> tuple[Expr, Expr, Expr]:
         """(beta, share softness Y_s/|s|^3, share softness 3 p / (Y_s |s|)), norms of tau, s in place of n."""

@@ -56,10 +56,10 @@ class ExplicitStepper(Stepper):
         self._by_edges = None
         super().settle(state)
 
-    def _release(self, state: State) -> None:
-        """Edges broke: reactions, and from here on other cells set the step."""
+    def _release(self, state: State, solved: Values, damage: list[Values]) -> None:
+        """Edges broke: from here on other cells set the step, too."""
         self._by_edges = None
-        super()._release(state)
+        super()._release(state, solved, damage)
 
     def _attempt(self, state: State, dt: float) -> Outcome:
         """u by v and a of the start, then a from the forces there."""

@@ -51,7 +51,6 @@ class Flow:
         assert plastic is not None
         self.plastic: Plasticity = plastic
         self._equations, domain = equations, equations.domain
-        self.inverse: Values = plastic.inverse.x.array.reshape(-1, 9)
         rotation = equations.rotation.field if equations.rotation is not None else None
         trial, of = Trial(plastic.energy, equations.u, rotation), (domain.comm, domain.mesh)
         self._state = CellExpression(*of, trial.state(), domain.cell_count)
@@ -64,21 +63,23 @@ class Flow:
 
     def __call__(self) -> float:
         """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
-        plastic, state = self.plastic, self._state()
+        plastic, dt = self.plastic, self.plastic.dt
+        self._put_back()
+        state = self._state()
         measure, Y = self.measured(state), plastic.resistance(plastic.strain)
         cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
-        self._before = cells, self.inverse[cells], plastic.strain[cells]
-        beta, lost, psi = np.zeros(len(cells)), 0.0, state[:, 2]
+        self._before = cells, plastic.rows[cells], plastic.strain[cells]
+        power, lost, psi = np.empty((6, len(cells))), 0.0, state[:, 2]
         if plastic.fraction > 0:
             for part in (slice(k, k + BLOCK) for k in range(0, len(cells), BLOCK)):
                 where = cells[part]
                 block = _Return(self, where, state[where], measure[where])
-                beta[part] = block.find()
+                power[:, part] = block.find()
                 lost += self._lost(block)
                 psi[where] = block.after[:, 2]
         self.stored = float(self._equations.domain.volumes @ psi)
-        if plastic.relaxation is not None:
-            plastic.relaxation.flowed(cells, beta, plastic.dt)
+        if plastic.relaxation is not None and dt:
+            plastic.relaxation.flowed(cells, power, dt)
         plastic.begin(0.0)
         if len(cells) and plastic.hardening:
             plastic.refresh()
@@ -88,10 +89,18 @@ class Flow:
         """Take the last flow back: the step will be solved again."""
         assert self._before is not None
         cells, inverse, strain = self._before
-        self.inverse[cells], self.plastic.strain[cells] = inverse, strain
+        self.plastic.rows[cells], self.plastic.strain[cells] = inverse, strain
         if self.plastic.relaxation is not None:
             self.plastic.relaxation.undo()
         self.plastic.refresh()
+
+    def _put_back(self) -> None:
+        """F_p of the step's start, in place of what it was solved with."""
+        if self.plastic.relaxation is None:
+            return
+        self.plastic.relaxation.begin(0.0, 0.0)
+        if self.plastic.relaxation.form is None and self._equations.rotation is not None:
+            self._equations.rotation.update()  # it was that of another F_e
 
     def measured(self, stress: Values) -> Values:
         """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
@@ -122,14 +131,14 @@ class _Return:
     def __init__(self, flow: Flow, cells: Cells, state: Values, measure: Values) -> None:
         self._flow, self.cells, self._measure = flow, cells, measure
         plastic = flow.plastic
-        self.alpha, self._start = plastic.strain[cells], np.ascontiguousarray(flow.inverse[cells].T)
+        self.alpha, self._start = plastic.strain[cells], np.ascontiguousarray(plastic.rows[cells].T)
         self.trial, self._C = state[:, :3], np.ascontiguousarray(state[:, 3:].T)
         self._values = eigenvalues(self._C)
         logs = np.log(self._values)
         self._logs = logs - logs.mean(axis=0)
         self.size = np.sqrt(np.sum(self._logs**2, axis=0) / 6)  # e is half the deviator of log C
         self._excess = measure - plastic.resistance(self.alpha, cells)
-        self.after = self.trial.copy()
+        self.after, self._power = self.trial.copy(), np.empty_like(self._C)
 
     @cached_property
     def J(self) -> Values:
@@ -137,7 +146,7 @@ class _Return:
         return np.sqrt(np.prod(self._values, axis=0))
 
     def find(self) -> Values:
-        """(n,) beta by the secant from beta = 0 and the root for a stress linear in beta; F_p is left with it.
+        """Let the cells flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
 
         Where the last two excesses promise that the next secant step is the root (errors of the secant multiply), it is
         taken and not looked at. A beta of 1 has no deviator left to relax: the Frobenius norm of a large pressure may
@@ -159,7 +168,7 @@ class _Return:
                 break
             before[live], g_before[live] = now, g
             live = _among(live, ~sure)
-        return self.beta
+        return self._power
 
     def _left(self, live: Any) -> Values:
         """What the excess of cells is above exp(-nu dt) of the old one, Pa, at their beta."""
@@ -181,7 +190,8 @@ class _Return:
     def _relax(self, cells: Any) -> None:
         """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
         power = deviatoric_power(self._C[:, cells], self._values[:, cells], self._logs[:, cells], -self.beta[cells] / 2)
-        self._flow.inverse[self.cells[cells]] = times(self._start[:, cells], power).T
+        self._flow.plastic.rows[self.cells[cells]] = times(self._start[:, cells], power).T
+        self._power[:, cells] = power
 
 
 def _among(cells: Any, mask: npt.NDArray[np.bool_]) -> Any:

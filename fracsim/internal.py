@@ -124,7 +124,7 @@ class InternalForces:
 
     @property
     def _relaxation(self) -> Any:
-        """Forms of a body that flows while a step is solved, None for all others."""
+        """Virtual work and tangent of a step that is solved with its own flow; None for all others."""
         plastic = self._material.plastic
         return plastic.relaxation.form if plastic is not None and plastic.relaxation is not None else None
 

@@ -26,7 +26,8 @@ class Plasticity:
     """What the cells remember of their flow.
 
     Attributes:
-        inverse: F_p^-1, DG0, 3 x 3.
+        inverse: F_p^-1, DG0, 3 x 3; while a step is solved, what `relaxation` puts in its place.
+        rows: (cells, 9) its values.
         strain: (cells,) accumulated plastic strain alpha.
         relaxation: what flow takes off the stress while a step is solved; None where flow only follows it.
         fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
@@ -41,6 +42,7 @@ class Plasticity:
         self._modulus: PerCell = 3 * material.mu
         self.strain = np.zeros(domain.cell_count)
         self.inverse = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (3, 3))), name="inverse plastic part")
+        self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: domain.cell_count]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
         # explicit steps know u before the stress is asked for: nothing need be extrapolated
@@ -51,7 +53,7 @@ class Plasticity:
     def _relaxation(self, domain: Domain, update: str) -> Relaxation | None:
         if update == "implicit":
             return Implicit(domain, self.energy, self.frobenius)
-        return Extrapolated(domain, self.energy) if update == "extrapolated" else None
+        return Extrapolated(self.rows) if update == "extrapolated" else None
 
     def resistance(self, strain: Values, cells: Cells | slice = slice(None)) -> Values:
         """Y = yield_stress + K alpha of cells with the given alpha, Pa; never below a small share of yield_stress."""
@@ -67,16 +69,17 @@ class Plasticity:
         self.relaxation.refresh(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
 
     def memory(self) -> Values:
-        """(cells, 10) F_p^-1 and alpha, for a checkpoint; with the pace of flow between them where it matters."""
-        pace = [self.relaxation.pace] if isinstance(self.relaxation, Extrapolated) else []
-        return np.column_stack([self.inverse.x.array.reshape(-1, 9)[: len(self.strain)], *pace, self.strain])
+        """(cells, 10) F_p^-1 and alpha, for a checkpoint; with six of the last flow between them where it matters."""
+        self.begin(0.0)  # a step that failed may have left another in its place
+        last = [self.relaxation.memory] if isinstance(self.relaxation, Extrapolated) else []
+        return np.column_stack([self.rows, *last, self.strain])
 
     def restore(self, memory: Values) -> None:
         """Take up what `memory` gave, whichever the update was."""
-        self.inverse.x.array.reshape(-1, 9)[: len(memory)] = memory[:, :9]
+        self.rows[:] = memory[:, :9]
         self.strain[:] = memory[:, -1]
         if isinstance(self.relaxation, Extrapolated) and memory.shape[1] > 10:
-            self.relaxation.pace[:] = memory[:, 9]
+            self.relaxation.memory = memory[:, 9:-1]
         self.refresh()
 
     def begin(self, dt: float) -> None:

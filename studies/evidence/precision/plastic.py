@@ -81,8 +81,8 @@ def _text(records: Records) -> str:
     return (
         "Stress at four times the strain at yield. Independent of the rate: the bilinear curve. Steps solved with "
         "their own flow (implicit) meet it at any size, steps solved with the flow of the step before (extrapolated) "
-        f"to second order, and steps whose flow follows them (staggered) to first. At a flow rate of {RATE:g} 1/s: the "
-        "curve plus the excess that the rate leaves. Theory: order 1 in dt."
+        "soon after flow has begun, and steps whose flow follows them (staggered) to first order. At a flow rate of "
+        f"{RATE:g} 1/s: the curve plus the excess that the rate leaves. Theory: order 1 in dt."
     )
 
 
