@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
@@ -89,6 +90,13 @@ class InternalForces:
     def factor(self) -> fem.Function | None:
         """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
         return self.chi if self.energy is self._material.energy else None
+
+    @property
+    def dead(self) -> npt.NDArray[np.bool_] | None:
+        """(owned cells,) flags of those without any stress, for ever; None where a broken cell keeps some of it."""
+        if self.factor is None or self._floor:
+            return None
+        return np.asarray(self.factor.x.array[: self._domain.cell_count] == 0)
 
     @property
     def stiffness_left(self) -> Any:
