@@ -67,10 +67,13 @@ class Chi:
         cells, lost = cells[changed], lost[changed]
         chi[cells] -= lost
         chi[cells[graph.split[cells]]] = 0.0
+        if not chi[cells].all():
+            self._equations.leave_out_dead_cells()
         return float(np.sum(self._volumes[cells] * lost * psi[cells]))
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""
+        self._equations.leave_out_dead_cells()
 
 
 class _Edges:

@@ -23,7 +23,7 @@ from .domain import Domain
 from .forms.balance import pressure_work, traction_work, viscous_work
 from .forms.schemes import Scheme
 from .internal import InternalForces
-from .kernels import compile_form
+from .kernels import CellForm, compile_form, over
 from .loads import Forces, Motion
 from .mass import ConsistentMass, LumpedMass, Mass
 from .material import MaterialFields, _coefficient
@@ -73,21 +73,23 @@ class Equilibrium:
 
     def _compile(self, study: Study, density: Any) -> None:
         domain, internal = self.domain, self.internal
-        w, dx = ufl.TestFunction(domain.space), ufl.Measure("dx", domain=domain.mesh)
+        w, dx = ufl.TestFunction(domain.space), over(domain.mesh, np.arange(domain.cell_count, dtype=np.int32))
         work = internal.work(w, dx)
-        self._internal_form, self._energy = compile_form(work), compile_form(internal.stored(dx))
+        self._internal_form, self._energy = CellForm(work), compile_form(internal.stored(dx))
         viscous, pressure = self._viscous(w, dx), self._pressure(w)
-        self._viscous_form = compile_form(viscous) if viscous else None
+        self._viscous_form = CellForm(viscous) if viscous else None
         self._pressure_form = compile_form(pressure) if pressure else None
         others = viscous + pressure
-        self._residual = compile_form(work + others)
-        near = ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, self._cells_at_supports())])(1)
-        self._reactions = compile_form(internal.work(w, near) + self._viscous(w, near) + pressure)
+        self._residual = CellForm(work + others)
+        near = over(domain.mesh, self._cells_at_supports())
+        self._reactions = CellForm(internal.work(w, near) + self._viscous(w, near) + pressure)
+        forms = self._internal_form, self._viscous_form, self._residual, self._reactions
+        self._of_stress = [form for form in forms if form is not None]
         if self.scheme.implicit:
             v = ufl.TrialFunction(domain.space)
-            tangent = internal.stiffness(v, w, dx)
-            whole = compile_form(tangent + (ufl.derivative(others, self.u, v) if others else 0))
-            self._assembly = Assembly(whole)
+            tangent = CellForm(internal.stiffness(v, w, dx) + (ufl.derivative(others, self.u, v) if others else 0))
+            self._of_stress.append(tangent)
+            self._assembly = Assembly(tangent)
             self.tangent = self._assembly.matrix
         self._dead = self._dead_loads(w, dx)
 
@@ -143,6 +145,19 @@ class Equilibrium:
         fem_petsc.assemble_vector(b, form)
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return b
+
+    def leave_out_dead_cells(self) -> None:
+        """Cells without stress are not integrated from here on: they would add zeros for ever (not collective)."""
+        dead = self.internal.dead
+        if dead is not None:
+            for form in self._of_stress:
+                form.leave_out(dead)
+
+    def exchange_damage(self, values: list[Values]) -> list[Values]:
+        """Put in what `internal.damage` has returned, and its living cells; returns what was there."""
+        found = self.internal.exchange_damage(values)
+        self.leave_out_dead_cells()
+        return found
 
     # --- a step ---
 

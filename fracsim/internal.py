@@ -109,6 +109,13 @@ class InternalForces:
         return self.chi if self.energy is self._material.energy else None
 
     @property
+    def dead(self) -> npt.NDArray[np.bool_] | None:
+        """(owned cells,) flags of those without any stress, for ever; None where a broken cell keeps some of it."""
+        if self.factor is None or self._floor:
+            return None
+        return np.asarray(self.factor.x.array[: self._domain.cell_count] == 0)
+
+    @property
     def stiffness_left(self) -> Any:
         """chi, 1 where there is none; in a quasi-static study with a floor, so that the tangent stays regular."""
         return self._floored(self.chi)

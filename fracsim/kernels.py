@@ -48,6 +48,39 @@ def compile_form(form: ufl.Form) -> fem.Form:
     return persistently(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
 
 
+class CellForm(fem.Form):
+    """A form over cells of `over`, some of which may be left out later: its kernels stay, and so do its facets.
+
+    fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a form
+    whose derivatives let one of them vanish.
+    """
+
+    def __init__(self, form: ufl.Form) -> None:
+        whole = compile_form(form)
+        super().__init__(whole._cpp_object, whole.ufcx_form, whole.code, whole.module)
+        self._whole: Any = whole._cpp_object
+        self._constants = [constant._cpp_object for constant in form.constants()]
+
+    def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
+        """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
+        module: Any = self.module
+        whole, cell = self._whole, fem.IntegralType.cell
+        domains = {
+            kind: [(number, whole.domains(kind, number).reshape(-1)) for number in whole.integral_ids(kind)]
+            for kind in whole.integral_types
+        }
+        domains[cell] = [(number, cells[~dead[cells]]) for number, cells in domains.get(cell, [])]
+        kernels = module.ffi.cast("uintptr_t", module.ffi.addressof(self.ufcx_form))
+        fields = whole.coefficients, self._constants
+        bind = fem.form_cpp_class(self.dtype)
+        self._cpp_object = bind(kernels, whole.function_spaces, *fields, domains, {}, whole.mesh)
+
+
+def over(mesh: Any, cells: npt.NDArray[np.int32]) -> ufl.Measure:
+    """Measure of the given owned cells."""
+    return ufl.Measure("dx", domain=mesh, subdomain_data=[(1, cells)])(1)
+
+
 def persistently[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
     """Compile; where an earlier process was killed while it compiled the same kernel, clear that away and do it again.
 

@@ -280,10 +280,10 @@ class Stepper:
         """
         equations = self.equations
         after = equations.internal_force()
-        damage = equations.internal.exchange_damage(damage)
+        damage = equations.exchange_damage(damage)
         released = equations.internal_force() - after
         change = self._acceleration(np.where(equations.free, released, 0.0))
-        equations.internal.exchange_damage(damage)
+        equations.exchange_damage(damage)
         return released, change
 
     def _acceleration(self, released: Values) -> Values:

@@ -184,6 +184,17 @@ def test_same_flow(results: Results, ranks: int) -> None:
     np.testing.assert_allclose(found, serial, atol=1e-6)
 
 
+@pytest.mark.parametrize("ranks", RANKS)
+def test_dead_cells_are_left_out(results: Results, ranks: int) -> None:
+    """Each rank leaves out its own, a third of all cells; residual and tangent are the same to the last bit."""
+    found, cells = results(ranks), len(mesh_named("3d").cells)
+    assert found["cells-with-dead"] == cells
+    assert found["cells-without-dead"] == cells - len(range(0, cells, 3))
+    for name in ("residual", "tangent"):
+        assert np.array_equal(found[f"{name}-without-dead"], found[f"{name}-with-dead"])
+        assert scale(found[f"{name}-with-dead"]) > 1e-3
+
+
 def test_the_runs_do_tear() -> None:
     """The comparisons mean something: there is a radius, there are ties, several schemes and energies."""
     assert {table["material"]["energy"] for table in RUNS.values()} == {"neo-hookean", "corotated", "linear"}

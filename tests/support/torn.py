@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx.fem import IntegralType
 from mpi4py import MPI
 
 from fracsim.average import NonlocalAverage
@@ -130,6 +131,38 @@ def edges(domain: Domain) -> Found:
     return found
 
 
+def weaken(scene: Scene) -> None:
+    """Give the cells a chi that follows from their place in the input: 0 in one of three, anything in the others."""
+    domain, chi = scene.domain, scene.equations.chi
+    assert chi is not None
+    chi.x.array[: domain.cell_count] = np.where(domain.cell_input % 3, np.cos(domain.cell_input) ** 2, 0.0)
+
+
+def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
+    """Owned cells that the residual is assembled over."""
+    return np.array(scene.equations._residual._cpp_object.domains(IntegralType.cell, 1))
+
+
+def dead_cells() -> Found:
+    """Residual and tangent of the damped block with its dead cells and without, and how many those are."""
+    scene, state = make_scene(**RUNS["block"])
+    domain, equations = scene.domain, scene.equations
+    equations.begin(0.05, 0.05, state.u, state.v, state.a)
+    equations.displace(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
+    weaken(scene)
+    x, y = equations.residual.duplicate(), equations.residual.duplicate()
+    x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
+    found: Found = {}
+    for name in ("with", "without"):
+        equations.assemble_tangent(None, x, equations.tangent, equations.tangent)
+        equations.tangent.mult(x, y)
+        found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
+        found[f"residual-{name}-dead"] = domain.gather_nodes(equations.forces_in_balance().reshape(-1, domain.dim))
+        found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
+        equations.leave_out_dead_cells()
+    return found
+
+
 def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) -> Found:
     """Everything that must not depend on the partition."""
     domain, found = scene.domain, {f"{name}-history": np.array(rows)}
@@ -216,6 +249,7 @@ def main(path: str) -> None:
         found |= pieces(label)
     for name in RUNS:
         found |= run(name)
+    found |= dead_cells()
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, **found)
 

@@ -1,0 +1,159 @@
+"""Cells that carry nothing any more are not integrated, and nothing but the time of a step tells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from cases import BAR, study
+from fracsim.kernels import CellForm
+from fracsim.relaxation import Extrapolated
+from fracsim.run import Run
+from fracsim.scene import Scene, build_scene
+from fracsim.state import State
+from support.reference import dense_tangent
+from support.scenes import Values, make_scene, march
+from support.torn import SOFT, integrated_cells, weaken
+
+SIDES = [
+    {"on": "left", "displacement": [0.1, "free", "free"]},
+    {"on": "right", "pressure": 0.2},
+    {"on": "top", "pressure": 0.1},
+]
+CASES: dict[str, dict[str, Any]] = {
+    # u is no coefficient of this tangent, but one of its form
+    "linear": {"material": SOFT | {"energy": "linear"}, "damping": {"stiffness": 0.2}},
+    "damped": {"material": SOFT | {"energy": "neo-hookean"}, "damping": {"mass": 0.1, "stiffness": 0.2}},
+    "rotated": {"material": SOFT | {"energy": "corotated"}},
+    "flowing": {
+        "material": SOFT | {"energy": "neo-hookean"}, "plasticity": {"yield_stress": 0.01, "update": "implicit"},
+    },
+    "extrapolated": {"material": SOFT | {"energy": "neo-hookean"}, "plasticity": {"yield_stress": 0.01}},
+}  # fmt: skip
+
+
+def damaged(case: str, dim: int, **tables: Any) -> tuple[Scene, State]:
+    """An unstructured body, loaded, deformed and flowing at random, with a third of its cells dead."""
+    sides = [{key: value[:dim] if isinstance(value, list) else value for key, value in side.items()} for side in SIDES]
+    mesh = {"builder": "box", "size": [1.0, 0.7, 0.6][:dim], "h": 0.2 if dim == 2 else 0.3, "pattern": "unstructured"}
+    scene, state = make_scene(**CASES[case] | {"mesh": mesh, "boundary": sides, "fracture": {"strength": 1e9}} | tables)
+    plastic = scene.equations.material.plastic
+    if plastic is not None and isinstance(plastic.relaxation, Extrapolated):
+        plastic.relaxation.memory = np.random.default_rng(4).uniform(0, 0.5, (scene.domain.cell_count, 6))
+    scene.equations.begin(0.1, 0.1, state.u, state.v, state.a)
+    scene.equations.displace(np.random.default_rng(5).uniform(-0.02, 0.02, len(state.u)))
+    weaken(scene)
+    return scene, state
+
+
+def forces(scene: Scene) -> list[Values]:
+    """Residual, forces of the stress, damping and reactions, copies."""
+    equations = scene.equations
+    drag = equations.viscous_force()
+    parts = [equations.forces_in_balance().copy(), equations.internal_force(), *([] if drag is None else [drag])]
+    equations.update_reactions()
+    return [*parts, equations.unbalanced.copy()]
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("case", CASES)
+def test_forces_and_tangent_without_dead_cells(case: str, dim: int) -> None:
+    """They only ever added zeros: not a bit changes, whatever carries the factor chi, facets and supports included."""
+    scene, _ = damaged(case, dim)
+    whole, tangent = forces(scene), dense_tangent(scene)
+    scene.equations.leave_out_dead_cells()
+    assert np.array_equal(integrated_cells(scene), np.flatnonzero(scene.equations.chi.x.array))
+    for after, before in zip(forces(scene), whole, strict=True):
+        np.testing.assert_array_equal(after, before)
+    np.testing.assert_array_equal(dense_tangent(scene), tangent)
+    assert np.abs(tangent).max() > 0.1
+
+
+def test_every_death_counts_from_all_cells() -> None:
+    """Bound again after more cells have died, and after chi was read from elsewhere."""
+    scene, _ = damaged("damped", 2)
+    equations, chi = scene.equations, scene.equations.chi.x.array
+    equations.leave_out_dead_cells()
+    chi[::2] = 0.0
+    equations.leave_out_dead_cells()
+    assert np.array_equal(integrated_cells(scene), np.flatnonzero(chi))
+    chi[:] = 0.5
+    equations.leave_out_dead_cells()
+    assert len(integrated_cells(scene)) == len(chi)
+
+
+@pytest.mark.parametrize(
+    "tables",
+    (
+        {"fracture": {"strength": 1e9, "unilateral": True}},
+        {"fracture": {"strength": 1e9, "approach": "edge"}},
+        {"time": {"scheme": "quasi-static", "step": 0.1, "end": 1.0}, "boundary": [{"on": "left", "fix": "xy"}]},
+    ),
+    ids=("closing", "edge", "quasi-static"),
+)
+def test_cells_that_keep_something_stay(tables: dict[str, Any]) -> None:
+    """Springs of cracks, projected strains, and the floor of a quasi-static study."""
+    scene, _ = make_scene(**{"fracture": {"strength": 1e9}} | tables)
+    if scene.equations.chi is not None:
+        scene.equations.chi.x.array[:] = 0.0
+    scene.equations.leave_out_dead_cells()
+    assert len(integrated_cells(scene)) == scene.domain.cell_count
+
+
+@pytest.mark.parametrize("strength", (0.05, 1e9), ids=("torn", "whole"))
+def test_cells_are_left_out_as_they_die_and_not_before(monkeypatch: pytest.MonkeyPatch, strength: float) -> None:
+    """A scene where nothing breaks never binds a form again; in a torn one just the living cells are integrated."""
+    bound = []
+    leave_out = CellForm.leave_out
+    monkeypatch.setattr(CellForm, "leave_out", lambda form, dead: bound.append(1) or leave_out(form, dead))
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1, "pattern": "unstructured"},
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.0]}],
+        fracture={"strength": strength},
+    )
+    march(scene, state)
+    living = np.flatnonzero(scene.equations.chi.x.array)
+    assert np.array_equal(integrated_cells(scene), living)
+    assert bool(bound) == (len(living) < scene.domain.cell_count) == (strength < 1)
+
+
+@pytest.mark.parametrize("solver", ({}, {"ksp_type": "preonly", "pc_type": "lu"}), ids=("multigrid", "direct"))
+@pytest.mark.parametrize("scheme", ("newmark", "explicit"))
+def test_dust_falls(scheme: str, solver: dict[str, Any]) -> None:
+    """With every edge broken no cell is left: each node falls by g t^2 / 2, which both schemes have exactly."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25},
+        material=SOFT | {"energy": "neo-hookean"},
+        fracture={"strength": 1e9},
+        load={"gravity": [0.0, -9.81]},
+        time={"scheme": scheme, "step": 0.01, "end": 0.1},
+        solver={} if scheme == "explicit" else solver,
+    )
+    graph = scene.fracture.graph
+    graph.break_edges(np.ones(len(graph.broken), bool))
+    values = scene.fracture._evaluate()
+    scene.fracture.degradation(True, values[:, :-1], values[:, -1])
+    assert len(integrated_cells(scene)) == 0
+    march(scene, state)
+    fallen = state.u.reshape(-1, 2) - [0.0, -9.81 * 0.1**2 / 2]
+    np.testing.assert_allclose(fallen, 0.0, atol=1e-9)
+
+
+def test_a_restart_leaves_the_same_cells_out(tmp_path: Path) -> None:
+    """chi of a checkpoint binds the forms before the first step."""
+    data = study(BAR, time={"scheme": "backward-euler"}, fracture={"strength": 1e9})
+    going = Run(build_scene(MPI.COMM_SELF, data), tmp_path)
+    graph = going._graph
+    graph.break_edges(np.random.default_rng(3).uniform(size=len(graph.broken)) < 0.6)
+    values = going.scene.fracture._evaluate()
+    going.scene.fracture.degradation(True, values[:, :-1], values[:, -1])
+    going._note_breaks()
+    going._checkpoint()
+    again = Run(build_scene(MPI.COMM_SELF, data), tmp_path, restart=True)
+    living = integrated_cells(again.scene)
+    assert np.array_equal(living, integrated_cells(going.scene))
+    assert 0 < len(living) < going.scene.domain.cell_count
