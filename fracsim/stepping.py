@@ -13,9 +13,11 @@ from .equilibrium import Equilibrium, driven
 from .errors import NotConverged
 from .laws import of_size
 from .parallel import total
+from .release import release
 from .solve import Outcome, Solver
 from .state import State
 from .study import Initial, Time
+from .work import acting, work_done
 
 Values = npt.NDArray[np.float64]
 
@@ -158,11 +160,11 @@ class Stepper:
     ) -> Report:
         equations = self.equations
         old, before = state.u, state.v
-        solved, acting = equations.u.x.array[: len(old)].copy(), self._acting()
+        solved, forces = equations.u.x.array[: len(old)].copy(), acting(equations, self._lumped)
         state.u, state.v, state.a = self._arrive(state, dt)
         self._before, self._last_dt = old, dt
         state.t, state.step = state.t + dt, state.step + 1
-        work, viscous = self._work(state, state.u - old, before, *acting)
+        work, viscous = work_done(equations, state, state.u - old, before, *forces, lumped=self._lumped)
         flowed = self._flow()
         broken, released, elastic = self._break(state, solved)
         broken, released = broken + broken_before, released + released_before + flowed
@@ -191,42 +193,6 @@ class Stepper:
             equations.update_reactions()
         return u, v, a
 
-    def _acting(self) -> tuple[Values, Values | None]:
-        """(loads and reactions, damping forces) at the level of the step where they balance; (owned dofs,), N.
-
-        Without the inertia of prescribed dofs where mass is lumped (`_work`).
-        """
-        equations, held = self.equations, self.equations.held
-        forces = equations.applied_force().copy()
-        forces[held] += equations.unbalanced[held]
-        if self._lumped:
-            forces[held] -= equations.mass[held] * equations.rates()[1][held]
-        return forces, equations.viscous_force()
-
-    def _work(
-        self, state: State, increment: Values, v: Values, forces: Values, drag: Values | None
-    ) -> tuple[float, float]:
-        """External work and viscous dissipation of the step on this rank, J, with forces that change linearly in time.
-
-        Those of this step (`forces`, `drag`) belong to t + (1 - alpha_f) dt, those of the last one to t - alpha_f dt;
-        their line is taken at t + dt/2. Forces at the end of a step of generalized-alpha would not do, since they
-        balance nothing: the pressure of a nearly incompressible body is off there by lambda |grad du|^2.
-
-        The inertia of prescribed dofs, whose velocity (`v` at the start) may jump, is not among the forces: what moves
-        them is the gain of their kinetic energy.
-        """
-        late, held = self.equations.scheme.alpha_f, self.equations.held
-        gained = 0.0
-        if self._lumped:
-            gained = 0.5 * float(self.equations.mass[held] @ (state.v[held] ** 2 - v[held] ** 2))
-        work = float(((0.5 + late) * forces + (0.5 - late) * state.forces) @ increment) + gained
-        viscous = 0.0
-        if drag is not None:
-            earlier = state.drag if state.drag is not None else 0.0
-            viscous = float(((0.5 + late) * drag + (0.5 - late) * earlier) @ increment)
-        state.forces, state.drag = forces, drag
-        return work, viscous
-
     def _flow(self) -> float:
         """Let the body flow, once it has arrived; returns the energy lost to it on this rank, J."""
         if self.flow is None:
@@ -254,48 +220,9 @@ class Stepper:
         return result.broken, result.released, result.elastic
 
     def _release(self, state: State, solved: Values, damage: list[Values]) -> None:
-        """What the broken edges no longer hold, of reactions and of M a: the next step starts from both.
-
-        M a would push for a part of it once more, with energy that is counted as dissipated. Forces are those at
-        `solved`, where a balances them: the end of a step of generalized-alpha is an extrapolation (`_work`).
-        """
-        equations, held = self.equations, self.equations.held
-        before = equations.unbalanced[held]
-        equations.update_reactions()
-        if equations.scheme.remembers:
-            equations.displace(solved)
-            released, change = self._change(damage)
-            equations.displace(state.u)
-            state.forces[held] -= released[held]
-            state.a = state.a + change
-        else:
-            state.forces[held] += equations.unbalanced[held] - before
+        release(self.equations, self.solver, state, solved, damage)
         if self.solver is not None:
             self.solver.damage_changed()
-
-    def _change(self, damage: list[Values]) -> tuple[Values, Values]:
-        """(forces of the stress that breaks took away, N; what that adds to a, m/s^2) at the present displacement.
-
-        `damage`: as it was before the breaks.
-        """
-        equations = self.equations
-        after = equations.internal_force()
-        damage = equations.exchange_damage(damage)
-        released = equations.internal_force() - after
-        change = self._acceleration(np.where(equations.free, released, 0.0))
-        equations.exchange_damage(damage)
-        return released, change
-
-    def _acceleration(self, released: Values) -> Values:
-        """(owned dofs,) what forces released at the start of a step add to a, m/s^2.
-
-        c_a (c_a M + K)^-1 f, K of the body before the breaks: M^-1 f for motion that steps resolve, with an error of
-        second order, and as good as nothing for what is over long before the step's end. M^-1 f itself, or K after
-        the breaks, sets slivers and cells that hang by an edge ringing: energy that was kept to 1 % then doubled.
-        """
-        if self.solver is None:  # explicit steps resolve all motion
-            return self.equations.inertia.solve(released, self.equations.free)
-        return self.equations.c_a * self.solver.yielding(released)
 
     def _grow(self, state: State) -> None:
         state.easy += 1
