@@ -125,14 +125,15 @@ def _peak_memory() -> float:
 class Bare:
     """Assemble, solve, move on: the same scene in DOLFINx and PETSc alone."""
 
-    def __init__(self, n: int, domain: Any) -> None:
+    def __init__(self, n: int, domain: Any, records: bool = False) -> None:
+        """`records`: evaluate the elastic energy of each step, too, as every run does for history.csv."""
         import numpy as np
         import ufl
         from dolfinx import fem
         from dolfinx.fem import petsc as fem_petsc
         from petsc4py import PETSc
 
-        from ..forms.balance import internal_work
+        from ..forms.balance import elastic_energy, internal_work
         from ..forms.energies import NeoHookean, lame
         from ..kernels import jit_options
         from ..preconditioner import MULTIGRID
@@ -149,6 +150,10 @@ class Bare:
         self.R = fem.form(residual, jit_options=jit_options())
         tangent = fem.form(ufl.derivative(residual, self.u, ufl.TrialFunction(V)), jit_options=jit_options())
         self.assemble = Assembly(tangent)
+        self.integrate = fem.assemble_scalar
+        self.stored: Any = None
+        if records:
+            self.stored = fem.form(elastic_energy(energy, self.u, dx), jit_options=jit_options())
         vertex = dx(metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
         mass = fem_petsc.assemble_vector(fem.form(1000.0 * ufl.inner(fem.Constant(mesh, np.ones(3)), w) * vertex))
         mass.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
@@ -196,6 +201,8 @@ class Bare:
         self.u.x.scatter_forward()
         self.v = (self.u.x.array[:n] - self.u_n) / self.dt
         self.u_n = self.u.x.array[:n].copy()
+        if self.stored is not None:
+            self.energy = self.integrate(self.stored)
 
 
 # --- all cases ------------------------------------------------------------------------------------------------------

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import json
+import os
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +20,7 @@ from ...report.machine import machine, programs
 from .runner import fingerprint, run_trial
 from .trial import Trial
 
+UNTIMED = ("stability", "dependence")  # what counts there is not time: runs of one rank go two at a time
 GROUPS = ("precision", "stability", "ladder", "growth", "dependence")
 Records = list[dict[str, Any]]
 
@@ -43,14 +47,18 @@ def _exists(group: str) -> bool:
 def _run(group: str, trials: list[Trial], out: Path, full: bool) -> Records:
     """Records of a group; of the long trials only those that are there already, unless `full`."""
     chosen = [trial for trial in trials if full or not trial.full or recorded(trial, out)]
-    began, records, spent = time.monotonic(), [], 0.0
-    for number, trial in enumerate(chosen, 1):
-        record = run_trial(trial, out)
-        records.append(record)
-        spent += sum(record["wall"])
-        left = spent / number * (len(chosen) - number)
-        line = f"{group} {number}/{len(chosen)} {trial.case}/{trial.name}: {record['outcome']}"
+    began, number = time.monotonic(), itertools.count(1)
+
+    def run(trial: Trial) -> dict[str, Any]:
+        record, done = run_trial(trial, out), next(number)
+        left = (time.monotonic() - began) / done * (len(chosen) - done)
+        line = f"{group} {done}/{len(chosen)} {trial.case}/{trial.name}: {record['outcome']}"
         print(f"{line}, {record['wall'][-1]:.1f} s, about {left:.0f} s left in the group", flush=True)
+        return record
+
+    with ThreadPoolExecutor(2 if group in UNTIMED and (os.cpu_count() or 1) > 1 else 1) as pool:
+        alone = [pool.submit(run, trial) if trial.ranks == 1 else None for trial in chosen]
+    records = [one.result() if one is not None else run(trial) for one, trial in zip(alone, chosen, strict=True)]
     print(f"{group}: {time.monotonic() - began:.0f} s", flush=True)
     return records
 

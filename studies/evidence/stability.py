@@ -214,7 +214,7 @@ def sections(records: list[Record]) -> list[Section]:
         "the error is that of a force, a momentum or a weight known in closed form (homogeneous stretch, dead load on "
         "a free body); the smallest J is that of the cells that still carry. `stable` means finite, and no energy "
         "from nowhere, where no closed form is known; `warned` means that the run says that its "
-        "result is not to be trusted and why. Each row was run on 1 and on 2 ranks."
+        "result is not to be trusted and why. Each row was run on 1 and on 2 ranks, those on 1 two at a time."
     )
     found = [record for record in records if record["case"] == "failed"]
     first = Section("Stability", text, claims=_claims(table), tables=(_table(table),))
