@@ -61,7 +61,7 @@ class Plasticity:
         return np.maximum(start + self.hardening * strain, WEAKEST * start)
 
     def refresh(self) -> None:
-        """What the relaxation has to know of `strain`."""
+        """What flow within a step has to know of `strain`."""
         if not isinstance(self.relaxation, Implicit):
             return
         Y = self.resistance(self.strain)

@@ -36,9 +36,6 @@ class Relaxation(Protocol):
     def begin(self, dt: float, fraction: float) -> None:
         """A step of dt is to be solved whose flow makes `fraction` of the return; zeros: it is done."""
 
-    def refresh(self, resistance: Values, softness: Values) -> None:
-        """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the cells as they are now."""
-
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
         """`cells` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
 
@@ -59,7 +56,7 @@ class Implicit:
         self._share.value = fraction
 
     def refresh(self, resistance: Values, softness: Values) -> None:
-        """Fields of the form."""
+        """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the cells as they are now."""
         self._resistance.x.array[: len(resistance)] = resistance
         self._softness.x.array[: len(softness)] = softness
 
@@ -96,9 +93,6 @@ class Extrapolated:
             self._held = np.ascontiguousarray(self._inverse[self._cells].T)
         longest = MOST / np.maximum(np.sqrt(WEIGHTS @ self._rate**2), MOST / dt)
         self._inverse[self._cells] = times(self._held, UNIT + longest * self._rate).T
-
-    def refresh(self, resistance: Values, softness: Values) -> None:
-        """Neither counts before the step is solved."""
 
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
         """The rate of the step."""

@@ -81,7 +81,8 @@ from fracsim.scene import build_scene
 scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
 Run(scene, Path({str(tmp_path / "out")!r}))()
 parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")
-parts += ("plasticity", "spectrum", "forms.plasticity", "edge_frequencies", "forms.closing", "forms.damage")
+parts += ("plasticity", "relaxation", "flow", "spectrum", "forms.plasticity")
+parts += ("edge_frequencies", "forms.closing", "forms.damage")
 print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

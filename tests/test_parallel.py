@@ -176,10 +176,11 @@ def test_same_motion(results: Results, ranks: int, name: str, quantity: str) -> 
         np.testing.assert_allclose(found[..., column], serial[..., column], atol=1e-7 * scale(serial[..., column]))
 
 
+@pytest.mark.parametrize("name", ("ductile", "ductile-implicit"))
 @pytest.mark.parametrize("ranks", RANKS[1:])
-def test_same_flow(results: Results, ranks: int) -> None:
+def test_same_flow(results: Results, ranks: int, name: str) -> None:
     """F_p and the accumulated plastic strain of every cell, some tens of which have flowed (atol: as of the motion)."""
-    found, serial = results(ranks)["ductile-plastic"], results(1)["ductile-plastic"]
+    found, serial = results(ranks)[f"{name}-plastic"], results(1)[f"{name}-plastic"]
     assert np.count_nonzero(np.asarray(serial[:, -1], float) > 0.01) > 20
     np.testing.assert_allclose(found, serial, atol=1e-6)
 

@@ -143,7 +143,7 @@ def test_an_extrapolated_bar_overshoots_where_flow_begins_and_then_catches_up() 
 
 
 def test_extrapolated_flow_follows_a_change_of_step() -> None:
-    """The pace is per second: beta of another step would leave 3 mu d / 2, 5 to 15 % of the stress."""
+    """Flow goes on at its rate per second: that of another step would leave 3 mu d / 2, 5 to 15 % of the stress."""
     scene, state = pulled([0, 8 * TINY], 40, "corotated", update="extrapolated", hardening=0.1)
     march(scene, state, 20)
     for dt in (1 / 80, 1 / 20):

@@ -228,6 +228,8 @@ RUNS: dict[str, dict[str, Any]] = {
         "probe": [{"name": "grip", "on": "right"}],
     },
 }  # fmt: skip
+# the same, each step solved with its own flow
+RUNS["ductile-implicit"] = RUNS["ductile"] | {"plasticity": RUNS["ductile"]["plasticity"] | {"update": "implicit"}}
 
 
 def run(name: str) -> Found:
