@@ -90,7 +90,6 @@ class Equilibrium:
             tangent = CellForm(internal.stiffness(v, w, dx) + (ufl.derivative(others, self.u, v) if others else 0))
             self._of_stress.append(tangent)
             self._assembly = Assembly(tangent)
-            self.tangent = self._assembly.matrix
         self._dead = self._dead_loads(w, dx)
 
     def _viscous(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
@@ -152,6 +151,17 @@ class Equilibrium:
         if dead is not None:
             for form in self._of_stress:
                 form.leave_out(dead)
+
+    @property
+    def tangent(self) -> PETSc.Mat:
+        """The matrix of K, until `fit_tangent` makes another."""
+        return self._assembly.matrix
+
+    def fit_tangent(self, share: float) -> bool:
+        """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a
+        new matrix (collective)."""
+        dead = self.internal.dead
+        return dead is not None and self.inertia.diagonal and self._assembly.fit(dead, share)
 
     def exchange_damage(self, values: list[Values]) -> list[Values]:
         """Put in what `internal.damage` has returned, and its living cells; returns what was there."""

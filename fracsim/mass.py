@@ -25,6 +25,7 @@ class Mass(Protocol):
     """What the equations need of a mass matrix; values are those of the owned dofs."""
 
     lumped: Values  # kg, of each dof
+    diagonal: bool  # whether it is the lumped one; the other also couples the nodes of dead cells
 
     def times(self, values: Values) -> Values:
         """M a."""
@@ -38,6 +39,8 @@ class Mass(Protocol):
 
 class LumpedMass:
     """M as a diagonal: int rho w at the vertices."""
+
+    diagonal = True
 
     def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec) -> None:
         self.lumped = lumped_mass(domain, density)
@@ -59,6 +62,8 @@ class LumpedMass:
 
 class ConsistentMass:
     """M = int rho u . w as a matrix."""
+
+    diagonal = False
 
     def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec, bcs: list[fem.DirichletBC]) -> None:
         self.lumped = lumped_mass(domain, density)

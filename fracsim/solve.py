@@ -36,6 +36,10 @@ RESTART = 200
 # dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
 FACTORISED = 100_000
 
+# A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
+# preconditioner is made anew anyhow, every dead cell goes.
+ROOMY = 0.9
+
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -60,9 +64,8 @@ class Solver:
         snes = self.snes = PETSc.SNES().create(equations.domain.comm)
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(equations.assemble_residual, equations.residual)
-        snes.setJacobian(self._assemble_tangent, equations.tangent, equations.tangent)
-        if chosen["pc_type"] in ("gamg", "ml", "hypre"):
-            equations.tangent.setNearNullSpace(rigid_body_modes(equations.domain))
+        self._near_null = rigid_body_modes(equations.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
+        self._take_tangent()
         self._x, self._correction = equations.residual.duplicate(), equations.residual.duplicate()
         self._configure(given)
         snes.setConvergenceTest(self._converged)
@@ -70,9 +73,25 @@ class Solver:
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
-            snes.ksp, equations.tangent, self._options, keep=self._iterative, may_change=_may_change(equations, given)
+            snes.ksp, self._options, keep=self._iterative, may_change=_may_change(equations, given)
         )
         self._first = 0.0
+
+    def _take_tangent(self) -> None:
+        """Solve with the matrix that the equations have now."""
+        tangent = self.equations.tangent
+        self.snes.setJacobian(self._assemble_tangent, tangent, tangent)
+        if self._near_null is not None:
+            tangent.setNearNullSpace(self._near_null)
+
+    def _fit(self) -> None:
+        """Where the body was damaged, see whether a smaller tangent does (collective)."""
+        preconditioner = self._preconditioner
+        preconditioner.look()
+        worn = preconditioner.age == Age.WORN
+        if preconditioner.age != Age.FRESH and self.equations.fit_tangent(1.0 if worn else ROOMY):
+            self._take_tangent()
+            preconditioner.age = Age.WORN
 
     def _configure(self, given: Options) -> None:
         try:
@@ -136,6 +155,7 @@ class Solver:
         0 where the linear solve fails: near incompressibility tangents may be indefinite.
         """
         equations, ksp = self.equations, self.snes.ksp
+        self._fit()
         b = equations.residual
         b.array_w[:] = force
         self._assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
@@ -151,6 +171,7 @@ class Solver:
         return not outcome.converged and self.snes.ksp.reason < 0
 
     def _attempt(self, guess: npt.NDArray[np.float64]) -> Outcome:
+        self._fit()
         self._x.array_w[:] = guess
         extended = self._extend() if self.equations.largest_gap(guess) > LARGE_GAP else 0
         self.snes.solve(None, self._x)
@@ -174,7 +195,7 @@ class Solver:
 
     def _assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         self.equations.assemble_tangent(snes, x, A, P)
-        self._preconditioner.refresh()
+        self._preconditioner.refresh(P)
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")

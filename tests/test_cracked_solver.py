@@ -34,13 +34,13 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
 
 
 def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
-    """Ten planes through a bar: CG takes a quarter less than with the aggregates of the whole body, which a user who
+    """Ten planes through a bar: CG takes a sixth less than with the aggregates of the whole body, which a user who
     asks for them keeps."""
     krylov = []
     for given in ({}, {"pc_gamg_agg_nsmooths": 1}):
         data = study(
             BAR,
-            mesh={"size": [0.6, 0.2, 0.2], "h": 0.02},
+            mesh={"size": [0.6, 0.2, 0.2], "h": 0.016},
             material={"energy": "neo-hookean"},
             fracture={"strength": 1e12},
             time={"end": 1.0, "scheme": "backward-euler"},
@@ -51,7 +51,7 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
         scene.stepper.advance(state)
         cut(scene, random_planes(10, scene.domain.lower, scene.domain.upper))
         krylov.append([scene.stepper.advance(state).outcome.krylov for _ in range(5)][-1])
-    assert krylov[0] < 0.85 * krylov[1], krylov
+    assert krylov[0] < 0.9 * krylov[1], krylov
 
 
 def cut(scene: Scene, planes: list[Any]) -> None:

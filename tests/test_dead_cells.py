@@ -10,6 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
+from fracsim.equilibrium import Equilibrium
 from fracsim.kernels import CellForm
 from fracsim.relaxation import Extrapolated
 from fracsim.run import Run
@@ -71,6 +72,86 @@ def test_forces_and_tangent_without_dead_cells(case: str, dim: int) -> None:
         np.testing.assert_array_equal(after, before)
     np.testing.assert_array_equal(dense_tangent(scene), tangent)
     assert np.abs(tangent).max() > 0.1
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("case", CASES)
+def test_a_smaller_tangent_is_the_same_one(case: str, dim: int) -> None:
+    """Without the entries of dead cells: a node that has no other keeps its place on the diagonal, and not a bit of
+    what is left changes."""
+    scene, _ = damaged(case, dim)
+    equations, tangent = scene.equations, dense_tangent(scene)
+    entries = equations.tangent.getInfo()["nz_used"]
+    equations.leave_out_dead_cells()
+    alive = len(integrated_cells(scene)) / scene.domain.cell_count
+    assert not equations.fit_tangent(alive - 0.01)
+    assert equations.fit_tangent(alive + 0.01)
+    np.testing.assert_array_equal(dense_tangent(scene), tangent)
+    assert equations.tangent.getInfo()["nz_used"] < entries
+    assert not equations.fit_tangent(1.0), "nothing died since"
+
+
+def test_cells_that_are_back_find_room() -> None:
+    """A tangent of the body before its last breaks is asked for now and then."""
+    scene, _ = damaged("damped", 3)
+    equations, chi = scene.equations, scene.equations.chi.x.array
+    chi[:] = 0.5
+    whole = dense_tangent(scene)
+    chi[::2] = 0.0
+    equations.leave_out_dead_cells()
+    assert equations.fit_tangent(1.0)
+    chi[:] = 0.5
+    equations.leave_out_dead_cells()
+    assert equations.fit_tangent(0.0)
+    np.testing.assert_array_equal(dense_tangent(scene), whole)
+
+
+@pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
+def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
+    """Every edge that breaks and every displacement are those of a run whose matrix keeps its size."""
+    fit, fitted, found = Equilibrium.fit_tangent, [], []
+    for choice in (lambda equations, share: fitted.append(fit(equations, share)) or fitted[-1], lambda *_: False):
+        monkeypatch.setattr(Equilibrium, "fit_tangent", choice)
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.05, "pattern": "unstructured"},
+            boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.0]}],
+            fracture={"strength": 0.03},
+            time={"scheme": scheme, "step": 0.1, "end": 1.0},
+            solver={"ksp_rtol": 1e-10, "snes_rtol": 1e-10},
+        )
+        march(scene, state)
+        found.append((state.u.copy(), scene.fracture.graph.broken.copy(), scene.equations.tangent.getInfo()["nz_used"]))
+    (small, torn, entries), (kept, same, all_entries) = found
+    assert any(fitted) and entries < all_entries
+    assert torn.any() and np.array_equal(torn, same)
+    np.testing.assert_allclose(small, kept, rtol=0, atol=1e-6 * np.abs(kept).max())
+
+
+def test_a_consistent_mass_keeps_its_pattern() -> None:
+    """It couples the nodes of dead cells, too."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1, "pattern": "unstructured"},
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.0]}],
+        fracture={"strength": 0.05},
+        time={"mass": "consistent", "scheme": "newmark", "step": 0.1, "end": 1.0},
+    )
+    march(scene, state)
+    assert len(integrated_cells(scene)) < scene.domain.cell_count
+    assert not scene.equations.fit_tangent(1.0)
+
+
+def test_no_entry_is_kept_for_nothing() -> None:
+    """2 x 2 for each pair of nodes in a living cell, and for each node with itself."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1}, fracture={"strength": 1e9})
+    domain, chi = scene.domain, scene.equations.chi.x.array
+    chi[: domain.cell_count] = np.random.default_rng(6).uniform(size=domain.cell_count) < 0.2
+    scene.equations.leave_out_dead_cells()
+    assert scene.equations.fit_tangent(1.0)
+    pairs = np.eye(domain.node_count, dtype=bool)
+    for nodes in domain.cell_nodes[chi[: domain.cell_count] > 0]:
+        pairs[np.ix_(nodes, nodes)] = True
+    scene.equations.assemble_tangent(None, None, *(scene.equations.tangent,) * 2)
+    assert scene.equations.tangent.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
 
 
 def test_every_death_counts_from_all_cells() -> None:

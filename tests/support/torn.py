@@ -144,7 +144,8 @@ def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
 
 
 def dead_cells() -> Found:
-    """Residual and tangent of the damped block with its dead cells and without, and how many those are."""
+    """Residual and tangent of the damped block with its dead cells, without, and without their entries, and how many
+    cells those are."""
     scene, state = make_scene(**RUNS["block"])
     domain, equations = scene.domain, scene.equations
     equations.begin(0.05, 0.05, state.u, state.v, state.a)
@@ -153,7 +154,9 @@ def dead_cells() -> Found:
     x, y = equations.residual.duplicate(), equations.residual.duplicate()
     x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
     found: Found = {}
-    for name in ("with", "without"):
+    for name in ("with", "without", "fitted-without"):
+        if name.startswith("fitted"):
+            assert equations.fit_tangent(0.7)
         equations.assemble_tangent(None, x, equations.tangent, equations.tangent)
         equations.tangent.mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
