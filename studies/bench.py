@@ -95,13 +95,21 @@ def take_step(run: Any) -> None:
     run.history.append(run.state, report, run._figures(), run.scene.probes())
 
 
+def break_now(run: Any, flags: Any) -> None:
+    """Break the flagged edges, and what follows from it, as the fracture pass does (collective)."""
+    fracture = run.scene.fracture
+    fracture.graph.break_edges(flags)
+    fracture.graph.break_idle()
+    values = fracture._evaluate()
+    fracture.degradation(True, values[:, :-1], values[:, -1])
+    run.scene.solver.damage_changed()
+
+
 def _after_fracture(run: Any, stage: Any) -> float:
     """Median step once every edge is broken."""
     import numpy as np
 
-    fracture = run.scene.fracture
-    fracture.graph.break_edges(np.ones(len(fracture.graph.broken), bool))
-    run.scene.solver.damage_changed()
+    break_now(run, np.ones(len(run.scene.fracture.graph.broken), bool))
     times: dict[str, list[float]] = {name: [] for name in ("step", "fracture", *EVENTS)}
     for _ in range(WARM + STEPS):
         _timed_step(run, stage, times)

@@ -236,6 +236,23 @@ def test_trials_run_once_and_failed_ones_stay(tmp_path: Path, monkeypatch: pytes
     assert record.stat().st_mtime_ns == made
 
 
+def test_what_a_group_doubts_is_run_again_and_kept(tmp_path: Path) -> None:
+    """Times are added to those of the record, on disk too, until the group is content; other trials stay."""
+
+    class Group:
+        trials = staticmethod(lambda: [Trial("precision", "a", name, script=("json.tool", "--help")) for name in "xy"])
+
+        @staticmethod
+        def to_time_again(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
+            return {("a", "y")} if len(records[1]["wall"]) < 3 else set()
+
+    found = program._run("precision", Group, tmp_path, full=False)
+    assert [len(record["wall"]) for record in found] == [1, 3]
+    on_disk = [json.loads((tmp_path / "precision" / "a" / name / "record.json").read_text()) for name in "xy"]
+    assert on_disk == found
+    assert [len(record["wall"]) for record in program._run("precision", Group, tmp_path, full=False)] == [1, 3]
+
+
 def test_a_section_that_cannot_be_made_says_so(tmp_path: Path) -> None:
     def broken(records: list[dict[str, Any]]) -> list[Section]:
         raise KeyError("step")

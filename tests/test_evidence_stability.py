@@ -247,6 +247,17 @@ def test_section_of_the_table() -> None:
     assert section.tables[0].rows[1][2] == "right; on 2 ranks WRONG: out of time"
 
 
+def test_runs_that_nobody_vouches_for_may_end_unlike_and_are_named() -> None:
+    """A warning here and no solution there is no answer on any rank; an answer on one rank only is a fault."""
+    warned = {"message": "fracsim: note: 3 cells are turned inside out"}
+    lost = {"outcome": "not converged", "message": "fracsim: no solution at t = 1 s", "figures": {"finite": True}}
+    (section,) = stability.sections([record("dt", "a", 1, **warned), record("dt", "a", 2, **lost)])
+    assert section.claims[3].holds and section.claims[3].measured.endswith("warn or give up: dt/a")
+    assert section.tables[0].rows[0][3] is False
+    (section,) = stability.sections([record("dt", "a", 1), record("dt", "a", 2, **lost)])
+    assert section.claims[3].holds is False and "against it: dt/a" in section.claims[3].measured
+
+
 def test_section_of_the_failed_approaches() -> None:
     figures = {"peak": 5.0, "rest_stress": 0.0, "loop": 1.0, "lowest": 0.0, "newton_failed_at": 0.1, "jump": 2.0}
     found = stability.sections([record("failed", "projected-stress", 1, figures=figures | {"reach": 1.0})])[1]

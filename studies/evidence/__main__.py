@@ -17,7 +17,7 @@ from typing import Any
 
 from ...report.content import Section, to_data
 from ...report.machine import machine, programs
-from .runner import fingerprint, run_trial
+from .runner import fingerprint, run_trial, time_again
 from .trial import Trial
 
 UNTIMED = ("stability", "dependence")  # what counts there is not time: runs of one rank go two at a time
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=GROUPS, metavar="GROUP", help=", ".join(GROUPS))
     given = parser.parse_args()
     modules = {name: importlib.import_module(f".{name}", __package__) for name in given.only if _exists(name)}
-    records = {name: _run(name, module.trials(), given.out, given.full) for name, module in modules.items()}
+    records = {name: _run(name, module, given.out, given.full) for name, module in modules.items()}
     path = write_evidence(given.out, records, {name: module.sections for name, module in modules.items()})
     failed = [record for group in records.values() for record in group if record["outcome"] != "done"]
     print(
@@ -44,9 +44,9 @@ def _exists(group: str) -> bool:
     return find_spec(f".{group}", __package__) is not None
 
 
-def _run(group: str, trials: list[Trial], out: Path, full: bool) -> Records:
+def _run(group: str, module: Any, out: Path, full: bool) -> Records:
     """Records of a group; of the long trials only those that are there already, unless `full`."""
-    chosen = [trial for trial in trials if full or not trial.full or recorded(trial, out)]
+    chosen = [trial for trial in module.trials() if full or not trial.full or recorded(trial, out)]
     began, number = time.monotonic(), itertools.count(1)
 
     def run(trial: Trial) -> dict[str, Any]:
@@ -59,8 +59,19 @@ def _run(group: str, trials: list[Trial], out: Path, full: bool) -> Records:
     with ThreadPoolExecutor(2 if group in UNTIMED and (os.cpu_count() or 1) > 1 else 1) as pool:
         alone = [pool.submit(run, trial) if trial.ranks == 1 else None for trial in chosen]
     records = [one.result() if one is not None else run(trial) for one, trial in zip(alone, chosen, strict=True)]
+    if doubtful := getattr(module, "to_time_again", None):
+        _time_again(doubtful, list(zip(chosen, records, strict=True)), out)
     print(f"{group}: {time.monotonic() - began:.0f} s", flush=True)
     return records
+
+
+def _time_again(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Path) -> None:
+    """Run what the group wants timed once more until it wants no more: each time that may be something else."""
+    while wanted := doubtful([record for _, record in runs]):
+        for trial, record in runs:
+            if (trial.case, trial.name) in wanted:
+                time_again(trial, out, record)
+                print(f"{trial.group} {trial.case}/{trial.name}: once more, {record['wall'][-1]:.1f} s", flush=True)
 
 
 def recorded(trial: Trial, out: Path) -> bool:

@@ -6,8 +6,8 @@ Each group module has
     def sections(records: list[dict[str, Any]]) -> list[Section]
 
 `sections` gets the records of its own group, those of failed trials too (`record["outcome"] != "done"`: they stay in
-the tables as failed). A record has group, case, name, settings, ranks, command, outcome, message, wall, stepping (lists
-of s, one a repeat), summary (of the run, or None) and figures (of `Trial.measure` or the script). The folder of the
+the tables as failed). A record has group, case, name, settings, ranks, command, outcome, message, wall, stepping, cpu
+(lists of s, one a run), summary (of the run, or None) and figures (of `Trial.measure` or the script). The folder of the
 trial is OUT/group/case/name; `folder_of(record)` is its path inside OUT, as `Picture.path` wants it.
 
 The page's pieces (Section, Claim, Table, Plot, Series, Picture) are frozen dataclasses of fracsim/report/content.py;

@@ -225,17 +225,20 @@ def _claims(records: list[Record]) -> tuple[Claim, ...]:
     wrong = [f"{r['case']}/{r['name']}" for r in records if verdict(r).startswith("WRONG")]
     endless = [f"{r['case']}/{r['name']}" for r in records if r["outcome"] == "out of time"]
     infinite = [f"{r['case']}/{r['name']}" for r in records if r["figures"].get("finite") is False]
-    differ = [f"{one['case']}/{_place(one)}" for one, *others in _by_place(records) if not _alike(one, others)]
+    differ = [runs for runs in _by_place(records) if not _alike(*runs)]
+    apart = [_where(runs) for runs in differ if any(map(_vouched_for, runs))]
+    doubtful = [_where(runs) for runs in differ if not any(map(_vouched_for, runs))]
+    aside = f"; unlike, but all of its runs warn or give up: {', '.join(doubtful)}" if doubtful else ""
     return (
         _claim("No hang in the whole table, on 1 and 2 ranks", endless, records),
         _claim("No NaN in history, fields or surface, on 1 and 2 ranks", infinite, records),
         _claim("Each case ends in a right answer or in a clear word", wrong, records),
-        _claim("2 ranks break the same edges as 1", differ, records),
+        _claim("2 ranks break the same edges as 1", apart, records, aside),
     )
 
 
-def _claim(text: str, against: Sequence[str], records: list[Record]) -> Claim:
-    measured = f"{len(records)} runs; against it: {', '.join(against) or 'none'}"
+def _claim(text: str, against: Sequence[str], records: list[Record], aside: str = "") -> Claim:
+    measured = f"{len(records)} runs; against it: {', '.join(against) or 'none'}{aside}"
     return Claim(text, measured, not against if records else None)
 
 
@@ -252,7 +255,17 @@ def _by_place(records: list[Record]) -> list[list[Record]]:
     return [places[place] for place in order]
 
 
-def _alike(one: Record, others: list[Record]) -> bool:
+def _where(runs: list[Record]) -> str:
+    return f"{runs[0]['case']}/{_place(runs[0])}"
+
+
+def _vouched_for(record: Record) -> bool:
+    """Whether the program stands by what it found: no warning, no refusal, no giving up. A motion that it does not
+    stand by (a body pushed through itself, say) is one of many, and round-off may choose."""
+    return not verdict(record).startswith(("warned", "refused", "not converged"))
+
+
+def _alike(one: Record, *others: Record) -> bool:
     """Whether runs ended alike, with as many broken edges and pieces."""
     return all(
         one["outcome"] == other["outcome"]
@@ -279,7 +292,7 @@ def _row(one: Record, others: list[Record]) -> tuple[Cell, ...]:
     words = list(dict.fromkeys(verdict(record) for record in (one, *others)))
     return (
         one["case"], _place(one), "; on 2 ranks ".join(words) if _differs(words) else words[0],
-        _alike(one, others) if others else None, *(figures.get(key) for key in FIGURES),
+        _alike(one, *others) if others else None, *(figures.get(key) for key in FIGURES),
         summary.get("steps_failed", figures.get("halved")), *(figures.get(key) for key in DAMAGE),
         one["wall"][-1],
     )  # fmt: skip

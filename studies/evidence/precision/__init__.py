@@ -7,7 +7,7 @@ from typing import Any
 from ..section import Section
 from ..trial import Trial
 from . import average, beam, brazilian, finite, fracture, plastic, solver, statics, wave
-from .page import section
+from .page import in_doubt, section
 
 FAMILIES = (statics, beam, wave, finite, fracture, plastic, brazilian, average, solver)
 
@@ -15,6 +15,11 @@ FAMILIES = (statics, beam, wave, finite, fracture, plastic, brazilian, average, 
 def trials() -> list[Trial]:
     """Every trial of the group."""
     return [trial for family in FAMILIES for trial in family.trials()]
+
+
+def to_time_again(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
+    """(case, name) of trials whose seconds decide something by more than noise, and were measured but once or twice."""
+    return {(case.name, name) for family in FAMILIES for case in family.CASES for name in in_doubt(case, records)}
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:

@@ -15,6 +15,7 @@ Errors = Callable[[Records], dict[str, dict[str, float]]]
 
 WITHIN = 0.2  # of an order of theory
 NOISE = 1.25  # no setting is better for less: times of single runs differ by a good part of it
+TIMED = 3  # runs of two settings of which the default came out dearer by more than that
 LIMITS = (0.05, 0.01)
 
 
@@ -72,10 +73,9 @@ class Row:
     def core_seconds(self) -> float:
         """Processor seconds of all ranks in the loop over steps; a script: seconds in its work.
 
-        Processor time hardly feels what else a machine does, as wall time in steps times ranks would.
+        Processor time feels less of what else a machine does than wall time in steps times ranks would.
         """
-        summary = self.record["summary"] or {}
-        return float(summary.get("cpu", self.record["figures"].get("seconds", 0.0)))
+        return median(self.record["cpu"] or [self.record["figures"].get("seconds", 0.0)])
 
 
 def figure(records: Records, name: str, key: str) -> float:
@@ -113,6 +113,21 @@ def section(case: Case, records: Records) -> Section:
     tables = (_table(case, rows, marked),)
     return Section(case.title, f"{text}\n\n{_words(advice, case)}", (*orders, *claims, *_default_claims(case, advice)),
                    tables, _plots(case, rows))  # fmt: skip
+
+
+def in_doubt(case: Case, records: Records) -> set[str]:
+    """Names of trials to be timed again: a default, and what came out cheaper by more than noise, perhaps by chance."""
+    mine = [record for record in records if record["case"] == case.name]
+    try:
+        errors = case.compare(mine)
+    except (KeyError, StopIteration):
+        return set()
+    advice, _ = _advice(case, [Row(record, errors.get(record["name"], {})) for record in mine])
+    rivals = [
+        row.record for each in advice if each.default is not None and not _as_good(each.default, each.candidate)
+        for row in (each.default, each.candidate) if row is not None
+    ]  # fmt: skip
+    return {record["name"] for record in rivals if 0 < len(record["cpu"]) < TIMED}
 
 
 # --- orders ---
@@ -242,7 +257,9 @@ def _default_claim(case: Case, advice: Advice) -> Claim:
     best = f"cheapest: {_setting(advice.candidate)}, {advice.candidate.core_seconds:.3g} core-seconds"
     if advice.default is None:
         return Claim(text, f"{best}; the default does not reach it here", False)
-    measured = f"{best}; default: {_setting(advice.default)}, {advice.default.core_seconds:.3g}"
+    runs = min(len(row.record["cpu"]) for row in (advice.candidate, advice.default))
+    medians = f", medians of {runs}" if runs > 1 else ""
+    measured = f"{best}; default: {_setting(advice.default)}, {advice.default.core_seconds:.3g}{medians}"
     holds = _as_good(advice.default, advice.candidate)
     return Claim(text, f"{measured} (a factor below {NOISE:g} is noise)", holds)
 
