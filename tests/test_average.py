@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
+from fracsim import average as average_module
 from fracsim.average import NonlocalAverage
 from fracsim.edge_stress import frobenius_norm
 from support.scenes import Values, cell_corners, make_scene
@@ -116,20 +117,46 @@ def test_radius_zero_builds_no_average() -> None:
     assert scene.fracture._average is None
 
 
-def test_cells_that_may_reach_a_bound_are_found_with_their_averages() -> None:
+@pytest.mark.parametrize("at_once", (0, 5e7), ids=("rows made as needed", "all rows"))
+def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
+    monkeypatch: pytest.MonkeyPatch, at_once: float
+) -> None:
     """None is missed: every cell whose average is as large as the bound is among them, with the same average."""
+    monkeypatch.setattr(average_module, "AT_ONCE", at_once)
     scene, _ = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"},
         fracture={"strength": 1.0, "radius": 0.25},
     )
     average, n = scene.fracture._average, scene.domain.cell_count
+    other = NonlocalAverage(scene.domain, 0.25, "linear")
     rng = np.random.default_rng(4)
     for active in (None, rng.uniform(size=n) < 0.7):
         values = rng.normal(size=(n, 3)) * (1.0 if active is None else active[:, None])
         size = frobenius_norm(values, 2)
-        whole = average(values, active)
+        whole = other(values, active)
         bound = float(np.quantile(frobenius_norm(whole, 2), 0.8))
         cells, found = average.reaching(values, size, bound, active)
         np.testing.assert_allclose(found, whole[cells], rtol=1e-12, atol=1e-14)
         assert set(np.flatnonzero(frobenius_norm(whole, 2) >= bound)) <= set(cells)
         assert len(average.reaching(values, size, 1.01 * size.max(), active)[0]) == 0
+
+
+def test_rows_are_made_where_stress_is_high(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One hot cell: rows of the cells within R of it and no others, kept from pass to pass, the same to a bit."""
+    body = Body(MESHES["2d-unstructured"])
+    size = np.zeros(len(body.volumes))
+    whole = body.average(2.7 * H, "linear")
+    monkeypatch.setattr(average_module, "AT_ONCE", 0)
+    few = body.average(2.7 * H, "linear")
+    made = []
+    for hot in (17, 17, 90):
+        size[:] = np.random.default_rng(hot).uniform(0.1, 0.4, len(size))
+        size[hot] = 5.0
+        cells, found = few.reaching(size[:, None], size, 0.5)
+        expected, averages = whole.reaching(size[:, None], size, 0.5)
+        assert len(cells) and np.array_equal(cells, expected) and np.array_equal(found, averages)
+        made.append(sum(len(cells) for cells, *_ in few._rows.made))
+    near = np.linalg.norm(body.centroids - body.centroids[[17, 90], None], axis=2) <= 2.7 * H
+    assert made == [near[0].sum(), near[0].sum(), near.any(axis=0).sum()] and made[0] < len(size) / 3
+    assert np.array_equal(few(size[:, None]), whole(size[:, None])), "all rows, in the order of the cells"
+    assert np.array_equal(few.reaching(size[:, None], size, 0.5)[1], averages)

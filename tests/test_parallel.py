@@ -176,6 +176,14 @@ def test_same_motion(results: Results, ranks: int, name: str, quantity: str) -> 
         np.testing.assert_allclose(found[..., column], serial[..., column], atol=1e-7 * scale(serial[..., column]))
 
 
+@pytest.mark.parametrize("ranks", RANKS)
+def test_same_crack_where_weights_are_made_as_needed(results: Results, ranks: int) -> None:
+    """An average of few rows breaks the edges that one of all rows breaks."""
+    found = results(ranks)
+    assert np.array_equal(found["broken-by-rows"], found["block-broken"])
+    np.testing.assert_allclose(found["u-by-rows"], found["block-u"], atol=1e-9 * scale(found["block-u"]))
+
+
 @pytest.mark.parametrize("name", ("ductile", "ductile-implicit"))
 @pytest.mark.parametrize("ranks", RANKS[1:])
 def test_same_flow(results: Results, ranks: int, name: str) -> None:
