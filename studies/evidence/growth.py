@@ -76,7 +76,7 @@ def _loaf(name: str) -> Trial:
     large = name == "620k"
     return Trial(
         "growth", "loaf", name, study=study, settings={"h": LOAVES[name]}, ranks=2 if large else 1,
-        limit=3000.0 if large else 300.0, full=large,
+        limit=4 * 3600.0 if large else 300.0, full=large,
     )  # fmt: skip
 
 
