@@ -51,16 +51,16 @@ class NonlocalAverage:
     def __call__(self, values: Values, active: npt.NDArray[np.bool_] | None = None) -> Values:
         """Averages (cells, n) of cell values (cells, n); cells not `active` enter none. 0 where none is left."""
         self._rows.make_all()
+        n = values.shape[1]
         if active is not None:
             values = np.column_stack([np.where(active[:, None], values, 0.0), active])
         near = self._exchange(values)[self._order]
-        sums = np.empty((len(values), values.shape[1]))
-        for cells, weights, _ in self._rows.made:
-            sums[cells] = weights @ near
-        if active is None:
-            return sums / self._rows.full()[:, None]
-        weight = sums[:, -1:]
-        return np.divide(sums[:, :-1], weight, out=np.zeros_like(sums[:, :-1]), where=weight > 0)
+        averages = np.zeros((len(values), n))
+        for cells, weights, full in self._rows.made:
+            sums = weights @ near
+            weight = full[:, None] if active is None else sums[:, -1:]
+            averages[cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(cells), n)), where=weight > 0)
+        return averages
 
     def reaching(
         self, values: Values, size: Values, bound: float, active: npt.NDArray[np.bool_] | None = None
@@ -126,7 +126,8 @@ class _Rows:
         self._add(np.flatnonzero(self._missing))
 
     def _add(self, cells: npt.NDArray[np.int64]) -> None:
-        for part in np.array_split(cells, -(-len(cells) // CHUNK)) if len(cells) else []:
+        for start in range(0, len(cells), CHUNK):
+            part = cells[start : start + CHUNK]
             pairs = cKDTree(self._centres[part]).sparse_distance_matrix(
                 self._tree, self._radius, output_type="coo_matrix"
             )
@@ -135,13 +136,6 @@ class _Rows:
             rows.sort_indices()
             self.made.append((part, rows, np.asarray(rows.sum(axis=1))[:, 0]))
         self._missing[cells] = False
-
-    def full(self) -> Values:
-        """(centres,) sums of the rows, all of which are made."""
-        sums = np.empty(len(self._centres))
-        for cells, _, full in self.made:
-            sums[cells] = full
-        return sums
 
 
 class _Halo:
