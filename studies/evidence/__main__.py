@@ -17,7 +17,7 @@ from typing import Any
 
 from ...report.content import Section, to_data
 from ...report.machine import machine, programs
-from .runner import fingerprint, run_trial, time_again
+from .runner import RECORD, fingerprint, folder_in, run_trial, time_again
 from .trial import Trial
 
 UNTIMED = ("stability", "dependence")  # what counts there is not time: runs of one rank go two at a time
@@ -76,7 +76,7 @@ def _time_again(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Pa
 
 def recorded(trial: Trial, out: Path) -> bool:
     """Whether this very trial has been run before."""
-    path = out / trial.group / trial.case / trial.name / "record.json"
+    path = folder_in(out, trial) / RECORD
     return path.exists() and json.loads(path.read_text())["digest"] == fingerprint(trial)
 
 

@@ -24,14 +24,15 @@ from fracsim.outcome import OUTCOMES, last_words
 
 from .trial import Trial
 
+RECORD = "record.json"
 TIMES = ("wall", "stepping", "cpu")  # of a record: lists of s, one of each run
 PHASES = ("solve", "fracture", "energies", "plasticity")
 
 
 def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
     """The record of a trial; taken from OUT/group/case/name/record.json where the same trial has been run before."""
-    folder = out / trial.group / trial.case / trial.name
-    path = folder / "record.json"
+    folder = folder_in(out, trial)
+    path = folder / RECORD
     digest = fingerprint(trial)
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     if record.get("digest") != digest:
@@ -41,19 +42,28 @@ def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
         record = {**_about(trial, command), "digest": digest, **_joined(runs)}
     if record.get("measured by") != measuring():
         _measure(trial, folder, record)
-        path.write_text(json.dumps(record, indent=1) + "\n")
+        _save(record, folder)
     return record
 
 
 def time_again(trial: Trial, out: Path, record: dict[str, Any]) -> None:
     """Run a trial that is recorded once more and add its times, whatever they are, to the record."""
-    folder = out / trial.group / trial.case / trial.name
+    folder = folder_in(out, trial)
     again = _joined([_once(_command(trial, folder), folder, trial.limit)])
     for key in TIMES:
         record[key] += again[key]
     if again["outcome"] != "done":
         record["outcome"], record["message"] = again["outcome"], again["message"]
-    (folder / "record.json").write_text(json.dumps(record, indent=1) + "\n")
+    _save(record, folder)
+
+
+def folder_in(out: Path, trial: Trial) -> Path:
+    """Where a trial is run and recorded."""
+    return out / trial.group / trial.case / trial.name
+
+
+def _save(record: dict[str, Any], folder: Path) -> None:
+    (folder / RECORD).write_text(json.dumps(record, indent=1) + "\n")
 
 
 def fingerprint(trial: Trial) -> str:
