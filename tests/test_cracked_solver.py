@@ -34,8 +34,8 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
 
 
 def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
-    """Ten planes through a bar: CG takes a sixth less than with the aggregates of the whole body, which a user who
-    asks for them keeps."""
+    """Ten planes through a bar: CG takes a fifth less in the end than with the aggregates of the whole body, which a
+    user who asks for them keeps."""
     krylov = []
     for given in ({}, {"pc_gamg_agg_nsmooths": 1}):
         data = study(
@@ -50,8 +50,8 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
         state = scene.stepper.start(None)
         scene.stepper.advance(state)
         cut(scene, random_planes(10, scene.domain.lower, scene.domain.upper))
-        krylov.append([scene.stepper.advance(state).outcome.krylov for _ in range(5)][-1])
-    assert krylov[0] < 0.9 * krylov[1], krylov
+        krylov.append([scene.stepper.advance(state).outcome.krylov for _ in range(12)][-1])
+    assert krylov[0] < 0.85 * krylov[1], krylov
 
 
 def cut(scene: Scene, planes: list[Any]) -> None:
