@@ -1,7 +1,7 @@
 """Virtual work of a body: the integrands from which residual and tangent are derived.
 
 Quadrature is chosen here and nowhere else: with P1 displacement F is constant in a cell, so one point integrates every
-energy exactly. Inertia is not here: with a lumped or constant mass matrix it is linear algebra (fracsim.solve).
+energy exactly. Inertia is not here: with a lumped or constant mass matrix it is linear algebra (stepping.newton).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What broken edges do to the strain of a simplex: the edge-projected energy (M22 sections 3.5.2 and 3.6.1).
 
 A strain is a sum over the edges ij of the reference cell, eps = - sum (d_ij . eps . d_ij) sym(g_i x g_j), with
-d_ij = X_j - X_i and barycentric gradients g_i (see fracsim.edge_stress for the identity): T_strain^-1 without a matrix
+d_ij = X_j - X_i and barycentric gradients g_i (see fracture.edge_stress for the identity): T_strain^-1 without a matrix
 inverse. Broken edges are left out of the sum.
 """
 

@@ -2,8 +2,8 @@
 within a step takes off the stress.
 
 F_p is 3 x 3 in 2D as well: under plane strain (F33 = 1) a body flows across the plane too. At the end of a step the
-elastic stretches flow back along their deviator (eq. 30, fracsim.flow). Where a step is solved with its own flow, what
-balances is the stress that this leaves, not the trial stress before it:
+elastic stretches flow back along their deviator (eq. 30, mechanics.return_mapping). Where a step is solved with its own
+flow, what balances is the stress that this leaves, not the trial stress before it:
 
     tau = tau_t - beta s,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
 

@@ -52,8 +52,8 @@ def check(study: StudyPath, set_: Set = _NONE) -> None:
     """Validate everything that can be known without solving; print what the scene will build."""
     if not _is_root():
         return
-    from .check import check_study
-    from .study_file import load_study
+    from .study.check import check_study
+    from .study.file import load_study
 
     path = find_study(study)
     loaded = load_study(path, set_)
@@ -71,9 +71,9 @@ def mesh(
     """Build and save the mesh of a study, print its quality."""
     if not _is_root():
         return
-    from .mesh_source import build_mesh, save_mesh
     from .meshes.quality import mesh_quality
-    from .study_file import load_study
+    from .study.file import load_study
+    from .study.mesh_source import build_mesh, save_mesh
 
     data = build_mesh(load_study(find_study(study), set_).mesh)
     for note in data.notes:
@@ -99,7 +99,7 @@ def render(
     """Draw the split surface of a run off-screen: a picture, or an animation where the name ends in .gif."""
     if not _is_root():
         return
-    from .picture import Look, render
+    from .report.picture import Look, render
 
     print(f"saved {render(out, png, Look(colour, explode, view, zoom), frame=frame)}")
 
@@ -131,7 +131,7 @@ def sweep(
     list_: Annotated[bool, typer.Option("--list", help="print one complete command a line for a job array")] = False,
 ) -> None:
     """Run a study once for each combination of values; goes on where it was left."""
-    from .sweep import run_sweep
+    from .report.sweep import run_sweep
 
     path = find_study(study)
     run_sweep(study, path, set_, out or Path("out") / f"{path.stem}-sweep", ranks=ranks, only_list=list_)
@@ -142,7 +142,7 @@ def list_() -> None:
     """Show the studies, builders, energies and schemes that exist."""
     if not _is_root():
         return
-    from .catalogue import catalogue
+    from .study.catalogue import catalogue
 
     for heading, entries in catalogue().items():
         print(heading)
@@ -163,9 +163,9 @@ def find_study(name: str) -> Path:
 
 def _load(comm: Any, path: Path, overrides: list[str], folder: Path) -> Any:
     """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
-    from .parallel import from_root
+    from .mesh.ranks import from_root
     from .study import Study
-    from .study_file import load_study
+    from .study.file import load_study
 
     def work() -> Any:
         loaded = load_study(path, overrides)

@@ -13,26 +13,26 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .bodies import bodies_of
-from .checkpoint import read_checkpoint, write_checkpoint
 from .errors import NotConverged, Stopped
-from .fields_file import FieldsFile
-from .frames import Frames
-from .gained import Gained
-from .history import History
-from .interrupt import Interrupt
-from .inverted import Inverted
-from .output_folder import OutputClock, make_folder, versions
-from .parallel import on_root, total
-from .progress import Progress
+from .mesh.bodies import bodies_of
+from .mesh.ranks import on_root, total
+from .output.checkpoint import read_checkpoint, write_checkpoint
+from .output.energy_gain import Gained
+from .output.fields import Frames
+from .output.fields_file import FieldsFile
+from .output.folder import OutputClock, make_folder, versions
+from .output.history import History
+from .output.interrupt import Interrupt
+from .output.inverted_cells import Inverted
+from .output.progress import Progress
 from .scene import Scene, build_scene
 from .study import Study
-from .study_file import study_text
+from .study.file import study_text
 
 if TYPE_CHECKING:
-    from .pieces import Pieces
-    from .record import EdgeRecord
-    from .surface.output import SurfaceOutput
+    from .fracture.record import EdgeRecord
+    from .mesh.pieces import Pieces
+    from .output.surface.output import SurfaceOutput
 
 
 class Run:
@@ -94,7 +94,7 @@ class Run:
         study, scene = self.scene.study, self.scene
         if study.output.surface is False or (study.output.surface is None and study.fracture is None):
             return
-        from .surface.output import SurfaceOutput
+        from .output.surface.output import SurfaceOutput
 
         density, resume_at = scene.equations.material.density, self.state.t if restart else None
         self.surface = SurfaceOutput(self.folder, scene.domain, density, self.record, resume_at=resume_at)
@@ -102,7 +102,7 @@ class Run:
     def _make_record(self) -> EdgeRecord | None:
         if self._graph is None:
             return None
-        from .record import EdgeRecord
+        from .fracture.record import EdgeRecord
 
         return EdgeRecord(self._graph)
 
@@ -118,7 +118,7 @@ class Run:
 
     def _cuts(self) -> npt.NDArray[np.float64]:
         """(edges,) cuts in inverse proportion to the nodal forces at the step's end (M22 fig. 12)."""
-        from .record import cut_by_forces
+        from .fracture.record import cut_by_forces
 
         equations, domain, graph = self.scene.equations, self.scene.domain, self._graph
         force = equations.nodal_forces().reshape(-1, domain.dim)
@@ -216,7 +216,7 @@ class Run:
         graph = self._graph
         if graph is None:
             return 0, 0, None
-        from .pieces import find_pieces
+        from .mesh.pieces import find_pieces
 
         broken, split = total(self.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
         return int(broken), int(split), find_pieces(graph)
@@ -268,7 +268,7 @@ def run_study(
 
 def _draw(folder: Path) -> None:
     """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
-    from .picture import render
+    from .report.picture import render
 
     try:
         render(folder)

@@ -7,17 +7,17 @@ from typing import Any
 
 from mpi4py import MPI
 
-from .check import checked_mesh
-from .domain import Domain, distribute
-from .equilibrium import Equilibrium
 from .forms.schemes import BackwardEuler, CentralDifference, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
-from .history import Probes
-from .material import material_fields
-from .parallel import on_root
-from .solve import Solver
-from .stepping import Stepper
+from .mechanics.balance import Equilibrium
+from .mechanics.material import material_fields
+from .mechanics.supports import check_supports
+from .mesh.domain import Domain, distribute
+from .mesh.ranks import on_root
+from .output.history import Probes
+from .stepping.implicit import Stepper
+from .stepping.newton import Solver
 from .study import Study, Time
-from .support import check_supports
+from .study.check import checked_mesh
 
 
 @dataclass
@@ -39,7 +39,7 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     scheme = make_scheme(study.time)
     material = material_fields(domain, study.material)
     if study.plasticity is not None:
-        from .plasticity import plastic_material
+        from .mechanics.plasticity import plastic_material
 
         material = plastic_material(domain, study, material)
     equations = Equilibrium(domain, study, material, scheme)
@@ -47,13 +47,13 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
         check_supports(domain, equations.motion)
     fracture = None
     if study.fracture is not None:
-        from .fracture import FracturePass
+        from .fracture.breaking import FracturePass
 
         fracture = FracturePass(equations, study.fracture, study.material, study.brittle)
     solver = Solver(equations, study.solver) if scheme.implicit else None
     stepper = make_stepper(equations, solver, study.time, fracture)
     if study.plasticity is not None:
-        from .flow import Flow
+        from .mechanics.return_mapping import Flow
 
         stepper.flow = Flow(equations)
     return Scene(study, domain, equations, solver, stepper, fracture, Probes(equations, study.probe))
@@ -77,6 +77,6 @@ def make_stepper(equations: Equilibrium, solver: Solver | None, timing: Time, fr
     """The stepper of an implicit or explicit scheme."""
     if solver is not None:
         return Stepper(equations, solver, timing, fracture)
-    from .explicit import ExplicitStepper
+    from .stepping.explicit import ExplicitStepper
 
     return ExplicitStepper(equations, None, timing, fracture)

@@ -12,16 +12,16 @@ when called, on the process that calls.
 
 from __future__ import annotations
 
-from .box import Box
-from .cylinder import Cylinder, Disk
+from .builders.box import Box
+from .builders.cylinder import Cylinder, Disk
+from .builders.figure import Figure
+from .builders.loaf import Loaf
+from .builders.notched_bar import NotchedBar
+from .builders.notched_plate import NotchedPlate
+from .builders.plate_hole import PlateHole
+from .builders.vase import Vase
 from .data import MeshData, MeshError
-from .figure import Figure
-from .loaf import Loaf
-from .notched_bar import NotchedBar
-from .notched_plate import NotchedPlate
 from .parameters import Builder
-from .plate_hole import PlateHole
-from .vase import Vase
 
 BUILDERS: dict[str, type[Builder]] = {
     "box": Box,

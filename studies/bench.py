@@ -4,7 +4,7 @@
 
 A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
 steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
-solver options, the same assembly of the tangent (fracsim.tangent) and the same policy for the preconditioner (made
+solver options, the same assembly of the tangent (mechanics.tangent) and the same policy for the preconditioner (made
 once: nothing in the body changes), so that the machine's moods hit both. Figures are medians over the steps.
 """
 
@@ -55,7 +55,7 @@ def case(n: int, bare: bool) -> dict[str, Any]:
 
     from ..run import Run
     from ..scene import build_scene
-    from ..study_file import validate
+    from ..study.file import validate
 
     PETSc.Log.begin()
     comm = MPI.COMM_WORLD
@@ -143,10 +143,10 @@ class Bare:
 
         from ..forms.balance import elastic_energy, internal_work
         from ..forms.energies import NeoHookean, lame
-        from ..kernels import jit_options
-        from ..preconditioner import MULTIGRID
-        from ..solve import rigid_body_modes
-        from ..tangent import Assembly
+        from ..mechanics.kernels import jit_options
+        from ..mechanics.tangent import Assembly
+        from ..stepping.newton import rigid_body_modes
+        from ..stepping.preconditioner import MULTIGRID
 
         scene = study(n)
         V, mesh = domain.space, domain.mesh

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fracsim.study import Study
-from fracsim.study_file import study_text, validate
+from fracsim.study.file import study_text, validate
 
 BAR = tomllib.loads("""
 title = "bar"

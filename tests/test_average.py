@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from fracsim import average as average_module
-from fracsim.average import NonlocalAverage
-from fracsim.edge_stress import frobenius_norm
+from fracsim.fracture import nonlocal_average as average_module
+from fracsim.fracture.edge_stress import frobenius_norm
+from fracsim.fracture.nonlocal_average import NonlocalAverage
 from support.scenes import Values, cell_corners, make_scene
 
 EPS = np.finfo(float).eps

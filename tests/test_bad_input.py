@@ -10,10 +10,10 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, fracsim, study, write_study
-from fracsim.check import check_study
 from fracsim.cli import check_folder
 from fracsim.errors import InputError
-from fracsim.study_file import load_study, validate
+from fracsim.study.check import check_study
+from fracsim.study.file import load_study, validate
 
 Data = dict[str, Any]
 LEFT: Data = {"on": "left", "fix": "xyz"}

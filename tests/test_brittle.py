@@ -15,17 +15,17 @@ from pydantic import ValidationError
 from scipy.spatial.distance import cdist
 
 from cases import fracsim, write_study
-from fracsim.brittle.body import Body
-from fracsim.brittle.level_set import DirectionField
-from fracsim.brittle.principal import SAME, directions, largest, material_normals, upper_bound
-from fracsim.brittle.sheet import NEAREST, settled, sides_of
-from fracsim.brittle.start import Starts
 from fracsim.errors import Stopped
-from fracsim.mesh_source import build_mesh
+from fracsim.fracture.brittle.body import Body
+from fracsim.fracture.brittle.level_set import DirectionField
+from fracsim.fracture.brittle.principal import SAME, directions, largest, material_normals, upper_bound
+from fracsim.fracture.brittle.sheet import NEAREST, settled, sides_of
+from fracsim.fracture.brittle.start import Starts
 from fracsim.meshes.data import MeshData
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study import Mesh
+from fracsim.study.mesh_source import build_mesh
 from support.brittle import cut_points, enclosed, open_at, scene_surface, volume_above
 from support.laws import rotation
 from support.scenes import deform, make_scene, make_study, march, mesh_of
@@ -294,7 +294,7 @@ def test_without_tension_a_curved_surface_goes_straight_on() -> None:
 
 def test_weights_are_a_share_of_the_strength() -> None:
     """Uniaxial stress of half the strength: weight 1/2 along it; equal principal stresses: direction without weight."""
-    from fracsim.brittle.body import Body
+    from fracsim.fracture.brittle.body import Body
 
     body = Body(box(2, 0.25))
     rest = np.broadcast_to(np.eye(2), (len(body.cells), 2, 2))
@@ -421,7 +421,7 @@ def test_a_study_without_brittle_imports_nothing_of_it() -> None:
         "import sys; sys.path.insert(0, 'tests'); from support.scenes import make_scene, march;"
         "scene, state = make_scene(fracture={'strength': 1.0}); march(scene, state, 1);"
         "assert scene.fracture.surfaces is None;"
-        "assert not [name for name in sys.modules if name.startswith('fracsim.brittle')]"
+        "assert not [name for name in sys.modules if name.startswith('fracsim.fracture.brittle')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], timeout=100)
 

@@ -13,8 +13,8 @@ import pytest
 import fracsim as package
 from cases import BAR, STRIP, fracsim, mpirun, study, write_study
 from fracsim import cli
-from fracsim.check import check_study
 from fracsim.errors import Exit
+from fracsim.study.check import check_study
 
 HEAVY = ("dolfinx", "gmsh", "petsc4py", "mpi4py", "pyvista", "meshio", "ufl", "basix", "h5py", "matplotlib")
 
@@ -75,14 +75,14 @@ def test_a_scene_without_fracture_builds_none_of_it(tmp_path: Path, scheme: str)
 import sys
 from pathlib import Path
 from mpi4py import MPI
-from fracsim.study_file import load_study
+from fracsim.study.file import load_study
 from fracsim.run import Run
 from fracsim.scene import build_scene
 scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
 Run(scene, Path({str(tmp_path / "out")!r}))()
-parts = ("graph", "pieces", "fracture", "average", "edge_stress", "picture")
-parts += ("plasticity", "relaxation", "flow", "spectrum", "forms.plasticity")
-parts += ("edge_frequencies", "forms.closing", "forms.damage")
+parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mechanics.plasticity")
+parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
+parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage")
 print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

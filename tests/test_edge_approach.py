@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from cases import STRIP, changed, study
 from fracsim.errors import Stopped
 from fracsim.forms.energies import lame
-from fracsim.graph import is_split, local_edges
+from fracsim.mesh.simplices import is_split, local_edges
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from support.reference import dense_tangent, gradients

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.edge_stress import carried_by, edge_vectors, normal_stress
-from fracsim.graph import local_edges
-from fracsim.small_matrices import barycentric_gradients
+from fracsim.fracture.edge_stress import carried_by, edge_vectors, normal_stress
+from fracsim.mesh.simplices import local_edges
+from fracsim.mesh.small_matrices import barycentric_gradients
 from support.laws import T_stress, Tensor, rotation
 
 EPS = np.finfo(float).eps

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.graph import local_edges, node_groups
-from fracsim.meshes.box import lattice
+from fracsim.mesh.simplices import local_edges, node_groups
+from fracsim.meshes.builders.box import lattice
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.studies.evidence import __main__ as program
 from fracsim.studies.evidence import growth, ladder
@@ -185,14 +185,15 @@ def test_sections_show_what_failed() -> None:
 
 
 def test_modules_of_other_features_are_noticed() -> None:
-    modules = ["fracsim.run", "fracsim.surface", "fracsim.record", "fracsim.graph", "fracsim.average"]
+    edges, average = "fracsim.mesh.edges", "fracsim.fracture.nonlocal_average"
+    modules = ["fracsim.run", "fracsim.output.surface", "fracsim.fracture.record", edges, average]
     assert ladder.strangers("elastic", 10, modules) == sorted(modules[1:])
-    assert ladder.strangers("damage", 10, ["fracsim.graph", "fracsim.average"]) == ["fracsim.average"]
-    assert ladder.strangers("average", 10, ["fracsim.graph", "fracsim.average"]) == []
+    assert ladder.strangers("damage", 10, [edges, average]) == [average]
+    assert ladder.strangers("average", 10, [edges, average]) == []
 
 
 def test_every_rung_is_a_study() -> None:
-    from fracsim.study_file import validate
+    from fracsim.study.file import validate
 
     for name in ladder.rungs(4):
         assert validate(ladder.rung_study(name, 4), name).title.startswith("bench")

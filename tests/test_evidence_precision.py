@@ -14,12 +14,22 @@ from mpi4py import MPI
 from scipy.integrate import quad
 from scipy.linalg import eigh
 
-from fracsim.check import check_study
 from fracsim.run import run_study
 from fracsim.studies.evidence import precision, references
-from fracsim.studies.evidence.precision import average, beam, brazilian, finite, fracture, page, plastic, statics, wave
+from fracsim.studies.evidence.precision import (
+    average,
+    beam,
+    brazilian,
+    finite,
+    fracture,
+    page,
+    plastic,
+    statics,
+    wave,
+)
 from fracsim.studies.evidence.trial import Trial
-from fracsim.study_file import validate
+from fracsim.study.check import check_study
+from fracsim.study.file import validate
 
 Values = npt.NDArray[np.float64]
 TRIALS = precision.trials()
@@ -152,7 +162,7 @@ def test_hondros_is_the_disk_on_its_diameter() -> None:
 
 @pytest.mark.parametrize("kernel", average.KERNELS)
 def test_kernel_moments_are_integrals(kernel: str) -> None:
-    from fracsim.average import KERNELS
+    from fracsim.fracture.nonlocal_average import KERNELS
 
     weight = lambda q: float(KERNELS[kernel](np.array([q]))[0] * q)  # noqa: E731
     expected = quad(lambda q: q**2 * weight(q), 0, 1)[0] / quad(weight, 0, 1)[0]
@@ -367,7 +377,7 @@ def test_all_sections_can_be_made_of_nothing() -> None:
 
 
 def test_the_tolerances_called_default_are() -> None:
-    from fracsim.solve import DEFAULTS
+    from fracsim.stepping.newton import DEFAULTS
     from fracsim.studies.evidence.precision import finite
 
     assert (DEFAULTS["snes_rtol"], DEFAULTS["ksp_rtol"]) == finite.DEFAULT

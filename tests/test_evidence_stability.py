@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.check import check_study
 from fracsim.errors import InputError
 from fracsim.run import run_study
 from fracsim.studies.evidence import (
@@ -23,7 +22,8 @@ from fracsim.studies.evidence import (
     written,
 )
 from fracsim.studies.evidence.trial import Trial
-from fracsim.study_file import validate
+from fracsim.study.check import check_study
+from fracsim.study.file import validate
 
 TRIALS = [*stability.trials(), *dependence.trials()]
 
@@ -97,7 +97,7 @@ def test_lateral_stretch_of_hooke_is_poissons() -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_volume_ratios_are_determinants(dim: int) -> None:
     """An affine map x = A X + b has J = det A in every cell; a mirror has a negative one."""
-    from fracsim.meshes.box import lattice
+    from fracsim.meshes.builders.box import lattice
 
     points, cells = lattice((2,) * dim)
     A = np.eye(dim) + np.random.default_rng(1).normal(size=(dim, dim)) * 0.3

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from fracsim import edge_frequencies
-from fracsim.explicit import SAFETY, ExplicitStepper, stable_step
 from fracsim.forms.energies import lame
-from fracsim.frequencies import cell_frequencies, damaged_frequencies
 from fracsim.scene import Scene
-from fracsim.state import State
+from fracsim.stepping import edge_frequencies
+from fracsim.stepping.explicit import SAFETY, ExplicitStepper, stable_step
+from fracsim.stepping.frequencies import cell_frequencies, damaged_frequencies
+from fracsim.stepping.state import State
 from support.reference import lumped_mass, modes, stiffness
 from support.scenes import make_scene, march
 

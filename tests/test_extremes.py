@@ -12,7 +12,7 @@ from mpi4py import MPI
 from fracsim.run import run_study
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import extremes
-from fracsim.study_file import validate
+from fracsim.study.file import validate
 from support.ranks import Arrays, run_on_ranks
 
 

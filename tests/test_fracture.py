@@ -15,17 +15,17 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest, pearsonr
 
-from fracsim.edge_stress import edge_vectors, normal_stress
 from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
-from fracsim.fracture import FracturePass
-from fracsim.graph import is_split, local_edges
-from fracsim.kernels import CellExpression
+from fracsim.fracture.breaking import FracturePass
+from fracsim.fracture.edge_stress import edge_vectors, normal_stress
+from fracsim.fracture.strength import hashed
+from fracsim.mechanics.kernels import CellExpression
+from fracsim.mesh.simplices import is_split, local_edges
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.scene import Scene
-from fracsim.state import State
-from fracsim.strength import hashed
+from fracsim.stepping.state import State
 from fracsim.study import Fracture
 from support.laws import T_stress, rotation
 from support.oscillator import slopes

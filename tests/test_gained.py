@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fracsim.gained import Gained
+from fracsim.output.energy_gain import Gained
 
 
 def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> Gained:

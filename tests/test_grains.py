@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from fracsim.brittle.body import Body
-from fracsim.brittle.grains import Grains, least, sow
-from fracsim.mesh_source import build_mesh
+from fracsim.fracture.brittle.body import Body
+from fracsim.fracture.brittle.grains import Grains, least, sow
 from fracsim.meshes.data import MeshData
 from fracsim.study import Grains as Table
 from fracsim.study import Mesh
+from fracsim.study.mesh_source import build_mesh
 from support.brittle import Broken, cut_points, open_at
 
 ROUND_OFF = 1e3 * np.finfo(float).eps

@@ -10,7 +10,8 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.graph import EdgeGraph, is_split, local_edges, node_groups
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from support.scenes import make_scene
 
 DIMS = (2, 3)

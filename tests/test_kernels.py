@@ -13,7 +13,7 @@ from dolfinx import fem, mesh
 from dolfinx.jit import get_options
 from mpi4py import MPI
 
-from fracsim import kernels
+from fracsim.mechanics import kernels
 
 
 def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

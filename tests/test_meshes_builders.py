@@ -11,18 +11,12 @@ import numpy as np
 import pytest
 
 from fracsim.meshes import BUILDERS, MeshData, MeshError
+from fracsim.meshes.builders.figure import BLEND, RoundCone
+from fracsim.meshes.builders.vase import CONTROL
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.figure import BLEND, RoundCone
-from fracsim.meshes.level_set import level_surface
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.topology import (
-    boundary_facets,
-    distinct_rows,
-    facet_measures,
-    facets_of,
-    signed_measures,
-)
-from fracsim.meshes.vase import CONTROL
+from fracsim.meshes.surfaces.level_set import level_surface
+from fracsim.meshes.topology import boundary_facets, distinct_rows, facet_measures, facets_of, signed_measures
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("box", {"size": (1.0, 2.0), "h": 0.2}),

@@ -11,9 +11,9 @@ import pytest
 
 from fracsim.meshes import BUILDERS, MeshError
 from fracsim.meshes.data import Indices, Points
-from fracsim.meshes.fill import fill_surface
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.surface import closed_surface
+from fracsim.meshes.surfaces.closed import closed_surface
+from fracsim.meshes.surfaces.fill import fill_surface
 from fracsim.meshes.topology import boundary_facets, signed_measures
 
 Shell = tuple[Points, Indices]

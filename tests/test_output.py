@@ -24,7 +24,7 @@ from cases import BAR, STRIP, command, study, write_study
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
-from fracsim.study_file import load_study
+from fracsim.study.file import load_study
 
 Values = npt.NDArray[Any]
 COLUMNS = [
@@ -230,7 +230,7 @@ def test_a_killed_run_leaves_whole_files(tmp_path: Path) -> None:
 def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    from fracsim.picture import render
+    from fracsim.report.picture import render
 
     pixels = imread(render(output.folder, tmp_path / "shot.png"))[..., :3]
     assert pixels.shape == (900, 1400, 3)
@@ -243,8 +243,8 @@ def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
     """Not on which other pieces there are, so that it stays from frame to frame; the palette of 20 starts again."""
     import pyvista
 
-    from fracsim.picture import _add_coloured
-    from fracsim.screen import display
+    from fracsim.report.picture import _add_coloured
+    from fracsim.report.screen import display
 
     corners = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.2, 1, 0.3]])
     points = np.concatenate([corners + shift for shift in np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 1.5, 0]])])

@@ -16,10 +16,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from fracsim.mesh_source import build_mesh
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import edges_of
 from fracsim.study import Mesh
+from fracsim.study.mesh_source import build_mesh
 from support.ranks import Arrays, run_on_ranks
 from support.reference import gradients, lumped_mass
 from support.torn import KERNELS, LABELS, MESHES, RADIUS, RUNS, cell_field, is_active

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from fracsim.flow import CLOSE
 from fracsim.forms.energies import ENERGIES
-from fracsim.frames import Frames
+from fracsim.mechanics.plasticity import WEAKEST
+from fracsim.mechanics.return_mapping import CLOSE
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
-from fracsim.plasticity import WEAKEST
+from fracsim.output.fields import Frames
 from fracsim.scene import Scene
-from fracsim.state import State
+from fracsim.stepping.state import State
 from support.laws import law_of, rotation
 from support.oscillator import slopes
 from support.scenes import Values, deform, each_step, make_scene, march

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from fracsim.check import check_study
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from fracsim.study_file import validate
+from fracsim.study.check import check_study
+from fracsim.study.file import validate
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import polar
 
-from fracsim.rotation import polar_rotation
+from fracsim.mesh.small_matrices import polar_rotation
 from support.laws import Tensor, rotation
 
 EPS = np.finfo(float).eps

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fracsim.strength import along_fibre, weibull
+from fracsim.fracture.strength import along_fibre, weibull
 from fracsim.study import Fibre, Heterogeneity
 from support.scenes import make_scene, march
 

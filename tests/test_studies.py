@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.check import check_study
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.topology import boundary_facets
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.studies import folder
-from fracsim.study_file import load_study
+from fracsim.study.check import check_study
+from fracsim.study.file import load_study
 
 STUDIES = sorted(folder().glob("*.toml"))
 # study -> its cell size for a run of a second or so

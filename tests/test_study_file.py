@@ -9,10 +9,10 @@ import pytest
 
 from cases import BAR, STRIP, changed, study, write_study
 from fracsim.errors import InputError
-from fracsim.mesh_source import find_builder
 from fracsim.studies import folder
 from fracsim.study import Study
-from fracsim.study_file import load_study, study_text, validate
+from fracsim.study.file import load_study, study_text, validate
+from fracsim.study.mesh_source import find_builder
 
 Data = dict[str, Any]
 
@@ -119,7 +119,7 @@ def test_the_written_study_is_the_study(tmp_path: Path, data: Data) -> None:
 
 @pytest.mark.parametrize("path", sorted(folder().glob("*.toml")), ids=lambda path: path.stem)
 def test_studies_of_the_package_survive_being_written(tmp_path: Path, path: Path) -> None:
-    from fracsim.check import check_study
+    from fracsim.study.check import check_study
 
     first = load_study(path)
     (tmp_path / "study.toml").write_text(study_text(first))

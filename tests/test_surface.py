@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fracsim.mesh.split.build import Split, split
+from fracsim.mesh.split.follow import Rotations
+from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import boundary_facets, signed_measures
-from fracsim.surface.build import Split, split
-from fracsim.surface.follow import Rotations
-from fracsim.surface.skeleton import Skeleton
 from support.solids import (
     EPS,
     Flags,

@@ -14,12 +14,12 @@ import pytest
 import pyvista
 
 from fracsim.errors import NotConverged
-from fracsim.fields_file import Field
+from fracsim.fracture.record import cut_by_forces
 from fracsim.meshes.data import MeshData
-from fracsim.record import cut_by_forces
-from fracsim.surface.files import SurfaceFiles, columns
-from fracsim.surface.fragments import PieceNames, fragments
-from fracsim.surface.frame import FARTHEST, Frame, Surface
+from fracsim.output.fields_file import Field
+from fracsim.output.surface.files import SurfaceFiles, columns
+from fracsim.output.surface.fragments import PieceNames, fragments
+from fracsim.output.surface.frame import FARTHEST, Frame, Surface
 from support.ranks import Arrays, run_on_ranks
 from support.solids import Values, lattice, patterns, separated
 

@@ -13,9 +13,9 @@ import pyvista
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
-from fracsim.colouring import select, shown_range
 from fracsim.errors import InputError, Stopped
-from fracsim.picture import Look, Shot, exploded, find_frames, load, render
+from fracsim.report.colouring import select, shown_range
+from fracsim.report.picture import Look, Shot, exploded, find_frames, load, render
 from fracsim.run import Run
 from fracsim.scene import build_scene
 

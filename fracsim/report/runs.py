@@ -133,8 +133,8 @@ def _read_history(path: Path) -> dict[str, Values]:
 
 def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
     """How far the groups are driven whose reaction is recorded, m: against it a reaction is usually plotted."""
-    from ..laws import motion_law
-    from ..study_file import load_study
+    from ..mechanics.time_functions import motion_law
+    from ..study.file import load_study
 
     motions: dict[str, Values] = {}
     try:

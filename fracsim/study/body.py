@@ -7,13 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from .values import (
-    NonNegative,
-    Poisson,
-    Positive,
-    Strength,
-    Table,
-)
+from .values import NonNegative, Poisson, Positive, Strength, Table
 
 
 class Mesh(BaseModel):

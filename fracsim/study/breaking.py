@@ -6,15 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from .values import (
-    Finite,
-    Flag,
-    NonNegative,
-    Positive,
-    Strength,
-    Table,
-    Vector,
-)
+from .values import Finite, Flag, NonNegative, Positive, Strength, Table, Vector
 
 
 class Heterogeneity(Table):

@@ -6,14 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from .values import (
-    Finite,
-    InTime,
-    Motion,
-    Positive,
-    Table,
-    Vector,
-)
+from .values import Finite, InTime, Motion, Positive, Table, Vector
 
 
 class Box(Table):

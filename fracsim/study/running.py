@@ -7,13 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from .loading import Where
-from .values import (
-    Finite,
-    Flag,
-    Positive,
-    Table,
-    Vector,
-)
+from .values import Finite, Flag, Positive, Table, Vector
 
 
 class Time(Table):

@@ -8,9 +8,7 @@ from .body import Damping, Material, Mesh
 from .breaking import Brittle, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .running import FRACTURE_FIELDS, Output, Probe, Setting, Time
-from .values import (
-    Table,
-)
+from .values import Table
 
 
 def _moduli(material: Material) -> list[tuple[float, float]]:

@@ -137,7 +137,7 @@ class Bar:
 
 def lattice_bar(approach: str) -> Bar:
     """A bar of 1 x 0.25 m with 9 x 3 squares, so that a plane of no nodes lies in the middle."""
-    from ...meshes.box import lattice
+    from ...meshes.builders.box import lattice
 
     points, cells = lattice((9, 3))
     return Bar(points * [1.0, 0.25], cells, approach)

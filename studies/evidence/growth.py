@@ -118,10 +118,10 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
     """Figures of one case on the ranks of this process (collective); the baseline is for one rank."""
     from mpi4py import MPI
 
-    from ...parallel import total
+    from ...mesh.ranks import total
     from ...run import Run
     from ...scene import build_scene
-    from ...study_file import validate
+    from ...study.file import validate
 
     comm = MPI.COMM_WORLD
     study = validate(scene_study(case), case)
@@ -170,12 +170,12 @@ class VirtualNodes:
     def __init__(self, run: Any, whole: Any) -> None:
         """`run` has the cuts; the motion is that of the `whole` body: nodes that a cut set loose are no part of a cell
         any more, and would turn the cells inside out that the copies are."""
-        from ...domain import distribute
-        from ...equilibrium import Equilibrium
-        from ...graph import node_groups
-        from ...material import material_fields
+        from ...mechanics.balance import Equilibrium
+        from ...mechanics.material import material_fields
+        from ...mesh.domain import distribute
+        from ...mesh.simplices import node_groups
         from ...scene import make_scheme, make_stepper
-        from ...solve import Solver
+        from ...stepping.newton import Solver
         from .virtual_nodes import duplicate
 
         began = time.perf_counter()
@@ -232,7 +232,7 @@ def _facet_nodes(domain: Any, facets: Any) -> Any:
 
 def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
     """Seconds per step of the loops, one step of each in turn."""
-    from ...parallel import total
+    from ...mesh.ranks import total
     from ..bench import take_step, timed
 
     loops = {"whole": whole.scene.stepper, "cut": cut.scene.stepper}

@@ -39,10 +39,10 @@ def main() -> None:
 
 def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
-    from ...inverted import Inverted
-    from ...parallel import total
+    from ...mesh.ranks import total
+    from ...output.inverted_cells import Inverted
     from ...scene import build_scene
-    from ...study_file import validate
+    from ...study.file import validate
 
     study = extremes.bare("inside out", extremes.BAR, {"energy": energy}, steps)
     study["damping"] = {"mass": 5.0}

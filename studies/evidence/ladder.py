@@ -33,11 +33,18 @@ SHORT, LONG = 10, 20  # cells along a metre: 24k and 192k tetrahedra
 LIMIT = 1.05  # what the elastic bar may cost over the bare loop
 DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never stressed enough to break by itself
 FLOW: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
-FRACTURE_MODULES = ("fracture", "graph", "degrade", "strength", "edge_stress", "pieces", "record")
-PLASTIC_MODULES = ("plasticity", "forms.plasticity", "relaxation", "flow", "spectrum")
+FRACTURE_MODULES = (
+    "fracture.breaking", "fracture.degradation", "fracture.strength", "fracture.edge_stress", "fracture.record",
+    "mesh.edges", "mesh.pieces",
+)  # fmt: skip
+PLASTIC_MODULES = (
+    "mechanics.plasticity", "mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum",
+    "forms.plasticity",
+)  # fmt: skip
+AVERAGE, SURFACE, BRITTLE = "fracture.nonlocal_average", ("mesh.split", "output.surface"), "fracture.brittle"
 OPTIONAL = (
-    *FRACTURE_MODULES, *PLASTIC_MODULES, "average", "surface", "forms.damage", "forms.closing", "edge_frequencies",
-    "brittle", "picture", "report",
+    *FRACTURE_MODULES, *PLASTIC_MODULES, AVERAGE, *SURFACE, BRITTLE, "forms.damage", "forms.closing",
+    "stepping.edge_frequencies", "report",
 )  # fmt: skip
 YIELDING = 1.30  # what flow everywhere may cost over the elastic bar
 
@@ -69,7 +76,7 @@ class Rung:
 def rungs(n: int) -> dict[str, Rung]:
     """All rungs by name, those that this version of the program has."""
     near = {"fracture": DAMAGE["fracture"] | {"radius": 2 / n}}
-    average = (*FRACTURE_MODULES, "average")
+    average = (*FRACTURE_MODULES, AVERAGE)
     every = {
         "elastic": Rung(after=""),
         "elastic-recorded": Rung(after="recorded"),
@@ -79,14 +86,14 @@ def rungs(n: int) -> dict[str, Rung]:
         "damage-cut": Rung(DAMAGE, FRACTURE_MODULES, cut=True),
         "average": Rung(near, average),
         "average-cut": Rung(near, average, cut=True),
-        "surface": Rung(DAMAGE | {"output": {"surface": True}}, (*FRACTURE_MODULES, "surface"), cut=True),
+        "surface": Rung(DAMAGE | {"output": {"surface": True}}, (*FRACTURE_MODULES, *SURFACE), cut=True),
         # both with as many Newton iterations as they need; every cell yields after a few steps
         "newton": Rung({"solver": None}),
         "plasticity": Rung(FLOW, PLASTIC_MODULES, after="newton"),
         # the forces of the elastic bar, which its residual is measured by, grow: it comes to need one iteration only
         "plasticity-later": Rung(FLOW, PLASTIC_MODULES, after="newton", first=30),
         "brittle": Rung(
-            DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, "brittle"), needs="brittle"
+            DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, BRITTLE), needs="brittle"
         ),
         "plane": Rung(plane=True),
         "plane-damage": Rung(DAMAGE, FRACTURE_MODULES, plane=True, after="plane"),
@@ -149,7 +156,7 @@ def started(name: str, n: int, folder: Path) -> Any:
 
     from ...run import Run
     from ...scene import build_scene
-    from ...study_file import validate
+    from ...study.file import validate
 
     run = Run(build_scene(MPI.COMM_WORLD, validate(rung_study(name, n), name)), folder)
     if rungs(n)[name].cut:

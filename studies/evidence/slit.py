@@ -107,7 +107,7 @@ def unstructured(specimen: Specimen, h: float) -> Data:
 
 def structured(specimen: Specimen, h: float) -> Any:
     """A lattice of squares h in two triangles each, without those in the slit."""
-    from ...meshes.box import lattice
+    from ...meshes.builders.box import lattice
     from ...meshes.data import MeshData
     from ...meshes.topology import boundary_facets, plane_groups
 

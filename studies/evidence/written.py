@@ -72,7 +72,7 @@ def _pulled_apart(d: int) -> dict[str, Any]:
 
 
 def _halves() -> Any:
-    from ...meshes.box import Box
+    from ...meshes.builders.box import Box
 
     made = Box(size=(1.0, 0.25, 0.25), h=0.125).build()
     heavy = np.flatnonzero(made.points[made.cells][:, :, 0].mean(axis=1) < 0.5)

@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import pyvista
 
-from fracsim.brittle.body import Body
-from fracsim.brittle.level_set import DirectionField
-from fracsim.brittle.pattern import Load, Opened, Pattern
+from fracsim.fracture.brittle.body import Body
+from fracsim.fracture.brittle.level_set import DirectionField
+from fracsim.fracture.brittle.pattern import Load, Opened, Pattern
+from fracsim.mesh.split.build import Split, split
+from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
+from fracsim.output.surface.fragments import volumes
 from fracsim.scene import Scene
 from fracsim.study import Brittle
-from fracsim.surface.build import Split, split
-from fracsim.surface.fragments import volumes
-from fracsim.surface.skeleton import Skeleton
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.inverted import Inverted
+from fracsim.output.inverted_cells import Inverted
 from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence import extremes
-from fracsim.study_file import validate
+from fracsim.study.file import validate
 
 
 def stepped(study: dict[str, Any], steps: int) -> tuple[Scene, Any, Any]:

@@ -17,7 +17,7 @@ from ufl.algorithms.expand_indices import expand_indices
 from ufl.algorithms.transformer import strip_variables
 
 from fracsim.forms.energies import Energy, cauchy_stress, first_piola_kirchhoff, full_cauchy_stress
-from fracsim.graph import local_edges
+from fracsim.mesh.simplices import local_edges
 
 Tensor = npt.NDArray[np.float64]
 

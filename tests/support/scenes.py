@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from fracsim.meshes.data import MeshData
 from fracsim.scene import Scene, build_scene
-from fracsim.state import State
-from fracsim.stepping import Report
+from fracsim.stepping.implicit import Report
+from fracsim.stepping.state import State
 from fracsim.study import Study
 
 Values = npt.NDArray[np.float64]

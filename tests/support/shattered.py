@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.record import EdgeRecord
+from fracsim.fracture.record import EdgeRecord
 from fracsim.scene import Scene
 
 from .scenes import make_scene, march

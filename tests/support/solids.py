@@ -11,10 +11,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
+from fracsim.mesh.split.build import Split, split
+from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import oriented, signed_measures
-from fracsim.surface.build import Split, split
-from fracsim.surface.skeleton import Skeleton
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.pieces import find_pieces
-from fracsim.record import EdgeRecord
-from fracsim.surface.output import SurfaceOutput
+from fracsim.fracture.record import EdgeRecord
+from fracsim.mesh.pieces import find_pieces
+from fracsim.output.surface.output import SurfaceOutput
 
 from .scenes import each_step, make_scene
 from .torn import RUNS, TIGHT, Found

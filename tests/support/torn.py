@@ -14,15 +14,15 @@ import numpy.typing as npt
 from dolfinx.fem import IntegralType
 from mpi4py import MPI
 
-from fracsim import average as average_module
-from fracsim.average import NonlocalAverage
-from fracsim.domain import Domain
-from fracsim.graph import EdgeGraph
-from fracsim.parallel import total
-from fracsim.pieces import find_pieces
+from fracsim.fracture import nonlocal_average as average_module
+from fracsim.fracture.nonlocal_average import NonlocalAverage
+from fracsim.fracture.strength import hashed
+from fracsim.mesh.domain import Domain
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.pieces import find_pieces
+from fracsim.mesh.ranks import total
 from fracsim.scene import Scene
-from fracsim.state import State
-from fracsim.strength import hashed
+from fracsim.stepping.state import State
 
 from .scenes import Values, each_step, make_scene
 

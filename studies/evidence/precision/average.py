@@ -37,8 +37,8 @@ def measure(parts: int) -> dict[str, float]:
     import numpy as np
     from mpi4py import MPI
 
-    from ....average import NonlocalAverage
-    from ....domain import distribute
+    from ....fracture.nonlocal_average import NonlocalAverage
+    from ....mesh.domain import distribute
     from ....meshes import BUILDERS
 
     maker: Any = BUILDERS["box"]

@@ -199,8 +199,8 @@ def _cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
 
 def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
-    from ....preconditioner import MULTIGRID
-    from ....solve import DEFAULTS
+    from ....stepping.newton import DEFAULTS
+    from ....stepping.preconditioner import MULTIGRID
     from ....study import Plasticity, Time
 
     ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}

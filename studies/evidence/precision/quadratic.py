@@ -26,10 +26,10 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
     from dolfinx import fem
     from mpi4py import MPI
 
-    from ....check import checked_mesh
-    from ....domain import distribute
-    from ....loads import surface_measure
-    from ....study_file import validate
+    from ....mechanics.loads import surface_measure
+    from ....mesh.domain import distribute
+    from ....study.check import checked_mesh
+    from ....study.file import validate
 
     checked = validate(study, "quadratic")
     domain = distribute(MPI.COMM_SELF, checked_mesh(checked))

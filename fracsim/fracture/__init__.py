@@ -1,0 +1,1 @@
+"""What breaks, and what that takes out of the stress."""

@@ -1,0 +1,111 @@
+"""Grain boundaries (B07 section 7.1): nodes belong to the seeded point p_i with the least energy k_i |x - p_i|.
+
+B07 cuts at the zero of (E_i - E_j) / 2, linear between nodes. The difference of the squares has the same zero, and is
+linear along an edge where the weights are equal: then the boundaries are planes exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ...study import Grains as GrainsTable
+from .body import Body
+from .sheet import NEAREST, ROUNDS
+
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+Values = npt.NDArray[np.float64]
+
+CHUNK = 1 << 22  # distances held at a time
+
+
+class Grains:
+    """Grains of a body.
+
+    Attributes:
+        seeds: (n, d) m, uniform in the body.    weights: (n,) k_i.
+        mode: see study.Grains.
+        of_node: (N,) grain of each node.    of_cell: (C,) grain of each centroid.
+        edges: (k,) edges between grains.    cut: (k,) where their boundaries cut them, from the lower node.
+    """
+
+    def __init__(self, body: Body, table: GrainsTable, settle: bool) -> None:
+        """`settle`: no node without a cell in its own grain, as far as its cells allow."""
+        self.mode = table.mode
+        self.seeds, self.weights = sow(body, table)
+        self.of_node, _ = least(body.points, self.seeds, self.weights)
+        self.of_cell, _ = least(body.centroids, self.seeds, self.weights)
+        if settle:
+            self.of_node = _settled(body.cells, self.of_node)
+        both = self.of_node[body.edges]
+        self.edges: Ints = np.flatnonzero(both[:, 0] != both[:, 1])
+        self._ends = both[self.edges]
+        self.cut = self._cuts(body.points[body.edges[self.edges]], self._ends)
+
+    def cut_of(self, edges: Ints) -> Values:
+        """(n,) where edges between grains are cut."""
+        return self.cut[np.searchsorted(self.edges, edges)]
+
+    def edges_of(self, grain: int) -> Ints:
+        """The edges that leave a grain."""
+        return self.edges[(self._ends == grain).any(axis=1)]
+
+    def mean(self, phi: Values) -> Values:
+        """(n,) mean of nodal values over each grain."""
+        count = len(self.weights)
+        nodes = np.bincount(self.of_node, minlength=count)
+        return np.asarray(np.bincount(self.of_node, phi, minlength=count) / np.maximum(nodes, 1))
+
+    def _cuts(self, ends: Values, grain: Ints) -> Values:
+        """(k,) zeros of E_j^2 - E_i^2 on edges whose ends (k, 2, d) belong to grains (k, 2) i and j."""
+        lead = [self._energy2(ends[:, a], grain[:, 1 - a]) - self._energy2(ends[:, a], grain[:, a]) for a in (0, 1)]
+        first, second = (np.maximum(each, 0.0) for each in lead)  # below 0: a node that was moved over
+        both = first + second
+        return np.clip(np.divide(first, both, out=np.full(len(both), 0.5), where=both > 0), NEAREST, 1 - NEAREST)
+
+    def _energy2(self, points: Values, grain: Ints) -> Values:
+        return np.asarray(self.weights[grain] ** 2 * np.sum((points - self.seeds[grain]) ** 2, axis=1))
+
+
+def sow(body: Body, table: GrainsTable) -> tuple[Values, Values]:
+    """Points drawn uniformly from the body, (n, d) in m, and weights (n,) drawn from 1 - spread to 1 + spread."""
+    random = np.random.Generator(np.random.PCG64(table.seed))
+    share = np.cumsum(body.volumes)
+    cell = np.searchsorted(share / share[-1], random.random(table.count), side="right")
+    inside = random.dirichlet(np.ones(body.dim + 1), table.count)
+    seeds = np.einsum("nk,nki->ni", inside, body.points[body.cells[np.minimum(cell, len(body.cells) - 1)]])
+    return seeds, random.uniform(1 - table.spread, 1 + table.spread, table.count)
+
+
+def least(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]:
+    """For each point the seed of least energy k_i |x - p_i|, the first where several are, and that energy (k m)."""
+    label, energy = np.empty(len(points), np.int64), np.empty(len(points))
+    rows = max(CHUNK // len(seeds), 1)
+    for first in range(0, len(points), rows):
+        part = slice(first, first + rows)
+        every = np.linalg.norm(points[part, None] - seeds, axis=2) * weights
+        label[part] = every.argmin(axis=1)
+        energy[part] = every.min(axis=1)
+    return label, energy
+
+
+def _settled(cells: Ints, grain: Ints) -> Ints:
+    """Grains (N,) with the nodes moved over that have no cell within their own grain, into one where they have."""
+    grain = grain.copy()
+    for _ in range(ROUNDS):
+        of = grain[cells]
+        within = np.all(of == of[:, :1], axis=1)
+        lost = np.ones(len(grain), bool)
+        lost[cells[within]] = False
+        if not lost.any():
+            break
+        moved = grain.copy()
+        for corner in range(cells.shape[1]):
+            rest = np.delete(of, corner, axis=1)
+            one = np.all(rest == rest[:, :1], axis=1) & lost[cells[:, corner]]
+            moved[cells[one, corner]] = rest[one, 0]
+        if np.array_equal(moved, grain):
+            break
+        grain = moved
+    return grain

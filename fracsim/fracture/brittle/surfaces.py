@@ -1,0 +1,110 @@
+"""The part of the fracture pass that starts surfaces and breaks the edges that they cut."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...mechanics.balance import Equilibrium
+from ...mesh.edges import EdgeGraph
+from ...mesh.ranks import from_root, total
+from ...study import Brittle
+from ..strength import Strength
+from .level_set import DirectionField
+from .pattern import Load, Opened, Pattern
+from .principal import largest, tensors, upper_bound
+
+Cells = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+SPACING = 4.0  # default distance of starts, in sides of a mean cell's cube: about two mesh edges
+
+
+class BrittleSurfaces:
+    """Surfaces where the averaged principal stress of cells reaches their strength, the mean over their edges.
+
+    Attributes:
+        starts: (n, d) where the surfaces so far have started, m; the same on every rank.
+        cut: (edges,) where surfaces cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
+        spacing: least distance of starts, m.
+    """
+
+    def __init__(self, equations: Equilibrium, graph: EdgeGraph, strength: Strength, brittle: Brittle) -> None:
+        self._equations, self._graph, self._strength, self._brittle = equations, graph, strength, brittle
+        self._domain = equations.domain
+        self.spacing = brittle.spacing if brittle.spacing is not None else SPACING * self._domain.mean_edge
+        self.starts: Values = np.empty((0, self._domain.dim))
+        self.cut: Values = np.full(len(graph.broken), np.nan)
+        self._pattern: Pattern | None = None
+
+    @property
+    def left(self) -> int:
+        """Surfaces that may still start."""
+        return self._brittle.surfaces - len(self.starts)
+
+    def __call__(self, cells: Cells, averaged: Values, everywhere: Callable[[], Values]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the edges that new surfaces cut (collective).
+
+        `cells`: those that may be overloaded, and their averaged stress (n, 3 or 6) in Pa. `everywhere`: that of all
+        cells, worked out where surfaces follow it.
+        """
+        load = self._overloaded(cells, averaged)
+        if not total(self._domain.comm, len(load.cell))[0]:
+            return np.zeros(len(self.cut), bool)
+        parts = self._domain.comm.gather(load)
+        field = self._field(everywhere()) if self._brittle.shape == "curved" else None
+        broken = self._graph.broken_keys()
+        opened: Opened = from_root(self._domain.comm, lambda: self._open(parts, broken, field))
+        self.starts = np.concatenate([self.starts, opened.starts])
+        return self._cut_edges(opened)
+
+    def _overloaded(self, cells: Cells, averaged: Values) -> Load:
+        """Those of the cells whose largest principal stress reaches their strength."""
+        dim = self._domain.dim
+        stress = tensors(averaged, dim)
+        may = np.flatnonzero(upper_bound(stress) >= self._strength.weakest)
+        cells, stress = cells[may], stress[may]
+        load = largest(stress) / self._strength_of(cells)
+        over = np.flatnonzero(load >= 1)
+        cells = cells[over]
+        return Load(self._domain.cell_input[cells], load[over], stress[over], self._gradients(cells))
+
+    def _strength_of(self, cells: Cells) -> Values:
+        """(n,) Pa: the mean over the edges of each cell."""
+        return np.asarray(self._strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
+
+    def _gradients(self, cells: Cells) -> Values:
+        """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0)."""
+        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._equations.corners(cells)
+        span, moved = (corners[:, 1:] - corners[:, :1] for corners in (rest, now))
+        return np.swapaxes(np.linalg.solve(span, moved), 1, 2)
+
+    def _field(self, averaged: Values) -> tuple[Any, ...]:
+        """Stress, F and strength of all cells in input order, on rank 0 (collective)."""
+        every = np.arange(self._domain.cell_count)
+        stress = tensors(averaged, self._domain.dim)
+        parts = stress, self._gradients(every), self._strength_of(every)
+        return tuple(self._domain.gather_cells(part) for part in parts)
+
+    def _open(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> Opened:
+        """What the pass opens, on rank 0."""
+        if self._pattern is None:
+            assert self._domain.source is not None
+            settle = self._equations.chi is not None
+            self._pattern = Pattern(self._domain.source, self._brittle, self.spacing, settle)
+        load = Load(*(np.concatenate([getattr(part, name) for part in parts]) for name in Load.__annotations__))
+        order = np.argsort(load.cell)
+        load = Load(*(getattr(load, name)[order] for name in Load.__annotations__))
+        most = min(self.left, self._brittle.per_pass or self.left)
+        along = DirectionField.of(self._pattern.body, *field) if field is not None else None
+        return self._pattern.open(load, broken, self.starts, most, along)
+
+    def _cut_edges(self, opened: Opened) -> npt.NDArray[np.bool_]:
+        """Flags of local edges; where they are cut is kept."""
+        flags = np.zeros(len(self.cut), bool)
+        local, place = self._graph.find_keys(opened.keys)
+        flags[local], self.cut[local] = True, opened.cut[place]
+        return flags

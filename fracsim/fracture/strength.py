@@ -1,0 +1,99 @@
+"""Strength of an edge in a cell: by region, with a hashed tie-break, and scatter and a fibre where the study asks.
+
+    s_e = strength(cell) (1 + tie_break h_e) w_e f_e
+
+h_e in [-1, 1) is hashed from the edge's reference mid-point; w_e is a Weibull number of mean 1 drawn from the same
+place and a seed, w = (-ln(1 - U))^(1/m) / Gamma(1 + 1/m); f_e = 1 + (ratio - 1) (n . a)^2 for the edge's reference
+direction n and the fibre a. All of them belong to the place of the edge, so that no partition changes them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..mechanics.material import PerCell, per_cell
+from ..mechanics.time_functions import of_size
+from ..mesh.edges import EdgeGraph
+from ..study import Fibre, Fracture, Heterogeneity, Material
+
+Values = npt.NDArray[np.float64]
+
+
+class Strength:
+    """Pa, for edges of cells of a distributed mesh."""
+
+    def __init__(self, graph: EdgeGraph, fracture: Fracture, material: Material) -> None:
+        self._graph = graph
+        self._of_cell: PerCell = per_cell(graph.domain, fracture, "strength", material.regions)
+        self._factor = self._edge_factors(fracture)
+        smallest = float(np.min(self._factor, initial=np.inf)) if self._factor is not None else 1.0
+        self._tie_break = fracture.tie_break
+        weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - fracture.tie_break)
+        self.weakest = graph.domain.comm.allreduce(weakest, op=MPI.MIN)  # no edge of the body is weaker
+
+    def __call__(self, cells: npt.NDArray[np.int64], edges: npt.NDArray[np.int32]) -> Values:
+        """(n, k) strengths of the (n, k) local edges of n cells."""
+        base = self._of_cell[cells, None] if isinstance(self._of_cell, np.ndarray) else self._of_cell
+        factor = 1.0 if self._factor is None else self._factor[edges]
+        return np.asarray(base * factor * (1 + self._tie_break * self.noise(edges)))
+
+    def noise(self, edges: npt.NDArray[np.int32]) -> Values:
+        """Numbers in [-1, 1) hashed from the mid-points of local edges; worked out only for those asked for."""
+        if not self._tie_break:
+            return np.zeros(edges.shape)
+        unique, inverse = np.unique(edges, return_inverse=True)
+        return hashed(self._twice_middle(unique))[inverse.reshape(edges.shape)]
+
+    def _twice_middle(self, edges: npt.NDArray[np.integer]) -> Values:
+        ends = self._graph.domain.nodes[self._graph.edge_nodes[edges]]
+        return ends[:, 0] + ends[:, 1]
+
+    def _edge_factors(self, fracture: Fracture) -> Values | None:
+        """w_e f_e of every local edge; None where all of them are 1."""
+        if fracture.heterogeneity is None and fracture.fibre is None:
+            return None
+        factor = np.ones(len(self._graph.broken))
+        if fracture.heterogeneity is not None:
+            factor *= weibull(self._twice_middle(np.arange(len(factor))), fracture.heterogeneity)
+        if fracture.fibre is not None:
+            factor *= along_fibre(self._directions(), fracture.fibre)
+        return factor
+
+    def _directions(self) -> Values:
+        ends = self._graph.domain.nodes[self._graph.edge_nodes]
+        return ends[:, 1] - ends[:, 0]
+
+
+def weibull(points: Values, heterogeneity: Heterogeneity) -> Values:
+    """Weibull numbers of mean 1 and the given modulus, one a place."""
+    m = heterogeneity.modulus
+    survival = (1 - hashed(points, heterogeneity.seed)) / 2  # 1 - U, in (0, 1]
+    return np.asarray((-np.log(survival)) ** (1 / m) / math.gamma(1 + 1 / m), np.float64)
+
+
+def along_fibre(vectors: Values, fibre: Fibre) -> Values:
+    """1 + (ratio - 1) cos^2 of the angle between edges ((n, d) vectors) and the fibre: `ratio` along it, 1 across."""
+    a = of_size(fibre.direction, vectors.shape[1], "fracture.fibre.direction")
+    cosine2 = (vectors @ a) ** 2 / (np.einsum("ni,ni->n", vectors, vectors) * (a @ a))
+    return np.asarray(1 + (fibre.ratio - 1) * cosine2)
+
+
+def hashed(points: Values, seed: int = 0) -> Values:
+    """Numbers in [-1, 1), one a point, from a seed and the bits of its coordinates (splitmix64's finaliser)."""
+    places = np.ascontiguousarray(points + 0.0, float)  # + 0.0: -0 and 0 are one place
+    bits: npt.NDArray[np.uint64] = places.view(np.uint64)
+    state: npt.NDArray[np.uint64] = np.full(len(points), seed, np.uint64)
+    for column in bits.T:
+        state = _mix(state ^ column)
+    return (state >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0
+
+
+def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    x = x + np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))

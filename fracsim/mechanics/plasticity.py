@@ -1,0 +1,102 @@
+"""What cells remember of plastic flow: F_p with det F_p = 1, and the accumulated plastic strain (M22 section 3.7)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from ..forms.plasticity import Plastic
+from ..mesh.domain import Domain
+from ..study import Study
+from .flow_prediction import Extrapolated, Implicit, Relaxation
+from .material import MaterialFields, PerCell, per_cell
+
+Values = npt.NDArray[np.float64]
+Cells = npt.NDArray[np.int32]
+
+WEAKEST = 0.01  # share of the yield stress that softening leaves
+
+
+class Plasticity:
+    """What the cells remember of their flow.
+
+    Attributes:
+        inverse: F_p^-1, DG0, 3 x 3; while a step is solved, what `relaxation` puts in its place.
+        rows: (cells, 9) its values.
+        strain: (cells,) accumulated plastic strain alpha.
+        relaxation: what flow takes off the stress while a step is solved; None where flow only follows it.
+        fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
+    """
+
+    def __init__(self, domain: Domain, study: Study, material: MaterialFields) -> None:
+        table = study.plasticity
+        assert table is not None
+        self.rate, self.hardening, self.frobenius = table.flow_rate, table.hardening, table.measure == "frobenius"
+        self.dt, self.fraction = 0.0, 0.0
+        self._yield: PerCell = per_cell(domain, table, "yield_stress", study.material.regions)
+        self._modulus: PerCell = 3 * material.mu
+        self.strain = np.zeros(domain.cell_count)
+        self.inverse = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (3, 3))), name="inverse plastic part")
+        self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: domain.cell_count]
+        self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
+        self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
+        # explicit steps know u before the stress is asked for: nothing need be extrapolated
+        known = table.update == "extrapolated" and study.time.scheme == "explicit"
+        self.relaxation = self._relaxation(domain, "implicit" if known else table.update)
+        self.refresh()
+
+    def _relaxation(self, domain: Domain, update: str) -> Relaxation | None:
+        if update == "implicit":
+            return Implicit(domain, self.energy, self.frobenius)
+        return Extrapolated(self.rows) if update == "extrapolated" else None
+
+    def resistance(self, strain: Values, cells: Cells | slice = slice(None)) -> Values:
+        """Y = yield_stress + K alpha of cells with the given alpha, Pa; never below a small share of yield_stress."""
+        start = self._yield[cells] if isinstance(self._yield, np.ndarray) else self._yield
+        return np.maximum(start + self.hardening * strain, WEAKEST * start)
+
+    def refresh(self) -> None:
+        """What flow within a step has to know of `strain`."""
+        if not isinstance(self.relaxation, Implicit):
+            return
+        Y = self.resistance(self.strain)
+        soft = (self.hardening < 0) & (WEAKEST * self._yield >= Y)  # as soft as it gets
+        self.relaxation.refresh(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
+
+    def memory(self) -> Values:
+        """(cells, 10) F_p^-1 and alpha, for a checkpoint; with six of the last flow between them where it matters."""
+        self.begin(0.0)  # a step that failed may have left another in its place
+        last = [self.relaxation.memory] if isinstance(self.relaxation, Extrapolated) else []
+        return np.column_stack([self.rows, *last, self.strain])
+
+    def restore(self, memory: Values) -> None:
+        """Take up what `memory` gave, whichever the update was."""
+        self.rows[:] = memory[:, :9]
+        self.strain[:] = memory[:, -1]
+        if isinstance(self.relaxation, Extrapolated) and memory.shape[1] > 10:
+            self.relaxation.memory = memory[:, 9:-1]
+        self.refresh()
+
+    def begin(self, dt: float) -> None:
+        """A step of dt is to be solved; with 0: it is done."""
+        self.dt, self.fraction = dt, -math.expm1(-self.rate * dt) if dt else 0.0
+        if self.relaxation is not None:
+            self.relaxation.begin(dt, self.fraction)
+
+
+def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
+    """F_p^-1; in plane strain with the zeros written out, so that no kernel multiplies by them."""
+    if dim == 3:
+        return inverse
+    return ufl.as_tensor([[inverse[0, 0], inverse[0, 1], 0], [inverse[1, 0], inverse[1, 1], 0], [0, 0, inverse[2, 2]]])
+
+
+def plastic_material(domain: Domain, study: Study, material: MaterialFields) -> MaterialFields:
+    """The material with an energy of the elastic part of F, and with what its cells remember."""
+    plastic = Plasticity(domain, study, material)
+    return replace(material, energy=plastic.energy, plastic=plastic)

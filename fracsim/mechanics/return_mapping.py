@@ -1,0 +1,201 @@
+"""Plastic flow at the end of a step: the elastic stretches of cells past yield flow back to the yield surface.
+
+With F_e = U Sigma V^T and the logarithmic deviator e = V dev(log Sigma) V^T of the elastic stretch a cell flows by
+
+    F_p <- exp(beta e) F_p,    exp(beta e) = V (det(Sigma)^(-1/3) Sigma)^beta V^T,
+
+which leaves F_e <- F_e exp(-beta e) and det F_p = 1. M22 eq. 30 prints the factors the other way round; but V belongs
+to the configuration between F_p and F_e: only in this order do the stretches of F_e shrink along their own axes. The
+accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the root of
+
+    q(beta) - Y(alpha + beta sqrt(2/3) |e|) = exp(-nu dt) (q(0) - Y(alpha)),
+
+q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) where
+the body is held, however it is cut into steps, and is gone at once for nu -> infinity. Eq. 31 is the first guess of the
+root without hardening (with nu for 1 - exp(-nu dt), so that halving the step would double the flow).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..forms.plasticity import Trial
+from .kernels import CellExpression
+from .plasticity import Plasticity
+from .spectrum import deviatoric_power, eigenvalues, times
+
+if TYPE_CHECKING:
+    from .balance import Equilibrium
+
+Values = npt.NDArray[np.float64]
+Cells = npt.NDArray[np.int32]
+
+CLOSE = 1e-6  # of the stress: how near the root is found
+ITERATIONS = 12  # of the secant; one does for small elastic strains
+BLOCK = 4096  # cells at a time: their arrays stay in the cache
+
+
+class Flow:
+    """The flow of a step, once its displacement is known.
+
+    Attributes:
+        stored: this rank's share of int psi dX after it, J; without damage.
+    """
+
+    def __init__(self, equations: Equilibrium) -> None:
+        plastic = equations.material.plastic
+        assert plastic is not None
+        self.plastic: Plasticity = plastic
+        self._equations, domain = equations, equations.domain
+        rotation = equations.rotation.field if equations.rotation is not None else None
+        trial, of = Trial(plastic.energy, equations.u, rotation), (domain.comm, domain.mesh)
+        self._state = CellExpression(*of, trial.state(), domain.cell_count)
+        self.stress = CellExpression(*of, trial.measures(), domain.cell_count)
+        self._before: tuple[Cells, Values, Values] | None = None
+
+    def begin(self, dt: float) -> None:
+        """The flow to come is that of a step of dt."""
+        self.plastic.begin(dt)
+
+    def __call__(self) -> float:
+        """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
+        plastic, dt = self.plastic, self.plastic.dt
+        self._put_back()
+        state = self._state()
+        measure, Y = self.measured(state), plastic.resistance(plastic.strain)
+        cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
+        self._before = cells, plastic.rows[cells], plastic.strain[cells]
+        power, lost, psi = np.empty((6, len(cells))), 0.0, state[:, 2]
+        if plastic.fraction > 0:
+            for part in (slice(k, k + BLOCK) for k in range(0, len(cells), BLOCK)):
+                where = cells[part]
+                block = _Return(self, where, state[where], measure[where])
+                power[:, part] = block.find()
+                lost += self._lost(block)
+                psi[where] = block.after[:, 2]
+        self.stored = float(self._equations.domain.volumes @ psi)
+        if plastic.relaxation is not None and dt:
+            plastic.relaxation.flowed(cells, power, dt)
+        plastic.begin(0.0)
+        if len(cells) and plastic.hardening:
+            plastic.refresh()
+        return lost
+
+    def undo(self) -> None:
+        """Take the last flow back: the step will be solved again."""
+        assert self._before is not None
+        cells, inverse, strain = self._before
+        self.plastic.rows[cells], self.plastic.strain[cells] = inverse, strain
+        if self.plastic.relaxation is not None:
+            self.plastic.relaxation.undo()
+        self.plastic.refresh()
+
+    def _put_back(self) -> None:
+        """F_p of the step's start, in place of what it was solved with."""
+        if self.plastic.relaxation is None:
+            return
+        self.plastic.relaxation.begin(0.0, 0.0)
+        if self.plastic.relaxation.form is None and self._equations.rotation is not None:
+            self._equations.rotation.update()  # it was that of another F_e
+
+    def measured(self, stress: Values) -> Values:
+        """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
+        vm, p = stress[:, 0], stress[:, 1]
+        return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
+
+    def _lost(self, block: _Return) -> float:
+        """Energy that a block of cells lost, J; takes up their plastic strain."""
+        plastic, cells = self.plastic, block.cells
+        flowed = block.beta * block.size
+        plastic.strain[cells] = block.alpha + flowed
+        gain = plastic.resistance(plastic.strain[cells], cells) - plastic.resistance(block.alpha, cells)
+        # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
+        (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
+        over = block.J * (vm_trial - vm) + gain
+        chi = 1.0 if self._equations.chi is None else self._equations.chi.x.array[cells]
+        return float(np.sum(chi * self._equations.domain.volumes[cells] * (psi_trial - psi - over / 2 * flowed)))
+
+
+class _Return:
+    """Cells past yield on their way back to the yield surface.
+
+    Attributes:
+        trial, after: (n, 3) measures before and after.    alpha: (n,) accumulated plastic strain before.
+        size: (n,) sqrt(2/3) |e|.    beta: (n,) the root.
+    """
+
+    def __init__(self, flow: Flow, cells: Cells, state: Values, measure: Values) -> None:
+        self._flow, self.cells, self._measure = flow, cells, measure
+        plastic = flow.plastic
+        self.alpha, self._start = plastic.strain[cells], np.ascontiguousarray(plastic.rows[cells].T)
+        self.trial, self._C = state[:, :3], np.ascontiguousarray(state[:, 3:].T)
+        self._values = eigenvalues(self._C)
+        logs = np.log(self._values)
+        self._logs = logs - logs.mean(axis=0)
+        self.size = np.sqrt(np.sum(self._logs**2, axis=0) / 6)  # e is half the deviator of log C
+        self._excess = measure - plastic.resistance(self.alpha, cells)
+        self.after, self._power = self.trial.copy(), np.empty_like(self._C)
+
+    @cached_property
+    def J(self) -> Values:
+        """(n,) det F."""
+        return np.sqrt(np.prod(self._values, axis=0))
+
+    def find(self) -> Values:
+        """Let the cells flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
+
+        Where the last two excesses promise that the next secant step is the root (errors of the secant multiply), it is
+        taken and not looked at. A beta of 1 has no deviator left to relax: the Frobenius norm of a large pressure may
+        stay above yield.
+        """
+        plastic, q = self._flow.plastic, self._measure
+        before, g_before = np.zeros(len(q)), plastic.fraction * self._excess
+        self.beta = np.clip(g_before / (q + np.maximum(plastic.hardening, 0.0) * self.size), 0.0, 1.0)
+        live: Any = slice(None)  # those whose root is not found
+        for last in (False,) * (ITERATIONS - 1) + (True,):
+            now, g = self.beta[live].copy(), self._left(live)
+            # the step that led here, once more
+            share = np.divide(g, g_before[live] - g, out=np.zeros_like(g), where=g != g_before[live])
+            self.beta[live] = np.clip(now + share * (now - before[live]), 0.0, 1.0)
+            near = CLOSE * q[live]
+            sure = (np.abs(g) <= near) | (g * g <= near * np.abs(g_before[live])) | ((now == 1) & (g > 0)) | last
+            self._settle(_among(live, sure), now[sure])
+            if sure.all():
+                break
+            before[live], g_before[live] = now, g
+            live = _among(live, ~sure)
+        return self._power
+
+    def _left(self, live: Any) -> Values:
+        """What the excess of cells is above exp(-nu dt) of the old one, Pa, at their beta."""
+        plastic, cells = self._flow.plastic, self.cells[live]
+        self._relax(live)
+        self.after[live] = stress = self._flow.stress(cells)
+        Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], cells)
+        return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
+
+    def _settle(self, cells: Any, before: Values) -> None:
+        """A last step from the beta `before`: small, so that the measures go along straight lines."""
+        self._relax(cells)
+        step, now = self.beta[cells] - before, self.after[cells]
+        slope = np.divide(step, before, out=np.zeros_like(step), where=before > 0)
+        now[:, :2] += slope[:, None] * (now - self.trial[cells])[:, :2]
+        now[:, 2] -= self.J[cells] * now[:, 0] * self.size[cells] * step  # s : e of a von Mises stress along e
+        self.after[cells] = now
+
+    def _relax(self, cells: Any) -> None:
+        """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
+        power = deviatoric_power(self._C[:, cells], self._values[:, cells], self._logs[:, cells], -self.beta[cells] / 2)
+        self._flow.plastic.rows[self.cells[cells]] = times(self._start[:, cells], power).T
+        self._power[:, cells] = power
+
+
+def _among(cells: Any, mask: npt.NDArray[np.bool_]) -> Any:
+    """`cells` narrowed to those of the mask; where that is all of them, without a copy."""
+    if mask.all():
+        return cells
+    return np.flatnonzero(mask) if isinstance(cells, slice) else cells[mask]

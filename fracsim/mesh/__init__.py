@@ -1,0 +1,10 @@
+"""The mesh of a run: distributed, with edges that break and pieces that come apart.
+
+ranks           small collective operations; errors that reach every rank
+domain          the partitioned mesh with its named groups, function spaces, and maps to the input mesh
+simplices       edges of a triangle or tetrahedron, and what every pattern of broken ones means
+small_matrices  arrays of 2 x 2 and 3 x 3 matrices
+edges           the edges of the mesh and their integrity
+pieces, bodies  connected components under intact edges; of the mesh as it was built
+split           geometry of the split surface
+"""

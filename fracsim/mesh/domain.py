@@ -1,0 +1,256 @@
+"""The body: a distributed mesh with named groups, made from the plain arrays of a builder or reader."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import basix.ufl
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+from dolfinx import cpp, fem
+from dolfinx.io import distribute_entity_data
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..meshes.data import MeshData
+from ..study import Box, Plane
+from .ranks import Gather, total
+
+Ints = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A partitioned simplex mesh without ghost cells: every cell belongs to one rank.
+
+    Attributes:
+        mesh: DOLFINx mesh of P1 geometry.
+        facets: group name -> local facet indices.
+        region_names: names of the regions, in the order of `region`.
+        region: (cells,) index into region_names of each owned cell, -1 outside every region.
+        source: the mesh as it was built or read, on rank 0 only (for output and checkpoints, which keep its order).
+        lower, upper: corners of the bounding box, m.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    facets: dict[str, Ints]
+    region_names: list[str]
+    region: npt.NDArray[np.int32]
+    lower: npt.NDArray[np.float64]
+    upper: npt.NDArray[np.float64]
+    source: MeshData | None = None
+
+    @property
+    def comm(self) -> MPI.Intracomm:
+        comm: MPI.Intracomm = self.mesh.comm
+        return comm
+
+    @property
+    def dim(self) -> int:
+        return int(self.mesh.topology.dim)
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the bounding box, m."""
+        return float(np.linalg.norm(self.upper - self.lower))
+
+    @property
+    def cell_count(self) -> int:
+        """Owned cells."""
+        return int(self.mesh.topology.index_map(self.dim).size_local)
+
+    @cached_property
+    def space(self) -> fem.FunctionSpace:
+        """P1 displacement."""
+        return fem.functionspace(self.mesh, ("Lagrange", 1, (self.dim,)))
+
+    @cached_property
+    def cell_scalar(self) -> fem.FunctionSpace:
+        """DG0 scalar; its dof i is cell i."""
+        return fem.functionspace(self.mesh, ("DG", 0))
+
+    def cell_vector(self, components: int) -> fem.FunctionSpace:
+        """DG0 vectors; dofs i * components + k are those of cell i."""
+        return fem.functionspace(self.mesh, ("DG", 0, (components,)))
+
+    @property
+    def cell_nodes(self) -> Ints:
+        """(cells, d + 1) node (blocked dof) indices of the owned cells."""
+        return self.space.dofmap.list
+
+    @cached_property
+    def node_count(self) -> int:
+        """Owned nodes."""
+        return int(self.space.dofmap.index_map.size_local)
+
+    @cached_property
+    def nodes(self) -> npt.NDArray[np.float64]:
+        """(nodes, d) reference coordinates X of owned and ghost nodes, m."""
+        # the bits of the input: tabulated dof coordinates depend in the last digit on the cell, and so on the partition
+        count = self.node_count + self.space.dofmap.index_map.num_ghosts
+        result = np.empty((count, self.dim))
+        result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+        return result
+
+    @cached_property
+    def node_input(self) -> npt.NDArray[np.int64]:
+        """Index in the input mesh of every owned and ghost node."""
+        result = np.full(len(self.nodes), -1, np.int64)
+        result[self.cell_nodes] = self.mesh.geometry.input_global_indices[self.mesh.geometry.dofmap]
+        return result
+
+    @cached_property
+    def cell_input(self) -> npt.NDArray[np.int64]:
+        """Index in the input mesh of every owned cell."""
+        return np.asarray(self.mesh.topology.original_cell_index[: self.cell_count], np.int64)
+
+    @cached_property
+    def gather_nodes(self) -> Gather:
+        return Gather(self.comm, self.node_input[: self.node_count])
+
+    @cached_property
+    def gather_cells(self) -> Gather:
+        return Gather(self.comm, self.cell_input)
+
+    @cached_property
+    def volumes(self) -> npt.NDArray[np.float64]:
+        """Volume (area in 2D) of each owned cell in the reference configuration, m^d."""
+        corner = self.nodes[self.cell_nodes]
+        edges = corner[:, 1:] - corner[:, :1]
+        return np.abs(np.linalg.det(edges)) / (2.0 if self.dim == 2 else 6.0)
+
+    @cached_property
+    def mean_edge(self) -> float:
+        """Edge length of a cube or square as large as the mean cell, m."""
+        volume, cells = total(self.comm, np.array([self.volumes.sum(), self.cell_count]))
+        return float((volume / cells) ** (1 / self.dim))
+
+    def nodes_of(self, where: str | Box | Plane, key: str) -> Ints:
+        """Local nodes (owned and ghost) of a facet group, a box or a plane; InputError where there are none."""
+        nodes = self._group_nodes(where, key) if isinstance(where, str) else self._selected(where, key)
+        if total(self.comm, len(nodes))[0] == 0:
+            raise InputError(f"{key}: {describe(where)} selects no node; the body lies in {self.extent()}")
+        return nodes
+
+    def facets_of(self, where: str | Box | Plane, key: str) -> Ints:
+        """Local boundary facets of a group, or those with all nodes in a box or on a plane."""
+        if isinstance(where, str):
+            facets = np.intersect1d(self.group(where, key), self._exterior)
+        else:
+            facets = self._facets_within(self._selected(where, key))
+        if total(self.comm, len(facets))[0] == 0:
+            raise InputError(f"{key}: {describe(where)} selects no boundary facet; the body lies in {self.extent()}")
+        return facets
+
+    def group(self, name: str, key: str) -> Ints:
+        """Facets of a named group; InputError lists the groups that exist."""
+        if name not in self.facets:
+            known = ", ".join(sorted(self.facets)) or "none"
+            raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {known}')
+        return self.facets[name]
+
+    def _group_nodes(self, name: str, key: str) -> Ints:
+        facets = self.group(name, key)
+        return fem.locate_dofs_topological(self.space, self.dim - 1, facets)
+
+    def _selected(self, where: Box | Plane, key: str) -> Ints:
+        select = in_box if isinstance(where, Box) else on_plane
+        inside = select(where, self.nodes, self.size, key)  # type: ignore[arg-type]
+        return np.flatnonzero(inside).astype(np.int32)
+
+    def _facets_within(self, nodes: Ints) -> Ints:
+        exterior = self._exterior
+        geometry = dolfinx.mesh.entities_to_geometry(self.mesh, self.dim - 1, exterior)
+        chosen = np.zeros(len(self.nodes), bool)
+        chosen[nodes] = True
+        of_geometry = np.zeros(len(self.mesh.geometry.x), bool)
+        of_geometry[self.mesh.geometry.dofmap] = chosen[self.cell_nodes]
+        return exterior[of_geometry[geometry].all(axis=1)]
+
+    @cached_property
+    def _exterior(self) -> Ints:
+        return dolfinx.mesh.exterior_facet_indices(self.mesh.topology)
+
+    def extent(self) -> str:
+        """The bounding box in words, m."""
+        return f"{format_point(self.lower)} to {format_point(self.upper)}"
+
+
+def in_box(box: Box, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:
+    """Which points lie in the closed box, give or take 1e-9 of the body's size: faces that coincide are meant."""
+    low, high = (_of_dimension(corner, points, f"{key}.box") for corner in box.box)
+    slack = 1e-9 * size
+    return np.all((points >= low - slack) & (points <= high + slack), axis=1)
+
+
+def on_plane(plane: Plane, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:
+    """Which points lie within `within` of the plane (default 1e-6 of the body's size)."""
+    normal = _of_dimension(plane.normal, points, f"{key}.normal")
+    point = _of_dimension(plane.point, points, f"{key}.point")
+    length = np.linalg.norm(normal)
+    if length == 0:
+        raise InputError(f"{key}.normal = {plane.normal}: a normal must not be zero")
+    return np.abs((points - point) @ normal) / length <= (plane.within or 1e-6 * size)
+
+
+def _of_dimension(vector: list[float], points: npt.NDArray[np.float64], key: str) -> npt.NDArray[np.float64]:
+    if len(vector) != points.shape[1]:
+        raise InputError(f"{key} = {vector}: the mesh has {points.shape[1]} dimensions; give as many numbers")
+    return np.asarray(vector, float)
+
+
+def describe(where: str | Box | Plane) -> str:
+    """A place in words."""
+    if isinstance(where, str):
+        return f'group "{where}"'
+    if isinstance(where, Box):
+        return f"box {where.box[0]} to {where.box[1]}"
+    return f"plane through {where.point} with normal {where.normal}"
+
+
+def format_point(point: npt.NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
+
+
+def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
+    """Partition a mesh that rank 0 holds (None elsewhere). Cells are not ghosted; groups follow their facets."""
+    head = None
+    if data is not None:
+        bounds = data.points.min(axis=0), data.points.max(axis=0)
+        head = (data.dim, list(data.facet_groups), _region_index(data), list(data.regions), *bounds)
+    dim, groups, region, region_names, lower, upper = comm.bcast(head)
+    cells = data.cells if data is not None else np.empty((0, dim + 1), np.int64)
+    points = data.points if data is not None else np.empty((0, dim))
+    shape = "triangle" if dim == 2 else "tetrahedron"
+    element = basix.ufl.element("Lagrange", shape, 1, shape=(dim,), dtype=np.float64)
+    partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
+    mesh = dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
+    mesh.topology.create_entities(dim - 1)
+    mesh.topology.create_connectivity(dim - 1, dim)
+    facets = {name: _group_facets(mesh, data.facet_groups[name] if data is not None else None) for name in groups}
+    owned = mesh.topology.index_map(dim).size_local
+    local = region[mesh.topology.original_cell_index[:owned]] if region_names else np.full(owned, -1, np.int32)
+    return Domain(mesh, facets, region_names, local, lower, upper, data)
+
+
+def _region_index(data: MeshData) -> npt.NDArray[np.int32] | None:
+    if not data.regions:
+        return None
+    index = np.full(len(data.cells), -1, np.int32)
+    for number, cells in enumerate(data.regions.values()):
+        index[cells] = number
+    return index
+
+
+def _group_facets(mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64] | None) -> Ints:
+    """Local facets of a group given on rank 0 by the input nodes of each facet."""
+    dim = mesh.topology.dim
+    facets = np.empty((0, dim), np.int64) if nodes is None else np.asarray(nodes, np.int64)
+    values = np.zeros(len(facets), np.int32)
+    local, values = distribute_entity_data(mesh, dim - 1, facets, values)
+    mesh.topology.create_connectivity(dim - 1, 0)
+    adjacency = cpp.graph.AdjacencyList_int32(local)
+    tags = dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, adjacency, values)
+    return tags.indices

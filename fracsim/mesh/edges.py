@@ -1,0 +1,139 @@
+"""The graph of a mesh: nodes joined by the edges of simplices, some of them broken.
+
+What the pattern of a cell's broken edges means is looked up in `simplices`.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import la
+
+from .domain import Domain, Ints
+from .ranks import total
+from .simplices import is_split, local_edges
+
+
+class EdgeGraph:
+    """Damage of the edges of a distributed mesh, and the patterns of its cells.
+
+    Attributes:
+        cell_edges: (cells, k) local edge index of each cell's local edges, k = 3 or 6.
+        cell_nodes: (cells, d + 1) local node index.
+        broken: (edges,) bool for owned and ghost edges, the same on every rank that has the edge.
+        pattern: (cells,) uint8, bit k set where local edge k is broken.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        topology = domain.mesh.topology
+        topology.create_entities(1)
+        topology.create_connectivity(domain.dim, 1)
+        edges = local_edges(domain.dim)
+        self.domain = domain
+        self.index_map = topology.index_map(1)
+        self.edge_count = int(self.index_map.size_local)
+        connectivity = topology.connectivity(domain.dim, 1).array
+        self.cell_edges: Ints = connectivity[: domain.cell_count * len(edges)].reshape(-1, len(edges))
+        self.cell_nodes = domain.cell_nodes
+        self.broken = np.zeros(self.edge_count + self.index_map.num_ghosts, bool)
+        self.pattern = np.zeros(domain.cell_count, np.uint8)
+        self._shared = la.vector(self.index_map, 1, np.int32)
+
+    @cached_property
+    def edge_nodes(self) -> Ints:
+        """(edges, 2) local nodes of owned and ghost edges."""
+        result = np.full((len(self.broken), 2), -1, np.int32)
+        result[self.cell_edges] = self.cell_nodes[:, local_edges(self.domain.dim)]
+        return result
+
+    def on_any_rank(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags raised on any rank that has the edge (collective)."""
+        if self.domain.comm.size == 1:
+            return flags
+        self._shared.array[:] = flags
+        self._shared.scatter_reverse(la.InsertMode.add)
+        self._shared.scatter_forward()
+        return self._shared.array > 0
+
+    def break_edges(self, flags: npt.NDArray[np.bool_]) -> int:
+        """Break the intact edges flagged on any rank; returns how many broke in all (collective)."""
+        new = self.on_any_rank(flags) & ~self.broken
+        count = int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
+        if count:
+            self.broken |= new
+            touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
+            bits = 1 << np.arange(self.cell_edges.shape[1])
+            self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
+        return count
+
+    def break_idle(self) -> int:
+        """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
+
+        Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
+        apart. Mechanics do not change: chi of its cells is 0 and they enter no average.
+        """
+        carried = np.zeros(len(self.broken), bool)
+        carried[self.cell_edges[~self.split]] = True
+        return self.break_edges(~self.on_any_rank(carried))
+
+    @property
+    def broken_count(self) -> int:
+        """Broken edges that this rank owns."""
+        return int(np.count_nonzero(self.broken[: self.edge_count]))
+
+    @property
+    def damaged(self) -> npt.NDArray[np.bool_]:
+        """(cells,) whether any edge is broken."""
+        return self.pattern != 0
+
+    @property
+    def split(self) -> npt.NDArray[np.bool_]:
+        """(cells,) whether the cell has come apart."""
+        return is_split(self.domain.dim)[self.pattern]
+
+    def intact(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """(n, k) whether each local edge of the cells is intact."""
+        bits = np.arange(self.cell_edges.shape[1])
+        return np.asarray((self.pattern[cells, None] >> bits) & 1 == 0)
+
+    def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
+        return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
+
+    def gather_broken(self, values: npt.NDArray[np.float64] | None = None) -> Any:
+        """(n, 2) sorted keys of all broken edges on rank 0 and, of (edges, m) values of local ones, their (n, m) rows.
+
+        None on the other ranks (collective).
+        """
+        own = np.flatnonzero(self.broken[: self.edge_count])
+        columns = np.empty((len(own), 0)) if values is None else values[own]
+        parts = self.domain.comm.gather((self.edge_keys(own), columns))
+        if parts is None:
+            return None
+        keys, rows = (np.concatenate(each) for each in zip(*parts, strict=True))
+        order = np.lexsort(keys.T[::-1])
+        return keys[order], rows[order]
+
+    def broken_keys(self) -> npt.NDArray[np.int64] | None:
+        """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""
+        gathered = self.gather_broken()
+        return None if gathered is None else gathered[0]
+
+    def find_keys(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Local edges whose keys are among the (n, 2) sorted ones, and the row of each of them there."""
+        own = self.edge_keys(np.arange(len(self.broken)))
+        factor = np.array([int(max(keys.max(initial=0), own.max(initial=0))) + 1, 1])
+        known, wanted = keys @ factor, own @ factor
+        place = np.searchsorted(known, wanted)
+        local = np.flatnonzero(place < len(known))
+        local = local[known[place[local]] == wanted[local]]
+        return local, place[local]
+
+    def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the local edges whose keys are among those given, in any order."""
+        flags = np.zeros(len(self.broken), bool)
+        flags[self.find_keys(keys[np.lexsort(keys.T[::-1])])[0]] = True
+        return flags

@@ -1,0 +1,43 @@
+"""Edges of a triangle or tetrahedron, and what every pattern of broken ones means.
+
+A cell's broken edges are one small integer, its *pattern*: bit k is set where local edge k is broken, 64 patterns for a
+tetrahedron and 8 for a triangle. What a pattern means is worked out once for all of them and looked up with arrays.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import basix
+import numpy as np
+import numpy.typing as npt
+
+CELL = {2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}
+
+
+@cache
+def local_edges(dim: int) -> npt.NDArray[np.int64]:
+    """(edges per cell, 2) local nodes of each local edge, in DOLFINx's order."""
+    return np.array(basix.topology(CELL[dim])[1])
+
+
+@cache
+def node_groups(dim: int) -> npt.NDArray[np.int8]:
+    """(patterns, d + 1): for each pattern, the lowest local node that each local node is joined to by intact edges."""
+    edges = local_edges(dim)
+    patterns = np.arange(1 << len(edges))
+    intact = (patterns[:, None] >> np.arange(len(edges))) & 1 == 0
+    label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(patterns), 1))
+    for _ in range(dim):  # a path through d + 1 nodes has at most d edges
+        for edge in range(len(edges)):
+            i, j = int(edges[edge, 0]), int(edges[edge, 1])
+            lower = np.minimum(label[:, i], label[:, j])
+            label[:, i] = np.where(intact[:, edge], lower, label[:, i])
+            label[:, j] = np.where(intact[:, edge], lower, label[:, j])
+    return label
+
+
+@cache
+def is_split(dim: int) -> npt.NDArray[np.bool_]:
+    """(patterns,): whether the intact edges no longer connect all nodes of the cell."""
+    return np.any(node_groups(dim) != 0, axis=1)

@@ -1,0 +1,10 @@
+"""The split surface of a torn body (METHOD section 8): what is drawn and what touches, never what is solved.
+
+table     what every damage pattern does to one cell, derived once
+skeleton  numbers of the edges, facets and boundary of the input mesh
+points    the points of a state of damage, numbered
+build     damage -> points, elements and the parents of every point
+follow    children follow parents: x = mean over p of x_p + R_p (X - X_p)
+
+Works on the arrays of a mesh on one rank, so that the surface is the same at any number of ranks.
+"""

@@ -1,0 +1,89 @@
+"""Numbers of the edges and facets of the input mesh, and its boundary: made once, on the rank that has the mesh."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ...meshes.data import MeshData
+from ...meshes.topology import distinct_rows, facets_of
+from ..simplices import local_edges
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+CRACK, BODY = 0, 1  # origins of elements that are on no boundary facet
+
+
+class Skeleton:
+    """A mesh of N nodes and C cells with its edges and facets.
+
+    Attributes:
+        points: (N, d) reference coordinates X, m.
+        cells: (C, d + 1) nodes.
+        edges: (E, 2) nodes, the lower first, in ascending order; cell_edges: (C, k) in the order of graph.local_edges.
+        facets: (F, d) nodes, ascending; cell_facets: (C, d + 1), facet i opposite node i.
+        boundary: (B, 2) cell and local facet of each boundary facet, in the order of the cells.
+        origins: names of the places that an element may come from; origin (B,) of each boundary facet.
+            A facet of several groups has them all in its name: "left + grip". "boundary": a facet of no group.
+    """
+
+    def __init__(self, mesh: MeshData) -> None:
+        d = mesh.dim
+        self.dim, self.points, self.cells = d, mesh.points, mesh.cells
+        pairs = np.sort(mesh.cells[:, local_edges(d)], axis=2).reshape(-1, 2)
+        self.edges, _, inverse = distinct_rows(pairs)
+        self.cell_edges: Ints = inverse.reshape(len(mesh.cells), -1)
+        sorted_facets = np.sort(facets_of(mesh.cells).reshape(-1, d), axis=1)
+        self.facets, counts, inverse = distinct_rows(sorted_facets)
+        self.cell_facets: Ints = inverse.reshape(len(mesh.cells), -1)
+        self.boundary = np.argwhere(counts[self.cell_facets] == 1)
+        self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
+
+    @cached_property
+    def boundary_nodes(self) -> Ints:
+        """Nodes of boundary facets, ascending."""
+        on_boundary = np.zeros(len(self.points), bool)
+        on_boundary[self.facets[self.cell_facets[tuple(self.boundary.T)]]] = True
+        return np.flatnonzero(on_boundary)
+
+    def of_edges(self, keys: Ints, values: Values) -> Values:
+        """(E,) values of edges named by pairs of nodes (n, 2), NaN for all others."""
+        factor = np.array([len(self.points), 1])
+        result = np.full(len(self.edges), np.nan)
+        result[np.searchsorted(self.edges @ factor, np.sort(keys, axis=1) @ factor)] = values
+        return result
+
+    def broken_edges(self, pattern: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """(E,) which edges the patterns (C,) of the cells call broken."""
+        damaged = np.flatnonzero(pattern)
+        bits = np.arange(self.cell_edges.shape[1])
+        broken = np.zeros(len(self.edges), bool)
+        broken[self.cell_edges[damaged][(pattern[damaged, None] >> bits) & 1 == 1]] = True
+        return broken
+
+    def pieces(self, broken: npt.NDArray[np.bool_]) -> tuple[int, Ints]:
+        """How many pieces the intact edges leave, and the piece of each node, numbered by their lowest node."""
+        links = self.edges[~broken]
+        size = len(self.points)
+        graph = csr_matrix((np.ones(len(links), np.int8), links.T), shape=(size, size))
+        count, label = connected_components(graph, directed=False)
+        lowest = np.unique(label, return_index=True)[1]
+        rank = np.empty(count, np.int64)
+        rank[np.argsort(lowest)] = np.arange(count)
+        return int(count), rank[label]
+
+
+def _origins(mesh: MeshData, facets: Ints) -> tuple[list[str], Ints]:
+    """Names, and the number of the name of each of the (B, d) boundary facets."""
+    groups = mesh.facet_groups
+    _, _, place = distinct_rows(np.sort(np.concatenate([facets, *groups.values()]), axis=1))
+    own, rest = place[: len(facets)], place[len(facets) :]
+    parts = np.split(rest, np.cumsum([len(group) for group in groups.values()])[:-1]) if groups else []
+    member = np.stack([np.isin(own, part) for part in parts], axis=1) if groups else np.zeros((len(own), 0), bool)
+    kinds, number = np.unique(member, axis=0, return_inverse=True)
+    named = [" + ".join(np.array(list(groups))[kind]) if kind.any() else "boundary" for kind in kinds]
+    return ["crack", "body", *named], number.reshape(-1) + 2

@@ -1,0 +1,41 @@
+"""Energy from nowhere: watched in every step, told at the end."""
+
+from __future__ import annotations
+
+from ..stepping.implicit import Report
+from ..stepping.state import State
+
+SHARE = 0.05  # of the energy at play: what steps that are long for the waves in them may gain without a word
+
+
+class Gained:
+    """The largest rise of elastic + kinetic + dissipated - work above what it was before.
+
+    Schemes may lose energy. One that gains it (projected strains at large strains; second-order schemes in tangents
+    that are not positive, or where all breaks at once) leads to motion that nothing drives.
+
+    Attributes:
+        rise: J.    scale: largest energy or work so far, J.
+    """
+
+    def __init__(self, *, at_rest: bool) -> None:
+        """`at_rest`: the body starts without energy; else from what its first step ends with."""
+        self._least = 0.0 if at_rest else float("inf")
+        self.rise, self.scale = 0.0, 0.0
+
+    def look(self, report: Report, state: State) -> None:
+        """Note a step that was taken."""
+        held = report.kinetic + report.elastic
+        balance = held + state.dissipated - state.work
+        self._least = min(self._least, balance)
+        self.rise = max(self.rise, balance - self._least)
+        self.scale = max(self.scale, held, abs(state.work))
+
+    def note(self) -> str:
+        """A sentence where it is too much."""
+        if self.rise <= SHARE * self.scale:
+            return ""
+        return (
+            f"the body gained {self.rise:.3g} J of energy from nowhere, {self.rise / self.scale:.0%} of all that was "
+            'at play: its motion is not to be trusted; try time.scheme = "backward-euler", or a shorter time.step'
+        )

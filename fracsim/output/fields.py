@@ -1,0 +1,117 @@
+"""What a frame of fields.xdmf holds: displacement, and the fields that the study asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from ufl.core.expr import Expr
+
+from ..forms.energies import full_cauchy_stress, von_mises
+from ..forms.kinematics import deformation_gradient, embed, green_strain
+from ..mechanics.balance import Equilibrium
+from ..mechanics.kernels import CellExpression
+from ..stepping.state import State
+from .fields_file import Field
+
+if TYPE_CHECKING:
+    from ..mesh.pieces import Pieces
+
+Values = npt.NDArray[Any]
+# XDMF's order of a symmetric tensor
+_TENSOR6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class Frames:
+    """Gathers the fields of a frame to rank 0. Expressions are compiled at the first frame that needs them."""
+
+    def __init__(self, equations: Equilibrium, names: list[str], fracture: Any = None) -> None:
+        self._equations, self._domain, self._fracture = equations, equations.domain, fracture
+        self._names = names
+        self._compiled: dict[str, CellExpression] = {}
+
+    def __call__(self, state: State, pieces: Pieces | None) -> list[Field]:
+        """All fields in input order (complete on rank 0; collective)."""
+        d = self._domain.dim
+        fields = [self._on_nodes("displacement", state.u.reshape(-1, d))]
+        for name in self._names:
+            if name == "velocity":
+                fields.append(self._on_nodes(name, state.v.reshape(-1, d)))
+            elif name == "piece":
+                assert pieces is not None
+                fields.append(self._on_nodes(name, pieces.of_node[: self._domain.node_count].astype(np.int32)))
+            else:
+                fields.append(Field(name, "Cell", self._domain.gather_cells(self._cell_values(name))))
+        return fields
+
+    def _on_nodes(self, name: str, owned: Values) -> Field:
+        return Field(name, "Node", self._domain.gather_nodes(owned))
+
+    def _cell_values(self, name: str) -> Values:
+        if name == "region":
+            return self._domain.region.astype(np.int32)
+        if name == "plastic_strain":
+            strain: Values = self._equations.material.plastic.strain
+            return strain
+        if name == "damage":
+            return self._broken_share()
+        if name == "chi":
+            assert self._equations.chi is not None
+            return self._equations.chi.x.array[: self._domain.cell_count]
+        values = self._carried(name)
+        return values[:, 0] if values.shape[1] == 1 else values
+
+    def _broken_share(self) -> Values:
+        """Broken edges of a cell over all its edges, 0 to 1."""
+        graph = self._fracture.graph
+        return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
+
+    def _carried(self, name: str) -> Values:
+        """An expression of the deformation; stress and energy times chi: what the damaged body really carries."""
+        if name not in self._compiled:
+            expression = _EXPRESSIONS[name](self._equations)
+            self._compiled[name] = CellExpression(
+                self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
+            )
+        values = self._compiled[name]()
+        if (chi := self._equations.internal.factor) is not None and name != "strain":
+            values *= chi.x.array[: self._domain.cell_count, None]
+        if self._fracture is not None and name == "strain":
+            values[self._fracture.graph.split] = 0.0  # nodes of several pieces have no strain in common
+        return np.nan_to_num(values)
+
+
+def _kinematics(equations: Equilibrium) -> tuple[Any, Expr, Expr | None]:
+    rotation = equations.rotation.field if equations.rotation is not None else None
+    return equations.energy, deformation_gradient(equations.u), rotation
+
+
+def _stress(equations: Equilibrium) -> Expr:
+    stress = full_cauchy_stress(*_kinematics(equations))
+    return ufl.as_vector([stress[i, j] for i, j in _TENSOR6])
+
+
+def _von_mises(equations: Equilibrium) -> Expr:
+    return von_mises(full_cauchy_stress(*_kinematics(equations)))
+
+
+def _energy_density(equations: Equilibrium) -> Expr:
+    energy, F, rotation = _kinematics(equations)
+    return energy.psi(F, rotation)
+
+
+def _strain(equations: Equilibrium) -> Expr:
+    """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (the strain profile of M22 fig. 2)."""
+    E = green_strain(embed(deformation_gradient(equations.u), 1.0))
+    return ufl.sqrt(2 / 3 * ufl.inner(ufl.dev(E), ufl.dev(E)))
+
+
+_EXPRESSIONS: dict[str, Callable[[Equilibrium], Expr]] = {
+    "stress": _stress,
+    "von_mises": _von_mises,
+    "energy_density": _energy_density,
+    "strain": _strain,
+}

@@ -1,0 +1,116 @@
+"""fields.xdmf with fields.h5: the computational mesh in time, one grid a time with every field on it.
+
+Written by rank 0 in the order of the input mesh, so that the files do not depend on the partition. One grid per time
+(DOLFINx's own writer makes one per field) lets ParaView warp by displacement and colour by damage at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from ..meshes.data import MeshData
+
+Values = npt.NDArray[np.float64]
+TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
+_KINDS = {1: "Scalar", 3: "Vector", 6: "Tensor6"}
+_TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
+_HEAD = (
+    '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
+    '    <Grid Name="fields" GridType="Collection" CollectionType="Temporal">\n'
+)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a frame: an array of rows in input order (None on ranks other than 0); `centre` is Node or Cell."""
+
+    name: str
+    centre: str
+    values: Any
+
+
+class FieldsFile:
+    """Appends frames; the XML is closed after each, so that the file can be opened while the run goes on."""
+
+    def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
+        """`resume_at`: keep the frames up to this time (s)."""
+        self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
+        self._mesh = mesh
+        self.times: list[float] = []
+        if resume_at is not None and self.h5.exists():
+            self._resume(resume_at)
+        else:
+            self._begin()
+
+    def _begin(self) -> None:
+        with h5py.File(self.h5, "w") as file:
+            file["points"] = padded(self._mesh.points)
+            file["cells"] = self._mesh.cells.astype(np.int32)
+            file.create_group("frames")
+        self.xdmf.write_text(_HEAD + _TAIL)
+
+    def _resume(self, until: float) -> None:
+        self.xdmf.write_text(_HEAD + _TAIL)
+        with h5py.File(self.h5, "a") as file:
+            for name in sorted(file["frames"]):
+                frame = file["frames"][name]
+                if frame.attrs["time"] > until * (1 + 1e-12):
+                    del file["frames"][name]
+                    continue
+                fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
+                self._append_xml(name, float(frame.attrs["time"]), fields)
+
+    def write(self, t: float, fields: list[Field]) -> None:
+        """Append the fields at time t (s). Vectors and symmetric tensors may have their 2D number of components."""
+        fields = [Field(field.name, field.centre, padded(field.values)) for field in fields]
+        name = f"{len(self.times):06d}"
+        with h5py.File(self.h5, "a") as file:
+            frame = file["frames"].create_group(name)
+            frame.attrs["time"] = t
+            for field in fields:
+                frame.create_dataset(field.name, data=field.values).attrs["centre"] = field.centre
+        self._append_xml(name, t, fields)
+
+    def _append_xml(self, name: str, t: float, fields: list[Field]) -> None:
+        self.times.append(t)
+        attributes = "".join(self._attribute(name, field) for field in fields)
+        kind = "Triangle" if self._mesh.dim == 2 else "Tetrahedron"
+        grid = (
+            f'      <Grid Name="body" GridType="Uniform">\n        <Time Value="{t:.12g}"/>\n'
+            f'        <Topology TopologyType="{kind}" NumberOfElements="{len(self._mesh.cells)}">'
+            f"{self._item('cells', self._mesh.cells.shape, 'Int')}</Topology>\n"
+            f'        <Geometry GeometryType="XYZ">{self._item("points", (len(self._mesh.points), 3))}</Geometry>\n'
+            f"{attributes}      </Grid>\n"
+        )
+        with self.xdmf.open("r+b") as file:
+            file.seek(-len(_TAIL), 2)
+            file.write((grid + _TAIL).encode())
+
+    def _attribute(self, frame: str, field: Field) -> str:
+        shape = field.values.shape
+        kind = _KINDS[shape[1] if len(shape) > 1 else 1]
+        number = "Int" if field.values.dtype.kind == "i" else "Float"
+        item = self._item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
+        head = f'<Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">'
+        return f"        {head}{item}</Attribute>\n"
+
+    def _item(self, path: str, shape: tuple[int, ...], number: str = "Float", size: int = 0) -> str:
+        precision = size or (4 if number == "Int" else 8)
+        dimensions = " ".join(map(str, shape))
+        return (
+            f'<DataItem Dimensions="{dimensions}" NumberType="{number}" Precision="{precision}" Format="HDF">'
+            f"{self.h5.name}:/{path}</DataItem>"
+        )
+
+
+def padded(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """Vectors of 2 components with a third that is zero: what ParaView's filters take."""
+    if values.ndim == 2 and values.shape[1] == 2:
+        return np.pad(values, ((0, 0), (0, 1)))
+    return values

@@ -1,0 +1,7 @@
+"""The split surface in time, as it is written.
+
+fragments mass, centre, velocity and spin of the pieces, and names that stay with them
+frame     a surface at a time, ready to be written
+files     surface.pvd, surface/*.vtu, pieces.csv
+output    the part of a run that gathers, builds and writes
+"""

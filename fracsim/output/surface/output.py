@@ -1,0 +1,73 @@
+"""The split surface in a run: gathers, builds on rank 0, writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...fracture.record import EdgeRecord
+from ...mechanics.material import PerCell
+from ...mesh.domain import Domain
+from ...mesh.ranks import on_root
+from ...stepping.state import State
+from ..fields_file import Field
+from .files import SurfaceFiles
+from .frame import Surface
+
+Values = npt.NDArray[np.float64]
+
+
+class SurfaceOutput:
+    """Writes surface.pvd and pieces.csv of a run.
+
+    Attributes:
+        record: when and where edges broke; None where the study has no fracture.
+        made: the surface and its files on rank 0, None elsewhere.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: Domain,
+        density: PerCell,
+        record: EdgeRecord | None,
+        *,
+        resume_at: float | None = None,
+    ) -> None:
+        """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint."""
+        self._domain, self.record = domain, record
+        everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
+        broken = self.record.gathered() if self.record is not None else None
+
+        def begin() -> tuple[Surface, SurfaceFiles]:
+            assert domain.source is not None
+            files = SurfaceFiles(folder, domain.dim, resume_at)
+            surface = Surface(domain.source, everywhere)  # type: ignore[arg-type]
+            if broken is not None and resume_at is not None:
+                surface.replay(surface.skeleton.of_edges(broken[0], broken[1][:, 0]), files.times)
+            return surface, files
+
+        self.made = on_root(domain.comm, begin)
+
+    def write(self, state: State, fields: list[Field]) -> None:
+        """A frame at the time of the state, with the gathered fields of fields.xdmf (collective)."""
+        domain, d = self._domain, self._domain.dim
+        gathered: list[Any] = [domain.gather_nodes(each.reshape(-1, d)) for each in (state.u, state.v)]
+        pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
+        broken = self.record.gathered() if self.record is not None else None
+
+        def work() -> None:
+            assert self.made is not None
+            surface, files = self.made
+            if state.t in files.times:
+                return
+            at = cut = None
+            if broken is not None and pattern is not None:
+                at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
+                surface.update(pattern, cut)
+            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields))
+
+        on_root(domain.comm, work)

@@ -1,0 +1,22 @@
+"""How a run ended, told from outside: by its exit code and the log of what it said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import Exit
+
+OUTCOMES: dict[int, str] = {
+    Exit.DONE: "done",
+    Exit.BAD_INPUT: "refused",
+    Exit.NOT_CONVERGED: "not converged",
+    Exit.STOPPED: "stopped",
+}
+SPEAKER = "fracsim: "  # before every message of the program's own
+
+
+def last_words(log: Path) -> str:
+    """The last line that is the program's own, else the last of all: what it said of its failure; "" where nothing."""
+    said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    own = [line for line in said if line.startswith(SPEAKER)]
+    return (own or said or [""])[-1]

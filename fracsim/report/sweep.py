@@ -1,0 +1,251 @@
+"""Sweeps: a study run once for each combination of values, each run in processes and a folder of its own."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import itertools
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import Exit, InputError, NotConverged, Stopped
+from ..study.check import check_study
+from ..study.file import load_study, study_text
+from .outcome import OUTCOMES, SPEAKER, last_words
+
+LONGEST_NAME = 100
+
+
+@dataclass(frozen=True)
+class Case:
+    """One combination: its values as texts by key, and its folder."""
+
+    values: dict[str, str]
+    folder: Path
+
+    @property
+    def overrides(self) -> list[str]:
+        return [f"{key}={value}" for key, value in self.values.items()]
+
+
+def run_sweep(study: str, path: Path, sets: list[str], out: Path, *, ranks: int, only_list: bool) -> None:
+    """Run what has not ended well yet, one run after the other; or print the commands. Raises NotConverged at the end
+    where a run failed. `study` is what the user called it, `path` where it is."""
+    _refuse_mpirun()
+    cases = combinations(sets, out)
+    studies = [_validated(path, case) for case in cases]
+    if only_list:
+        for case, text in zip(cases, studies, strict=True):
+            print(shlex.join(command(study, case, ranks, restart=_state(case, text) == "begun")))
+        return
+    outcomes = {}
+    for number, (case, text) in enumerate(zip(cases, studies, strict=True), 1):
+        print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
+        outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
+        print(outcome, flush=True)
+        collect(cases, outcomes, out)
+        if outcome.startswith("interrupted"):
+            raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
+    failed = [f"{name} ({outcome})" for name, outcome in outcomes.items() if not outcome.startswith("done")]
+    print(f"settings and figures of all runs: {out / 'sweep.csv'}")
+    if failed:
+        raise NotConverged(f"{len(failed)} of {len(cases)} runs did not end well: {'; '.join(failed)}")
+
+
+# --- combinations ---------------------------------------------------------------------------------------------------
+
+
+def combinations(sets: list[str], out: Path) -> list[Case]:
+    """All combinations of the values given, the last key changing fastest. InputError where one comes up twice."""
+    values: dict[str, list[str]] = {}
+    for text in sets:
+        key, equals, rest = text.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise InputError(f"--set {text}: write key=a,b,c, for example --set mesh.h=0.02,0.01")
+        if key in values:
+            raise InputError(f"--set {text}: {key} is given twice; put all its values in one list")
+        values[key] = [part.strip() for part in split_list(rest)]
+        if "" in values[key]:
+            raise InputError(f"--set {text}: there is an empty value in the list")
+        if repeated := {value for value in values[key] if values[key].count(value) > 1}:
+            raise InputError(f"--set {text}: {min(repeated)} comes up twice")
+    if not values:
+        raise InputError("a sweep needs values to vary: --set mesh.h=0.02,0.01 --set time.step=1e-3,5e-4")
+    short = short_keys(list(values))
+    chosen = [dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values())]
+    return [Case(case, out / name_of({short[key]: value for key, value in case.items()})) for case in chosen]
+
+
+def split_list(text: str) -> list[str]:
+    """Parts between the commas that are not inside brackets, braces or quotes."""
+    parts, depth, quote = [""], 0, ""
+    for character in text:
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "\"'":
+            quote = character
+        else:
+            depth += (character in "[{(") - (character in "]})")
+        if character == "," and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return parts
+
+
+def short_keys(keys: list[str]) -> dict[str, str]:
+    """The last part of each key where that tells them apart, else the whole key."""
+    last = [key.rpartition(".")[2] for key in keys]
+    return {
+        key: end if last.count(end) == 1 and not end.isdigit() else key for key, end in zip(keys, last, strict=True)
+    }
+
+
+def name_of(values: dict[str, str]) -> str:
+    """A folder name that can be read: h-0.02_scheme-newmark. A few digits of a hash where characters had to go."""
+    whole = "_".join(f"{key}-{value}" for key, value in values.items())
+    safe = "_".join(f"{key}-{_plain(value)}" for key, value in values.items())
+    if safe == whole and len(safe) <= LONGEST_NAME:
+        return safe
+    return f"{safe[:LONGEST_NAME]}-{hashlib.sha256(whole.encode()).hexdigest()[:6]}"
+
+
+def _plain(value: str) -> str:
+    """A value in characters that no file system or shell minds; a leading minus stays."""
+    if re.fullmatch(r"-?[A-Za-z0-9][A-Za-z0-9.+-]*", value):
+        return value
+    return re.sub(r"[^A-Za-z0-9.+]+", "-", value).strip("-.")
+
+
+def _validated(path: Path, case: Case) -> str:
+    """The study of a case as its run would write it. InputError, with the combination, where it cannot be run."""
+    try:
+        study = load_study(path, case.overrides)
+        check_study(study)
+    except InputError as error:
+        raise InputError(f"{case.folder.name}: {error}. Nothing was run") from None
+    return study_text(study)
+
+
+def _refuse_mpirun() -> None:
+    if any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
+        raise InputError("a sweep starts its runs itself: call it without mpirun and say how many ranks with --ranks")
+
+
+# --- one run --------------------------------------------------------------------------------------------------------
+
+
+def command(study: str, case: Case, ranks: int, *, restart: bool) -> list[str]:
+    """What runs one case."""
+    work = ["fracsim", "run", study]
+    for override in case.overrides:
+        work += ["--set", override]
+    work += ["-o", str(case.folder), *(["--restart"] if restart else [])]
+    return work if ranks == 1 else ["mpirun", "-n", str(ranks), *work]
+
+
+def _state(case: Case, study: str) -> str:
+    """ "done", "begun" (there is a checkpoint) or "new"; what is there of another study counts for nothing."""
+    try:
+        if tomllib.loads((case.folder / "study.toml").read_text()) != tomllib.loads(study):
+            return "new"
+    except (OSError, ValueError):
+        return "new"
+    if _summary(case).get("outcome") == "done":
+        return "done"
+    return "begun" if (case.folder / "checkpoint" / "state.h5").is_file() else "new"
+
+
+def _summary(case: Case) -> dict[str, Any]:
+    """summary.json of a case, empty where there is none."""
+    try:
+        return dict(json.loads((case.folder / "summary.json").read_text()))
+    except (OSError, ValueError):
+        return {}
+
+
+def _run(study: str, case: Case, text: str, ranks: int) -> str:
+    """The outcome in words, with the reason where it failed."""
+    state = _state(case, text)
+    if state == "done":
+        return "done before"
+    try:
+        case.folder.mkdir(parents=True, exist_ok=True)
+        (case.folder / "summary.json").unlink(missing_ok=True)  # of an earlier run: it would be taken for this one's
+    except OSError as error:
+        raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
+    log, work = case.folder / "log.txt", command(study, case, ranks, restart=state == "begun")
+    with log.open("w") as file, _forwarding() as forward:
+        # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
+        process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True)
+        forward.append(process)
+        code = process.wait()
+    if forward[1:]:
+        return "interrupted"
+    outcome = OUTCOMES.get(code, f"failed with exit code {code}")
+    if code == Exit.DONE:
+        return outcome
+    return f"{outcome}: {last_words(log).removeprefix(SPEAKER) or 'it said nothing'}"
+
+
+@contextmanager
+def _forwarding() -> Iterator[list[Any]]:
+    """A signal that would end the sweep ends the run first, with a checkpoint; the list then has a second entry.
+
+    SIGUSR1 is passed on in place of the others: mpirun passes it on, too, while it kills ranks at a SIGTERM. Who does
+    not want to wait for the checkpoint sends a second signal.
+    """
+    running: list[Any] = []
+
+    def handle(number: int, _: Any) -> None:
+        if running and running[0].poll() is None:
+            running[0].send_signal(signal.SIGTERM if running[1:] else signal.SIGUSR1)
+        running.append(number)
+
+    signals = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
+    before = {number: signal.signal(number, handle) for number in signals}
+    try:
+        yield running
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+
+def collect(cases: list[Case], outcomes: dict[str, str], out: Path) -> None:
+    """sweep.csv: settings, outcome and the figures of summary.json of every run so far; replaced in one go."""
+    rows = []
+    for case in cases:
+        figures = _figures(case) if case.folder.name in outcomes else {}
+        rows.append({"case": case.folder.name, **case.values, "outcome": outcomes.get(case.folder.name, "not run yet")})
+        rows[-1] |= figures
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    part = out / f"sweep.csv.{os.getpid()}"
+    with part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    part.replace(out / "sweep.csv")
+
+
+def _figures(case: Case) -> dict[str, Any]:
+    summary = _summary(case)
+    plain = {key: value for key, value in summary.items() if isinstance(value, int | float)}
+    peaks = {f"peak_{key}": value for key, value in summary.get("peak_reactions", {}).items()}
+    return plain | peaks | {f"seconds_{key}": value for key, value in summary.get("seconds", {}).items()}
+
+
+__all__ = ["Case", "collect", "combinations", "command", "name_of", "run_sweep", "split_list"]

@@ -1,0 +1,77 @@
+"""PETSc options of one solver: given under a prefix of its own, checked, and taken out of the database again."""
+
+from __future__ import annotations
+
+import ctypes
+import difflib
+import itertools
+from collections.abc import Callable
+
+from petsc4py import PETSc
+
+from ..errors import InputError
+
+Options = dict[str, bool | int | float | str]
+
+# what a misspelt option is compared with
+COMMON = (
+    "snes_type", "snes_rtol", "snes_atol", "snes_stol", "snes_max_it", "snes_max_funcs", "snes_monitor",
+    "snes_converged_reason", "snes_linesearch_type", "snes_linesearch_max_it", "snes_linesearch_monitor",
+    "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_monitor", "ksp_converged_reason", "ksp_gmres_restart",
+    "pc_type", "sub_pc_type", "pc_factor_mat_solver_type", "pc_gamg_threshold", "pc_gamg_agg_nsmooths", "pc_gamg_type",
+    "pc_gamg_aggressive_coarsening", "pc_hypre_type", "mg_levels_ksp_type", "mg_levels_ksp_max_it", "mg_levels_pc_type",
+)  # fmt: skip
+
+_prefixes = itertools.count()
+PETSc.Options()["options_left"] = "false"  # what PETSc would say at the end is checked here at the start
+_library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptionsUsed
+
+
+class OptionSet:
+    """The options of one SNES, in the database while it lives: multigrid reads its levels' at every set-up."""
+
+    def __init__(self, options: Options) -> None:
+        self.prefix = f"fracsim{next(_prefixes)}_"
+        self._keys: list[str] = []
+        self.change(options)
+
+    def change(self, options: Options) -> None:
+        """Other values, or more options, for what is set up from now on."""
+        database = PETSc.Options()
+        for key, value in options.items():
+            database[self.prefix + key] = str(value).lower() if isinstance(value, bool) else str(value)
+        self._keys += [key for key in options if key not in self._keys]
+
+    def check(self, given: Options, set_up: Callable[[], None]) -> None:
+        """InputError for an option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""
+        if not self._unused(given):
+            return
+        refusing(set_up)
+        for key in self._unused(given):
+            near = difflib.get_close_matches(key, COMMON, n=1, cutoff=0.6)
+            hint = f"did you mean {near[0]}?" if near else "see PETSc's manual pages of SNES, KSP and PC"
+            raise InputError(f"solver.{key} is not an option that PETSc looks up here; {hint}")
+
+    def _unused(self, keys: Options) -> list[str]:
+        return [key for key in keys if not _is_used(self.prefix + key)]
+
+    def remove(self) -> None:
+        """Take the options out of the database."""
+        database = PETSc.Options()
+        for key in self._keys:
+            database.delValue(self.prefix + key)
+
+
+def refusing(work: Callable[[], None]) -> None:
+    """Run what reads options; a value that PETSc refuses becomes an InputError."""
+    try:
+        work()
+    except PETSc.Error as error:
+        message = str(error).splitlines()[-1].split("] ", 1)[-1]
+        raise InputError(f"[solver]: PETSc refuses an option: {message}") from None
+
+
+def _is_used(name: str) -> bool:
+    flag = ctypes.c_int(0)
+    _library.PetscOptionsUsed(None, name.encode(), ctypes.byref(flag))
+    return bool(flag.value)

@@ -1,0 +1,221 @@
+"""`fracsim check`: everything that can be known of a study without solving, and what its scene will build.
+
+Names, dimensions and places are compared with what the builder says of itself, or with the mesh file. No DOLFINx: the
+answer comes in a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from ..mechanics.time_functions import AXES, format_point, in_time, motion_law, of_size
+from ..mesh.bodies import bodies_of, not_held
+from ..meshes.data import MeshData
+from . import MOTIONS, Box, Brittle, Plane, Study
+from .mesh_source import build_mesh, find_builder
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """What is known of a mesh before it is built."""
+
+    dim: int
+    groups: tuple[str, ...]
+    regions: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    size: str  # how many cells, in words
+    notes: tuple[str, ...] = ()  # what was mended while reading
+
+
+def check_study(study: Study) -> list[str]:
+    """Lines that tell what the scene will build. InputError where the study cannot run."""
+    anatomy = _words_of(study) or anatomy_of(build_mesh(study.mesh))
+    _check(study, anatomy)
+    return list(_description(study, anatomy))
+
+
+def checked_mesh(study: Study) -> MeshData:
+    """The mesh of a study that fits it. InputError; from a builder's own words before anything is built."""
+    words = _words_of(study)
+    if words is not None:
+        _check(study, words)
+    mesh = build_mesh(study.mesh)
+    if study.mesh.builder is None:
+        _check(study, anatomy_of(mesh))
+    return mesh
+
+
+def _words_of(study: Study) -> Anatomy | None:
+    """What a builder says of itself; a surface is left to the run. None where the mesh has to be read."""
+    builder = find_builder(study.mesh)
+    if builder is not None:
+        lower, upper = builder.bounds()
+        size = f"about {builder.cells_estimate():,} cells"
+        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size)
+    if study.mesh.surface is not None:
+        infinite = (np.inf,) * 3
+        return Anatomy(3, ("surface",), (), tuple(-x for x in infinite), infinite, "cells counted when it is filled")
+    return None
+
+
+def anatomy_of(mesh: MeshData) -> Anatomy:
+    """What a mesh turned out to be."""
+    count = bodies_of(mesh)[0]
+    size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
+    lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
+    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), lower, upper, size, mesh.notes)
+
+
+def _check(study: Study, anatomy: Anatomy) -> None:
+    _check_groups(study, anatomy)
+    _check_dimensions(study, anatomy)
+    if study.time.scheme == "quasi-static":
+        _check_held(study, anatomy.dim)
+
+
+def _check_held(study: Study, dim: int) -> None:
+    """A motion along an axis that no entry holds. Turning and single bodies need the mesh: the run finds them."""
+    held = np.zeros(dim, bool)
+    for i, entry in enumerate(study.boundary):
+        if entry.kind in MOTIONS:
+            held |= motion_law(entry, dim, f"boundary.{i}")[1]
+    if not held.all():
+        raise InputError(not_held("the body", f"moving along {AXES[int(np.argmin(held))]}"))
+
+
+def _check_groups(study: Study, anatomy: Anatomy) -> None:
+    places = [(f"boundary.{i}.on", entry.on) for i, entry in enumerate(study.boundary)]
+    places += [(f"probe.{i}.on", probe.on) for i, probe in enumerate(study.probe) if probe.on is not None]
+    for key, where in places:
+        if isinstance(where, str):
+            if where not in anatomy.groups:
+                known = ", ".join(sorted(anatomy.groups)) or "none"
+                raise InputError(f'{key} = "{where}": the mesh has no such facet group; it has: {known}')
+        else:
+            _check_place(key, where, anatomy)
+    for name in study.material.regions:
+        if name not in anatomy.regions:
+            known = ", ".join(anatomy.regions) or "none"
+            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {known}")
+
+
+def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
+    """Whether a box or plane meets the body's bounding box at all."""
+    if isinstance(where, Box):
+        low, high = (of_size(corner, anatomy.dim, f"{key}.box") for corner in where.box)
+        slack = 1e-9 * float(np.linalg.norm(np.subtract(anatomy.upper, anatomy.lower)))
+        misses = np.any(low > np.array(anatomy.upper) + slack) or np.any(high < np.array(anatomy.lower) - slack)
+    else:
+        normal, point = (of_size(getattr(where, name), anatomy.dim, f"{key}.{name}") for name in ("normal", "point"))
+        if not np.any(normal):
+            raise InputError(f"{key}.normal = {where.normal}: a normal must not be zero")
+        ends = np.sort(normal * (np.array([anatomy.lower, anatomy.upper]) - point), axis=0)
+        slack = (where.within or 0.0) * np.linalg.norm(normal) + 1e-9 * np.abs(ends[np.isfinite(ends)]).sum()
+        misses = ends[0].sum() > slack or ends[1].sum() < -slack
+    if misses:
+        raise InputError(f"{key} selects no node; the body lies in {_extent(anatomy)}")
+
+
+def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
+    dim = anatomy.dim
+    for i, entry in enumerate(study.boundary):
+        key = f"boundary.{i}"
+        if entry.kind in MOTIONS:
+            motion_law(entry, dim, key)
+        else:
+            in_time(getattr(entry, entry.kind), f"{key}.{entry.kind}", dim if entry.kind == "traction" else 1)
+    if study.load is not None:
+        for name in ("gravity", "body_force"):
+            if (value := getattr(study.load, name)) is not None:
+                in_time(value, f"load.{name}", dim)
+    if study.initial is not None and study.initial.velocity is not None:
+        of_size(study.initial.velocity, dim, "initial.velocity")
+    if study.initial is not None and study.initial.spin is not None:
+        of_size(study.initial.spin, 1 if dim == 2 else 3, "initial.spin")
+    for i, probe in enumerate(study.probe):
+        if probe.point is not None:
+            _check_inside(probe.point, anatomy, f"probe.{i}.point")
+    if dim == 3 and study.material.plane == "stress":
+        raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
+
+
+def _check_inside(point: list[float], anatomy: Anatomy, key: str) -> None:
+    at, lower, upper = of_size(point, anatomy.dim, key), np.array(anatomy.lower), np.array(anatomy.upper)
+    slack = 1e-9 * float(np.linalg.norm(upper - lower))
+    if np.any(at < lower - slack) or np.any(at > upper + slack):
+        raise InputError(f"{key} = {point} lies outside the body, which spans {_extent(anatomy)}")
+
+
+def _extent(anatomy: Anatomy) -> str:
+    return f"{format_point(anatomy.lower)} to {format_point(anatomy.upper)}"
+
+
+def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
+    source = study.mesh.builder or study.mesh.file or study.mesh.surface
+    yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
+    for note in anatomy.notes:
+        yield f"            note: {note}"
+    plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
+    regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
+    yield f"material    {study.material.energy}{plane}{regions}"
+    yield f"fracture    {_fracture(study)}"
+    yield f"plasticity  {_plasticity(study)}"
+    if study.brittle is not None:
+        yield f"brittle     {_brittle(study.brittle)}"
+    yield f"damping     {_damping(study)}"
+    kinds = [entry.kind for entry in study.boundary]
+    yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
+    yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
+    steps = study.time.end / study.time.step
+    halving = "halved where a step fails" if study.time.adapt else "fixed"
+    yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
+    options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
+    yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
+    yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _fracture(study: Study) -> str:
+    if study.fracture is None:
+        return "off: no damage field, no graph, no average"
+    fracture = study.fracture
+    average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
+    approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
+    closing = ", cracks close" if fracture.unilateral else ""
+    return f"{approach}, strength {fracture.strength:g} Pa, {average}{closing}"
+
+
+def _plasticity(study: Study) -> str:
+    if study.plasticity is None:
+        return "off: no plastic strain, no flow"
+    table = study.plasticity
+    rate = "independent of the rate" if np.isinf(table.flow_rate) else f"flow rate {table.flow_rate:g} 1/s"
+    return (
+        f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
+        f"hardening {table.hardening:g} Pa, {table.update}"
+    )
+
+
+def _brittle(brittle: Brittle) -> str:
+    many = f"{brittle.surfaces} surfaces" if brittle.surfaces > 1 else "1 surface"
+    apart = f"starts {brittle.spacing:g} m apart" if brittle.spacing else "starts two mesh edges apart"
+    at_once = f", {brittle.per_pass} a pass" if brittle.per_pass else ""
+    return f"up to {many}{at_once}, {_kind_of(brittle)}, {apart}; edges do not break by themselves"
+
+
+def _kind_of(brittle: Brittle) -> str:
+    grains = brittle.grains
+    if grains is None:
+        return brittle.shape
+    how = "each frees one of" if grains.mode == "replace" else f"{brittle.shape} along the boundaries of"
+    return f"{how} {grains.count} grains (seed {grains.seed}, spread {grains.spread:g})"
+
+
+def _damping(study: Study) -> str:
+    if study.damping is None:
+        return "off"
+    return f"Rayleigh, {study.damping.mass:g} M + {study.damping.stiffness:g} K"

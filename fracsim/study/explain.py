@@ -1,0 +1,106 @@
+"""What is wrong with a table of the study file, in one sentence: the key, the value, what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from . import Study
+
+# sentences for pydantic's types of errors; the others keep its own words
+_WORDS = {
+    "bool_type": "must be true or false",
+    "dataclass_type": "must be a table",
+    "dict_type": "must be a table",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "list_type": "must be a list",
+    "model_attributes_type": "must be a table",
+    "model_type": "must be a table",
+    "path_type": "must be a text in quotes",
+    "string_type": "must be a text in quotes",
+    "too_long": "must have {max_length} or fewer entries",
+    "too_short": "must have {min_length} or more entries",
+    "tuple_type": "must be a list",
+}
+_PATTERNS = {
+    "^[xyz]+$": 'must name components, such as "xyz" or "x"',
+    "^[A-Za-z][A-Za-z0-9-]*$": "must be letters, digits and -, a letter first",
+}
+
+
+def explain(errors: Sequence[Any], table: str = "") -> str:
+    """The error to mend first as a sentence. An unknown key goes before a missing one: it is mostly the same key."""
+    error = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
+    location = _location(error["loc"])
+    where = ".".join(map(str, [table, *location] if table else location))
+    if error["type"] == "extra_forbidden":
+        return unknown_key(where, _known_keys(location[:-1]))
+    if error["type"] == "missing":
+        return f"{where} is missing; {_owner(location)} needs it"
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
+    return f"{where} = {_show(error['input'])}: {_sentence(error)}"
+
+
+def unknown_key(where: str, known: Iterable[str]) -> str:
+    """`where` is not a key; the nearest one, or all that are known at its place."""
+    known = sorted(known)
+    near = difflib.get_close_matches(where.rpartition(".")[2], known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+    return f"{where} is not a known key; {hint}"
+
+
+def _location(parts: Sequence[Any]) -> list[Any]:
+    """Keys of the file: without the tags of unions, and without the field that collects the regions."""
+    keys = [part for part in parts if not str(part).startswith("<")]
+    return [keys[0], *keys[2:]] if keys[:2] == ["material", "regions"] else keys
+
+
+def _owner(location: list[Any]) -> str:
+    return f"the table [{'.'.join(map(str, location[:-1]))}]" if location[:-1] else "every study"
+
+
+def _sentence(error: Any) -> str:
+    kind, context = error["type"], error.get("ctx", {})
+    if kind in _WORDS:
+        return _WORDS[kind].format(**context)
+    if kind == "string_pattern_mismatch":
+        return _PATTERNS[context["pattern"]]
+    if context.get("expected") == "'free'":
+        return 'must be a number or "free"'
+    text = str(error["msg"]).removeprefix("Input ").replace("should be", "must be")
+    if kind == "literal_error" and isinstance(error["input"], str):
+        allowed = context["expected"].replace(" or ", ", ").replace("'", "").split(", ")
+        near = difflib.get_close_matches(error["input"], allowed, n=1, cutoff=0.65)
+        return f"{text}; did you mean {near[0]}?" if near else text
+    return text
+
+
+def _show(value: Any) -> str:
+    text = json.dumps(value, default=str).replace("NaN", "nan").replace("Infinity", "inf")
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _known_keys(location: list[Any]) -> list[str]:
+    """The keys allowed at a place of the study file, found by walking the schema."""
+    models: list[type[BaseModel]] = [Study]
+    for part in location:
+        fields = [model.model_fields for model in models]
+        inner = [m for field in fields for m in _models_in(field.get(part, field.get("regions")))]
+        models = inner or models  # an index of a list stands for its entries
+    return [key for model in models for key in model.model_fields if key != "regions"]
+
+
+def _models_in(field: Any) -> list[type[BaseModel]]:
+    def walk(annotation: Any) -> list[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            return [annotation]
+        inner = [found for argument in get_args(annotation) for found in walk(argument)]
+        return inner or walk(annotation.__value__) if hasattr(annotation, "__value__") else inner
+
+    return walk(field.annotation) if field is not None else []

@@ -1,0 +1,104 @@
+"""Reading a study file into a `Study`, with messages a user can act on; writing it back with every default."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ..errors import InputError
+from . import Study
+from .explain import explain
+from .mesh_source import find_builder
+
+
+def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
+    """Read, override (`key.path=value`) and validate. Raises InputError with one message."""
+    data = _parse(path)
+    _anchor(data, path.parent)
+    for override in overrides:
+        _apply(data, override)
+    _anchor(data, Path())
+    return validate(data, str(path))
+
+
+def validate(data: dict[str, Any], name: str) -> Study:
+    """Build the Study; the first thing that is wrong becomes the message."""
+    try:
+        study = Study.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{name}: {explain(error.errors())}") from None
+    return study
+
+
+def study_text(study: Study, comments: Iterable[str] = ()) -> str:
+    """The study as TOML with every default written out, `comments` first."""
+    import tomli_w
+
+    data = study.model_dump(mode="json", exclude_none=True)
+    data["material"] |= data["material"].pop("regions")
+    data["mesh"] |= _builder_parameters(study)
+    return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
+
+
+def _builder_parameters(study: Study) -> dict[str, Any]:
+    builder = find_builder(study.mesh)
+    return {} if builder is None else {key: value for key, value in asdict(builder).items() if value is not None}
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"there is no study file {path}; `fracsim list` shows those that come with fracsim") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the study file {path}: {error}") from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not TOML: {error}") from None
+
+
+def _anchor(data: dict[str, Any], folder: Path) -> None:
+    """Mesh files are looked for beside the study file (those given with --set: in the working folder)."""
+    mesh = data.get("mesh")
+    for key in ("file", "surface"):
+        if isinstance(mesh, dict) and isinstance(mesh.get(key), str):
+            mesh[key] = str((folder / mesh[key]).resolve())
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not all(key.strip().split(".")):
+        raise InputError(f"--set {override}: write key.path=value, for example --set time.step=1e-3")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *path, last = key.strip().split(".")
+    place: Any = data
+    for part in path:
+        place = _descend(place, part, override)
+    if isinstance(place, list):
+        place[_index(place, last, override)] = value
+    else:
+        place[last] = value
+
+
+def _descend(place: Any, part: str, override: str) -> Any:
+    if isinstance(place, list):
+        return place[_index(place, part, override)]
+    inner = place.setdefault(part, {})
+    if not isinstance(inner, dict | list):
+        raise InputError(f"--set {override}: {part} is a value, not a table")
+    return inner
+
+
+def _index(place: list[Any], part: str, override: str) -> int:
+    if not part.isdigit() or int(part) >= len(place):
+        raise InputError(f"--set {override}: {part} is not an entry; there are {len(place)}, counted from 0")
+    return int(part)

@@ -1,0 +1,1 @@
+"""Bodies by their name: builders with parameters, one a file."""

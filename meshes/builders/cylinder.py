@@ -1,0 +1,130 @@
+"""A round bar, and a disk in 2D."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, pi, radians, sin
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from ..data import MeshData
+from ..gmsh_session import meshed
+from ..parameters import affordable, one_of, positive, require
+from ..sizing import Sizing, cells_for
+from ..topology import boundary_facets, facets_except, plane_groups
+from .profile import Profile
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A solid circular cylinder that starts at the origin and runs along an axis.
+
+    Attributes:
+        radius: [m].
+        length: [m].
+        h: cell size [m]. The round side is a polygon with its nodes on the circle: the volume is less by about
+            (h / radius)^2 / 6 of itself.
+        axis: "x", "y" or "z".
+
+    Groups: bottom (at coordinate 0 of the axis), top (at `length`), side.
+
+    Raises:
+        MeshError: a parameter is out of range.
+    """
+
+    name: ClassVar[str] = "cylinder"
+    groups: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
+    regions: ClassVar[tuple[str, ...]] = ()
+
+    radius: float = 0.05
+    length: float = 0.2
+    h: float = 0.01
+    axis: Literal["x", "y", "z"] = "z"
+
+    def __post_init__(self) -> None:
+        positive("cylinder", radius=self.radius, length=self.length, h=self.h)
+        one_of("cylinder", "axis", self.axis, ("x", "y", "z"))
+        affordable("cylinder", self.h, self.cells_estimate())
+
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        along = "xyz".index(self.axis)
+        low, high = [-self.radius] * 3, [self.radius] * 3
+        low[along], high[along] = 0.0, self.length
+        return tuple(low), tuple(high)
+
+    def cells_estimate(self) -> int:
+        return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+
+    def build(self) -> MeshData:
+        points, cells = meshed(self._draw, 3, Sizing(self.h))
+        along = "xyz".index(self.axis)
+        # Drawn along z; turning the axes in a circle keeps every cell's orientation.
+        points = np.roll(points, along - 2, axis=1)
+        boundary = boundary_facets(cells)
+        ends = plane_groups(points, boundary, {"bottom": (along, 0.0), "top": (along, self.length)})
+        return MeshData(points, cells, ends | {"side": facets_except(boundary, *ends.values())})
+
+    def _draw(self, gmsh: Any) -> None:
+        gmsh.model.occ.addCylinder(0.0, 0.0, 0.0, 0.0, 0.0, self.length, self.radius)
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A flat disk around the origin, in triangles.
+
+    Attributes:
+        radius: [m].
+        h: cell size [m].
+        arc: angle [degrees] of two arcs of the rim that face each other on the y axis, as the platens of a Brazilian
+            test touch them; 0 for none. Their ends, and the ends of both diameters along the axes, are nodes.
+
+    Groups: rim; with arcs top, bottom, and rim for what lies between them.
+
+    Raises:
+        MeshError: a parameter is out of range.
+    """
+
+    name: ClassVar[str] = "disk"
+    regions: ClassVar[tuple[str, ...]] = ()
+
+    radius: float = 0.05
+    h: float = 0.005
+    arc: float = 0.0
+
+    def __post_init__(self) -> None:
+        positive("disk", radius=self.radius, h=self.h)
+        require(0 <= self.arc < 180, f"disk: arc = {self.arc!r} must be at least 0 and less than 180 degrees.")
+        affordable("disk", self.h, self.cells_estimate())
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return ("top", "bottom", "rim") if self.arc else ("rim",)
+
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return (-self.radius,) * 2, (self.radius,) * 2
+
+    def cells_estimate(self) -> int:
+        return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+
+    def build(self) -> MeshData:
+        draw = self._sectors().draw if self.arc else self._draw
+        points, cells = meshed(lambda gmsh: draw(gmsh, 0.0), 2, Sizing(self.h))
+        boundary = boundary_facets(cells)
+        if not self.arc:
+            return MeshData(points, cells, {"rim": boundary})
+        # the end of an arc is a node: facets lie inside or outside, told by their mid-points
+        middle = points[boundary].mean(axis=1)
+        near = np.abs(middle[:, 0]) < np.abs(middle[:, 1]) * np.tan(radians(self.arc / 2))
+        parts = {"top": near & (middle[:, 1] > 0), "bottom": near & (middle[:, 1] < 0), "rim": ~near}
+        return MeshData(points, cells, {name: boundary[part] for name, part in parts.items()})
+
+    def _draw(self, gmsh: Any, _: float) -> None:
+        gmsh.model.occ.addDisk(0.0, 0.0, 0.0, self.radius, self.radius)
+
+    def _sectors(self) -> Profile:
+        """The rim cut at both ends of each arc and at its middle, and on the x axis."""
+        half = self.arc / 2
+        angles = [0.0, 90 - half, 90.0, 90 + half, 180.0, 270 - half, 270.0, 270 + half]
+        corners = [(self.radius * cos(radians(angle)), self.radius * sin(radians(angle))) for angle in angles]
+        return Profile(corners, dict.fromkeys(range(len(corners)), (0.0, 0.0)))

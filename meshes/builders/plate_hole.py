@@ -1,0 +1,88 @@
+"""A quarter of a plate with a round hole, with its two planes of symmetry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import ClassVar
+
+from ..data import MeshData
+from ..parameters import affordable, not_negative, positive, require
+from ..sizing import Sizing, cells_for
+from .profile import Profile, mesh_profile, rectangle_bounds, rectangle_groups
+
+
+@dataclass(frozen=True)
+class PlateHole:
+    """The quarter x > 0, height > 0 of a plate of twice this length and height with a hole around the origin.
+
+    2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. Holding x on "left" and the
+    height on "bottom" makes it stand for the whole plate.
+
+    Attributes:
+        length, height: of the quarter [m].
+        thickness: [m]; 0 makes a 2D mesh.
+        radius: of the hole [m].
+        h: cell size [m] away from the hole.
+        h_hole: cell size [m] at the hole, up to twice its radius around the origin; h / 4 where left out.
+
+    Groups: left, right (least and greatest x), bottom, top (least and greatest height), hole, and in 3D front, back
+    (least and greatest y).
+
+    Raises:
+        MeshError: a parameter is out of range, or the hole does not fit.
+    """
+
+    name: ClassVar[str] = "plate-hole"
+    regions: ClassVar[tuple[str, ...]] = ()
+
+    length: float = 0.05
+    height: float = 0.05
+    thickness: float = 0.0
+    radius: float = 0.01
+    h: float = 0.004
+    h_hole: float | None = None
+
+    def __post_init__(self) -> None:
+        positive("plate-hole", length=self.length, height=self.height, radius=self.radius, h=self.h, h_hole=self._fine)
+        not_negative("plate-hole", thickness=self.thickness)
+        require(
+            self.radius < min(self.length, self.height),
+            f"plate-hole: radius = {self.radius!r} must be less than length = {self.length!r} and height = "
+            f"{self.height!r}.",
+        )
+        affordable("plate-hole", min(self.h, self._fine), self.cells_estimate())
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return ("left", "right", "bottom", "top", *(("front", "back") if self.thickness else ()), "hole")
+
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return rectangle_bounds(self._size)
+
+    def cells_estimate(self) -> int:
+        """The hole is taken for filled with the cells beside it, less its own share of them."""
+        fine, full = self._sizing, (self.length, self.height)
+        high = (*full, self.thickness) if self.thickness else full
+        inside = (self.radius, self.radius, *high[2:])
+        whole, hole = (cells_for(fine, (0.0,) * len(high), corner) for corner in (high, inside))
+        return max(1, round(whole - pi / 4 * hole))
+
+    def build(self) -> MeshData:
+        r, length, height = self.radius, self.length, self.height
+        outline = Profile([(r, 0.0), (length, 0.0), (length, height), (0.0, height), (0.0, r)], {4: (0.0, 0.0)})
+        points, cells = mesh_profile(outline, self.thickness, self._sizing)
+        return MeshData(points, cells, rectangle_groups(points, cells, self._size, "hole"))
+
+    @property
+    def _size(self) -> tuple[float, float, float]:
+        return self.length, self.height, self.thickness
+
+    @property
+    def _fine(self) -> float:
+        return self.h / 4 if self.h_hole is None else self.h_hole
+
+    @property
+    def _sizing(self) -> Sizing:
+        reach = min(2 * self.radius, self.length), min(2 * self.radius, self.height)
+        return Sizing(self.h, min(self._fine, self.h), (0.0, 0.0), reach)

@@ -1,0 +1,1 @@
+"""Closed surfaces: read, made from a level set, filled with tetrahedra."""

@@ -1,0 +1,259 @@
+"""Closed surfaces of triangles: read, joined, turned outwards, sorted into bodies and cavities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ..contents import Block
+from ..data import Indices, MeshError, Points
+from ..read import read_contents
+from ..topology import Floats, Mask, distinct_rows
+
+JOINED = 1e-6  # points nearer than this share of the body's size are one
+PROBES = 300  # points of a part that are looked up in another part
+
+
+@dataclass(frozen=True)
+class ClosedSurface:
+    """Triangles that enclose one or more bodies.
+
+    Attributes:
+        points: (n, 3) [m].
+        triangles: (k, 3), each edge in exactly two of them, normals out of the material (into cavities).
+        shell: (k,) the connected part that each triangle belongs to.
+        bodies: for each body its outer shell, followed by the shells of its cavities.
+        notes: what was mended.
+    """
+
+    points: Points
+    triangles: Indices
+    shell: Indices
+    bodies: list[list[int]]
+    notes: tuple[str, ...]
+
+    @property
+    def volume(self) -> float:
+        """Volume of the material [m^3]."""
+        return float(enclosed_volumes(self.points, self.triangles).sum())
+
+    def part(self, shell: int) -> tuple[Points, Indices]:
+        """Points and triangles of one shell."""
+        used, triangles = np.unique(self.triangles[self.shell == shell], return_inverse=True)
+        return self.points[used], triangles.reshape(-1, 3)
+
+
+def enclosed_volumes(points: Points, triangles: Indices) -> Floats:
+    """The triangles' shares x_0 . (x_1 x x_2) / 6 of the enclosed volume (divergence theorem) [m^3]: (k,)."""
+    a, b, c = (points - points.mean(axis=0))[triangles].transpose(1, 0, 2)
+    return np.einsum("ki,ki->k", a, np.cross(b, c)) / 6
+
+
+def read_surface(path: str | Path) -> ClosedSurface:
+    """A closed surface from STL, OBJ, PLY or another format with triangles or quads.
+
+    Raises:
+        MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, has
+            triangles without an area or points that are no numbers, or parts that cut each other.
+    """
+    path = Path(path)
+    contents = read_contents(path)
+    triangles = np.concatenate([np.zeros((0, 3), np.int64), *map(_triangles, contents.blocks)])
+    if len(triangles) == 0 or contents.points.shape[1] != 3:
+        raise MeshError(f"Surface file '{path}' holds no triangles in space.")
+    return closed_surface(contents.points, triangles, f"Surface file '{path}'")
+
+
+def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
+    """Closed shells, one inside another or apart, as one surface."""
+    starts = np.cumsum([0] + [len(points) for points, _ in shells])
+    triangles = [shell + start for (_, shell), start in zip(shells, starts, strict=False)]
+    return closed_surface(np.concatenate([points for points, _ in shells]), np.concatenate(triangles), source)
+
+
+def _triangles(block: Block) -> Indices:
+    """The triangles of a block, quads cut in two."""
+    if block.shape == "triangle":
+        return block.corners
+    if block.shape == "quad":
+        return block.nodes[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    if block.dim == 2 and len(block.nodes):
+        raise MeshError(f"The surface has {len(block.nodes)} faces of kind {block.kind}; cut them into triangles.")
+    return np.zeros((0, 3), np.int64)
+
+
+def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSurface:
+    """Triangles joined at coincident points, checked, turned outwards and sorted into bodies.
+
+    Raises:
+        MeshError: see read_surface; `source` begins the message.
+    """
+    _check_points(points, triangles, source)
+    points, triangles = _joined(points, triangles)
+    _check_areas(points, triangles, source)
+    _check_closed(points, triangles, source)
+    triangles, shell, turned = _consistent(triangles, source)
+    triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
+    notes = []
+    if turned:
+        notes.append(f"{turned} of {len(triangles)} surface triangles faced the other way than the rest; turned.")
+    if inside_out:
+        notes.append(f"{inside_out} parts of the surface were inside out and have been turned.")
+    cavities = sum(len(body) - 1 for body in bodies)
+    if len(bodies) > 1:
+        notes.append(f"The surface encloses {len(bodies)} separate bodies; each needs its own supports.")
+    if cavities:
+        notes.append(f"{cavities} closed parts of the surface lie inside another and are taken as cavities.")
+    return ClosedSurface(points, triangles, shell, bodies, tuple(notes))
+
+
+def _check_points(points: Points, triangles: Indices, source: str) -> None:
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        raise MeshError(f"{source} names points that do not exist (there are {len(points)}); it is damaged.")
+    used = np.unique(triangles)
+    wrong = used[~np.isfinite(points[used]).all(axis=1)]
+    if len(wrong):
+        raise MeshError(f"{source} has {len(wrong)} points that are not finite numbers, the first is point {wrong[0]}.")
+
+
+def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
+    """Points at the same place made one (STL repeats every corner); triangles that collapse thereby are left out."""
+    used, triangles = np.unique(triangles, return_inverse=True)
+    points, triangles = points[used], triangles.reshape(-1, 3)
+    points, number = np.unique(points, axis=0, return_inverse=True)
+    reach = JOINED * float(np.ptp(points, axis=0).max())
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    _, cluster = _components(pairs, len(points))
+    first = np.unique(cluster, return_index=True)[1]
+    triangles = cluster[number.ravel()[triangles]]
+    whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return points[first], triangles[whole].astype(np.int64)
+
+
+def _check_areas(points: Points, triangles: Indices, source: str) -> None:
+    if len(triangles) == 0:
+        raise MeshError(f"{source} has no triangle that is larger than a point.")
+    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    areas = np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
+    longest = np.linalg.norm(points[triangles] - points[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
+    # Coordinates of single precision move a corner by up to 6e-8 of the body's size.
+    flat = np.flatnonzero(areas <= 1e-7 * float(np.ptp(points, axis=0).max()) * longest / 2)
+    if len(flat):
+        raise MeshError(
+            f"{source} has {len(flat)} triangles without an area, the first at {_place(points, triangles[flat[0]])}; "
+            "remesh the surface there."
+        )
+
+
+def _check_closed(points: Points, triangles: Indices, source: str) -> None:
+    edges, counts, _ = distinct_rows(np.sort(_directed_edges(triangles), axis=1))
+    for wrong, what in (
+        (edges[counts == 1], "is open: {} edges belong to one triangle only"),
+        (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
+    ):
+        if len(wrong):
+            raise MeshError(
+                f"{source} {what.format(len(wrong))}, the first at {_place(points, wrong[0])}; close or mend it there."
+            )
+
+
+def _directed_edges(triangles: Indices) -> Indices:
+    """Edges in the direction of their triangle, three rows for each triangle: (3 k, 2)."""
+    return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+
+
+def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]:
+    """Triangles turned so that neighbours face the same side; the connected part of each; how many were turned.
+
+    Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; the
+    links fall into two mirrored halves for each part, or into one where the part has one side only (Moebius).
+    """
+    count = len(triangles)
+    directed = _directed_edges(triangles)
+    _, _, edge = distinct_rows(np.sort(directed, axis=1))
+    order = np.argsort(edge, kind="stable")
+    first, second = order[0::2], order[1::2]
+    disagree = directed[first, 0] == directed[second, 0]
+    a, b = first // 3, second // 3
+    links = np.concatenate([np.stack([a, b + count * disagree], 1), np.stack([a + count, b + count * ~disagree], 1)])
+    _, state = _components(links, 2 * count)
+    as_given, turned = state[:count], state[count:]
+    if (as_given == turned).any():
+        raise MeshError(f"{source} has one side only, like a Moebius strip; it encloses no body.")
+    _, shell = np.unique(np.minimum(as_given, turned), return_inverse=True)
+    flip = turned < as_given
+    # Of the two ways to make a part consistent take the one that turns fewer triangles.
+    size, flips = np.bincount(shell), np.bincount(shell, weights=flip)
+    flip ^= (2 * flips > size)[shell]
+    return _flipped(triangles, flip), shell, int(flip.sum())
+
+
+def _flipped(triangles: Indices, which: Mask) -> Indices:
+    return np.where(which[:, None], triangles[:, ::-1], triangles)
+
+
+def _outwards(points: Points, triangles: Indices, shell: Indices, source: str) -> tuple[Indices, list[list[int]], int]:
+    """Triangles with normals out of the material; for each body its outer shell and its cavities; shells turned."""
+    volumes = np.bincount(shell, weights=enclosed_volumes(points, triangles))
+    holders = _holders(points, triangles, shell, source)
+    depth = holders.sum(axis=1)
+    wrong = (volumes > 0) != (depth % 2 == 0)
+    bodies = [[int(outer), *_cavities(outer, holders, depth)] for outer in np.flatnonzero(depth % 2 == 0)]
+    return _flipped(triangles, wrong[shell]), bodies, int(wrong.sum())
+
+
+def _cavities(outer: np.int64, holders: Mask, depth: Indices) -> list[int]:
+    inside = holders[:, outer] & (depth == depth[outer] + 1)
+    return [int(shell) for shell in np.flatnonzero(inside)]
+
+
+def _holders(points: Points, triangles: Indices, shell: Indices, source: str) -> Mask:
+    """Whether shell i lies inside shell j: (s, s). Where only some of its points do, the two cut each other."""
+    count = int(shell.max()) + 1
+    inside = np.zeros((count, count), bool)
+    corners = [points[triangles[shell == j]] for j in range(count)]
+    for i, j in _near(corners):
+        probes = np.unique(corners[i].reshape(-1, 3), axis=0)
+        within = np.array([abs(_winding(p, corners[j])) > 0.5 for p in probes[:: 1 + len(probes) // PROBES]])
+        if within.any() and not within.all():
+            raise MeshError(
+                f"{source} has parts that cut each other, near {_place(points, triangles[shell == i].ravel())}; join "
+                "them into one surface, or move them apart."
+            )
+        inside[i, j] = within.all()
+    return inside
+
+
+def _near(corners: list[Floats]) -> list[tuple[int, int]]:
+    """Pairs of different shells whose bounding boxes overlap."""
+    low = np.array([c.min(axis=(0, 1)) for c in corners])
+    high = np.array([c.max(axis=(0, 1)) for c in corners])
+    overlap = (low[:, None] < high[None]).all(axis=2) & (low[None] < high[:, None]).all(axis=2)
+    return [(int(i), int(j)) for i, j in np.argwhere(overlap) if i != j]
+
+
+def _winding(point: Floats, corners: Floats) -> float:
+    """How often the triangles (k, 3, 3) wind around the point: the sum of their solid angles over 4 pi.
+
+    tan(omega / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|)   (Van Oosterom, Strackee 1983)
+    """
+    a, b, c = (corners - point).transpose(1, 0, 2)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    dots = [np.einsum("ki,ki->k", v, w) for v, w in ((a, b), (b, c), (c, a))]
+    below = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+    return float(np.arctan2(np.einsum("ki,ki->k", a, np.cross(b, c)), below).sum() / (2 * np.pi))
+
+
+def _components(pairs: Indices, count: int) -> tuple[int, Indices]:
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    parts, labels = connected_components(graph, directed=False)
+    return int(parts), labels.astype(np.int64)
+
+
+def _place(points: Points, nodes: Indices) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in points[nodes].mean(axis=0)) + ") m"
