@@ -183,7 +183,7 @@ def test_a_fault_on_one_rank_ends_all(tmp_path: Path) -> None:
     script.write_text(f"""
 import sys
 from mpi4py import MPI
-from fracsim.solve import Solver
+from fracsim.stepping.newton import Solver
 solve = Solver.solve
 def faulty(self, guess):
     if MPI.COMM_WORLD.rank == 1:
