@@ -50,13 +50,12 @@ class Run:
         """Start or resume; makes the output folder. `began`: when the work on the scene began (perf_counter)."""
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
         self._interrupt = Interrupt(self.comm, wall_limit)
-        self.state = scene.stepper.start(scene.study.initial)
+        self.state = scene.start()
         self.record = self._make_record()
         if restart:
-            read_checkpoint(folder, scene.domain, self.state, scene.equations, self.record, self._surfaces)
-            if scene.fracture is not None:
-                scene.fracture.degradation.restore()
-            self.state.elastic = scene.equations.elastic_energy()
+            stress = scene.balance.stress
+            state = read_checkpoint(folder, scene.domain, self.state, stress, self.record, self._surfaces)
+            self.state = scene.stepper.resume(state)
         self._prepare(restart)
         self._damage = self._count_damage()
         self.output_seconds = 0.0
@@ -68,7 +67,7 @@ class Run:
 
     @property
     def _surfaces(self) -> Any:
-        return self.scene.fracture.surfaces if self.scene.fracture is not None else None
+        return brittle_surfaces(self.scene.fracture)
 
     # --- set-up ---
 
@@ -78,8 +77,8 @@ class Run:
         root = self.comm.rank == 0
         self.history = History(self.folder / "history.csv" if root else None, self.scene.probes.names, step)
         names = study.output.fields if study.output.fields is not None else default_fields(study)
-        self.frames = Frames(self.scene.equations, names, self.scene.fracture)
-        self.inverted = Inverted(self.scene.equations, self.scene.fracture)
+        self.frames = Frames(self.scene.balance.stress, names, self.scene.fracture)
+        self.inverted = Inverted(self.scene.balance.stress, self.scene.fracture)
         self.gained = Gained(at_rest=study.initial is None and not restart)
         source = self.scene.domain.source
         self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
@@ -96,7 +95,7 @@ class Run:
             return
         from .output.surface.output import SurfaceOutput
 
-        density, resume_at = scene.equations.material.density, self.state.t if restart else None
+        density, resume_at = scene.balance.stress.material.density, self.state.t if restart else None
         self.surface = SurfaceOutput(self.folder, scene.domain, density, self.record, resume_at=resume_at)
 
     def _make_record(self) -> EdgeRecord | None:
@@ -120,8 +119,8 @@ class Run:
         """(edges,) cuts in inverse proportion to the nodal forces at the step's end (M22 fig. 12)."""
         from .fracture.record import cut_by_forces
 
-        equations, domain, graph = self.scene.equations, self.scene.domain, self._graph
-        force = equations.nodal_forces().reshape(-1, domain.dim)
+        domain, graph = self.scene.domain, self._graph
+        force = domain.with_ghosts(self.scene.balance.stress.force()).reshape(-1, domain.dim)
         ends = graph.edge_nodes
         swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
         return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
@@ -173,7 +172,8 @@ class Run:
         last = time.monotonic()
         every = self.scene.study.output.checkpoint
         while state.t < end * (1 - 1e-12):
-            report = self.scene.stepper.advance(state)
+            state, report = self.scene.stepper.advance(state)
+            self.state = state
             if report.broken:
                 self._damage = self._count_damage()
                 self._note_breaks()
@@ -204,7 +204,7 @@ class Run:
     def _checkpoint(self) -> Path:
         began = time.perf_counter()
         path = write_checkpoint(
-            self.folder, self.scene.domain, self.state, self.scene.equations, self.record, self._surfaces
+            self.folder, self.scene.domain, self.state, self.scene.balance.stress, self.record, self._surfaces
         )
         self.output_seconds += time.perf_counter() - began
         return path
@@ -234,7 +234,7 @@ class Run:
         seconds = {"setup": self._setup_seconds, **stepper.phases, "output": self.output_seconds}
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
-            "steps_failed": stepper.failed, "nodes": int(sizes[0]), "cells": int(sizes[1]),
+            "steps_failed": stepper.trouble.steps_failed, "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces,
             "smallest_J": self.inverted.least, "inverted_cells": self.inverted.count,
             "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
@@ -243,6 +243,11 @@ class Run:
             "peak_memory_MiB": round(float(memory), 1),
             "ranks": self.comm.size, "versions": versions(self.comm),
         }  # fmt: skip
+
+
+def brittle_surfaces(breaking: Any) -> Any:
+    """What starts surfaces, where the study has [brittle]; None elsewhere."""
+    return breaking.criterion if breaking is not None and hasattr(breaking.criterion, "starts") else None
 
 
 def default_fields(study: Study) -> list[str]:
@@ -262,8 +267,7 @@ def run_study(
     try:
         return Run(scene, folder, restart=restart, wall_limit=wall_limit, began=began)()
     finally:
-        if scene.solver is not None:
-            scene.solver.forget_options()
+        scene.destroy()
 
 
 def _draw(folder: Path) -> None:

@@ -93,7 +93,6 @@ DUCTILE = ["plasticity.yield_stress=1.2e4", "plasticity.hardening=1e5", "plastic
 # name -> (study: packaged, or a text; overrides; ranks)
 SCENES: dict[str, tuple[str, list[str], int]] = {
     "loaf": ("loaf", ["mesh.h=0.013", "time.end=0.3"], 1),
-    "loaf-2-ranks": ("loaf", ["mesh.h=0.015", "time.end=0.25"], 2),
     "cylinder": ("cylinder", ["mesh.h=0.007", "time.end=5e-4"], 1),
     "doormat": ("doormat", ["mesh.h=0.03", "fracture.radius=0.05", "time.end=0.01"], 1),
     "struck-vase": ("struck-vase", ["mesh.h=0.012", "time.end=6e-5"], 1),

@@ -1,9 +1,8 @@
-"""The pass after a step: which edges break, and what that leaves of the energy of their cells."""
+"""A pass of fracture at the end of a step: which edges fail, and what that leaves of the energy of their cells."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,144 +11,126 @@ import ufl
 
 from ..forms.energies import cauchy_stress
 from ..forms.kinematics import deformation_gradient, symmetric_components
-from ..mechanics.balance import Equilibrium
 from ..mechanics.kernels import CellExpression
-from ..mesh.domain import Domain
+from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from ..study import Brittle, Fracture, Material
-from .degradation import make_degradation
-from .edge_stress import carried_by, edge_vectors, frobenius_norm, normal_stress
-from .strength import Strength
+from .criterion import Criterion
+from .degradation import Degradation, make_degradation
+from .edge_law import Brittle, EdgeLaw
 
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class PassResult:
-    """What one pass did."""
-
-    broken: int  # edges that broke in this pass, on all ranks
-    released: float  # elastic energy that went with them on this rank, J
-    elastic: float  # elastic energy that is left on this rank, J
-
-
-class FracturePass:
-    """Breaks edges where the averaged normal stress reaches the strength, and weakens their cells.
+    """What one pass did.
 
     Attributes:
-        graph: edges and their damage.
-        strength: of each edge in each cell.
-        degradation: what broken edges take out of the energy.
-        surfaces: what breaks edges instead in a study with [brittle]; None elsewhere.
+        broken: edges that broke, on all ranks.    loss: most that chi of a cell of this rank lost.
+        released: elastic energy that went with them on this rank, J.    elastic: what is left of it, J.
+        died: whether cells of this rank lost the last of their stress.
+        before: copies of the fields of damage before the pass, where edges broke.
     """
 
+    broken: int
+    loss: float
+    released: float
+    elastic: float
+    died: bool
+    before: list[Values] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What is damaged at a time: integrity of local edges, the fields of damage, and what the criterion remembers."""
+
+    integrity: Values
+    fields: list[Values]
+    criterion: Any
+
+
+class Breaking:
+    """Weakens the edges that a criterion finds overloaded, and their cells: a part of stepping.after_step.
+
+    Attributes:
+        graph: edges and their integrity.    criterion: which edges fail.    law: what is left of an edge that does.
+        degradation: what broken edges take out of the energy.
+        passes: most passes in a step; None: until nothing changes.
+        not_finite: cells whose stress was no number when it was looked at (crushed flat), over all passes of this rank.
+    """
+
+    phase = "fracture"
+
     def __init__(
-        self, equations: Equilibrium, fracture: Fracture, material: Material, brittle: Brittle | None = None
+        self,
+        stress: Stress,
+        graph: EdgeGraph,
+        criterion: Criterion,
+        law: EdgeLaw | None = None,
+        *,
+        passes: int | None = 1,
     ) -> None:
-        domain = equations.domain
-        self.domain, self.equations = domain, equations
-        self.graph = EdgeGraph(domain)
-        self.strength = Strength(self.graph, fracture, material)
-        rotation = equations.rotation.field if equations.rotation is not None else None
-        F, energy = deformation_gradient(equations.u), equations.material.energy
-        stress = symmetric_components(cauchy_stress(energy, F, rotation))
-        both = ufl.as_vector([*stress, energy.psi(F, rotation)])  # one kernel: F is worked out once
+        self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
+        self.law: EdgeLaw = law or Brittle()
+        self.degradation: Degradation = make_degradation(stress, graph)
+        self.not_finite = 0
+        energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
+        tensor = symmetric_components(cauchy_stress(energy, F, stress.R))
+        both = ufl.as_vector([*tensor, energy.psi(F, stress.R)])  # one kernel: F is worked out once
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
-        self.degradation = make_degradation(equations, self.graph)
-        self._average = _average(domain, fracture)
-        self.surfaces = _surfaces(equations, self.graph, self.strength, brittle)
-        self.passes = fracture.passes
-        self._most = None if fracture.cap is None else math.ceil(fracture.cap * self.graph.index_map.size_global)
+        self._memory: Damage | None = None
+
+    def evaluate(self) -> tuple[Values, Values]:
+        """Cauchy stress (cells, 3 or 6) in Pa and energy density (cells,) in J/m^3 of the undamaged material."""
+        values = self._evaluate()
+        if not np.isfinite(values.sum()):  # a crushed cell: J = 0
+            self.not_finite += int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+            np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        return values[:, :-1], values[:, -1]
 
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
-        values = self._evaluate()
-        stress, psi = values[:, :-1], values[:, -1]
-        if not np.isfinite(values.sum()):  # a crushed cell: J = 0
-            np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        broken = self.graph.break_edges(self._by_edges(stress) if self.surfaces is None else self._by_surfaces(stress))
+        stress, psi = self.evaluate()
+        broken = self._weaken(*self.criterion(stress))
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
-        released, elastic = self.degradation(broken > 0, stress, psi)
-        return PassResult(broken, released, elastic)
+        before = [each.x.array.copy() for each in self.stress.fields] if broken else []
+        lost = self.degradation(broken > 0, stress, psi)
+        if broken or lost.loss:
+            self.changed()
+        return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died, before)
 
-    def _by_edges(self, stress: Values) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the edges that their own normal stress breaks."""
-        edges, load = self._overloaded(*self._candidates(*self._carried(stress)))
-        if self._most is not None:
-            edges = self._strongest(edges, load, self._most)
-        flags = np.zeros(len(self.graph.broken), bool)
-        flags[edges] = True
-        return flags
+    def _weaken(self, edges: npt.NDArray[np.integer], load: Values) -> int:
+        """Give edges (n,) under a load (n,), in units of their strength, what the law leaves them; how many broke."""
+        left = np.ones(len(self.graph.broken))
+        np.minimum.at(left, edges, self.law(load))
+        return self.graph.break_edges(left == 0) if self.law.all_or_nothing else self.graph.weaken(left)
 
-    def _by_surfaces(self, stress: Values) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the edges that new surfaces cut; once all surfaces are used up nothing breaks."""
-        if not self.surfaces.left:
-            return np.zeros(len(self.graph.broken), bool)
-        carried, active = self._carried(stress)
-        average = self._average
-        return self.surfaces(
-            *self._candidates(carried, active), lambda: carried if average is None else average(carried, active)
-        )
+    # --- what it remembers ---
 
-    def _candidates(
-        self, carried: Values, active: npt.NDArray[np.bool_] | None
-    ) -> tuple[npt.NDArray[np.int64], Values]:
-        """Cells whose averaged stress may break an edge, and that stress.
+    def changed(self) -> None:
+        """Damage is not what `memory` gave."""
+        self._memory = None
 
-        No normal stress exceeds the Frobenius norm of its tensor, and no average exceeds the average of the norms:
-        most cells are passed over after one product.
-        """
-        size = frobenius_norm(carried, self.domain.dim)
-        if self._average is not None:
-            return self._average.reaching(carried, size, self.strength.weakest, active)
-        cells = np.flatnonzero(size >= self.strength.weakest)
-        return cells, carried[cells]
+    def restored(self) -> None:
+        """Edges and chi were read from a checkpoint."""
+        self.degradation.restore()
+        self.changed()
 
-    def _carried(self, stress: Values) -> tuple[Values, npt.NDArray[np.bool_] | None]:
-        """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
-        graph = self.graph
-        damaged = np.flatnonzero(graph.damaged)
-        if not self.domain.comm.allreduce(len(damaged)):
-            return stress, None
-        active = ~graph.split
-        carried = np.where(active[:, None], stress, 0.0)
-        # by edges and locally there is no need: an intact edge has the same normal stress in the whole tensor
-        if self._average is not None or self.surfaces is not None:
-            whole = damaged[active[damaged]]
-            carried[whole] = carried_by(stress[whole], self.equations.corners(whole), graph.intact(whole))
-        return carried, active
+    def memory(self) -> Damage:
+        """The damage of now."""
+        if self._memory is None:
+            fields = [each.x.array.copy() for each in self.stress.fields]
+            self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
+        return self._memory
 
-    def _overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[npt.NDArray[np.int32], Values]:
-        """Local edges whose normal stress in one of the cells reaches the strength, and the ratio of the two."""
-        edges = self.graph.cell_edges[cells]
-        along = normal_stress(averaged, edge_vectors(self.equations.corners(cells)))
-        strength = self.strength(cells, edges)
-        over = (along >= strength) & ~self.graph.broken[edges]
-        return edges[over], along[over] / strength[over]
-
-    def _strongest(self, edges: npt.NDArray[np.int32], load: Values, most: int) -> npt.NDArray[np.int32]:
-        """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
-        keys = self.graph.edge_keys(edges.astype(np.int64))
-        every = np.concatenate(self.domain.comm.allgather(np.column_stack([keys, -load])))
-        order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
-        _, first = np.unique(every[order, :2], axis=0, return_index=True)
-        chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)
-        wanted = self.graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self.graph.broken), bool)
-        return edges[wanted[edges]]
-
-
-def _average(domain: Domain, fracture: Fracture) -> Any:
-    if fracture.radius == 0:
-        return None
-    from .nonlocal_average import NonlocalAverage
-
-    return NonlocalAverage(domain, fracture.radius, fracture.kernel)
-
-
-def _surfaces(equations: Equilibrium, graph: EdgeGraph, strength: Strength, brittle: Brittle | None) -> Any:
-    if brittle is None:
-        return None
-    from .brittle.surfaces import BrittleSurfaces
-
-    return BrittleSurfaces(equations, graph, strength, brittle)
+    def recall(self, memory: Damage) -> bool:
+        """Be damaged as `memory` says; whether that is anything else than now."""
+        if memory is self._memory:
+            return False
+        self.graph.set_integrity(memory.integrity)
+        self.stress.exchange(memory.fields)
+        self.criterion.recall(memory.criterion)
+        self._memory = memory
+        return True

@@ -8,18 +8,34 @@ Where cracks close (`unilateral`) the springs of broken edges are added to eithe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..forms.kinematics import deformation_gradient
-from ..mechanics.balance import Equilibrium
 from ..mechanics.kernels import CellExpression
+from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from .edge_stress import edge_vectors, normal_stress
 
 Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What cells of this rank lost in a pass.
+
+    Attributes:
+        released, elastic: elastic energy that went, and that is left, J.
+        loss: most that chi of a cell fell.    died: whether cells lost the last of their stress.
+    """
+
+    released: float
+    elastic: float
+    loss: float = 0.0
+    died: bool = False
 
 
 class Degradation(Protocol):
@@ -27,10 +43,10 @@ class Degradation(Protocol):
 
     idle: bool  # an edge whose cells have all come apart carries nothing
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
-        """(energy released, elastic energy left) on this rank, J, after a pass that `broke` edges or did not.
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
+        """After a pass that `broke` edges or did not.
 
-        `stress` (cells, 3 or 6) and `psi` (cells,) are those of the undamaged material.
+        `stress` (cells, 3 or 6) in Pa and `psi` (cells,) in J/m^3 are those of the undamaged material.
         """
 
     def restore(self) -> None:
@@ -42,24 +58,25 @@ class Chi:
 
     idle = True
 
-    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
-        assert equations.chi is not None
-        self._equations, self._graph = equations, graph
-        self._chi: Values = equations.chi.x.array
-        self._volumes = equations.domain.volumes
+    def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
+        assert stress.chi is not None
+        self._stress, self._graph = stress, graph
+        self._chi: Values = stress.chi.x.array
+        self._volumes = stress.domain.volumes
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
         """Released and left: sums of V psi times what chi lost and what it is."""
-        released = self._lower(stress, psi)
-        return released, float(np.sum(self._volumes * self._chi[: len(psi)] * psi))
+        released, loss, died = self._lower(stress, psi)
+        return Lost(released, float(np.sum(self._volumes * self._chi[: len(psi)] * psi)), loss, died)
 
-    def _lower(self, stress: Values, psi: Values) -> float:
+    def _lower(self, stress: Values, psi: Values) -> tuple[float, float, bool]:
+        """Energy released on this rank in J, most that chi of a cell fell, and whether it fell to 0 in any."""
         graph, chi = self._graph, self._chi
         cells = np.flatnonzero(graph.damaged & (chi[: len(psi)] > 0))
         if not len(cells):
-            return 0.0
-        load = np.abs(normal_stress(stress[cells], edge_vectors(self._equations.corners(cells))))
-        whole, kept = load.sum(axis=1), np.where(graph.intact(cells), load, 0.0).sum(axis=1)
+            return 0.0, 0.0, False
+        load = np.abs(normal_stress(stress[cells], edge_vectors(self._stress.corners(cells))))
+        whole, kept = load.sum(axis=1), (load * graph.cell_integrity(cells)).sum(axis=1)
         share = np.divide(kept, whole, out=np.ones_like(kept), where=whole > 0)
         share[graph.split[cells]] = 0.0
         lost = np.maximum(chi[cells] - share, 0.0)
@@ -67,25 +84,22 @@ class Chi:
         cells, lost = cells[changed], lost[changed]
         chi[cells] -= lost
         chi[cells[graph.split[cells]]] = 0.0
-        if not chi[cells].all():
-            self._equations.leave_out_dead_cells()
-        return float(np.sum(self._volumes[cells] * lost * psi[cells]))
+        released = float(np.sum(self._volumes[cells] * lost * psi[cells]))
+        return released, float(np.max(lost, initial=0.0)), not chi[cells].all()
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""
-        self._equations.leave_out_dead_cells()
 
 
 class _Edges:
     """Integrity of each edge of each cell, and the energy that depends on it."""
 
-    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
-        assert equations.integrity is not None
-        domain = equations.domain
+    def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
+        assert stress.integrity is not None
+        domain = stress.domain
         self._graph, self._volumes = graph, domain.volumes
-        self._integrity = equations.integrity.x.array.reshape(-1, graph.cell_edges.shape[1])
-        rotation = equations.rotation.field if equations.rotation is not None else None
-        density = equations.energy.psi(deformation_gradient(equations.u), rotation)
+        self._integrity = stress.integrity.x.array.reshape(-1, graph.cell_edges.shape[1])
+        density = stress.energy.psi(deformation_gradient(stress.u), stress.R)
         self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count)
 
     def energy(self) -> float:
@@ -93,8 +107,8 @@ class _Edges:
         return float(self._volumes @ self._density()[:, 0])
 
     def update(self) -> None:
-        """Integrity from the patterns of the cells."""
-        self._integrity[: len(self._volumes)] = self._graph.intact(np.arange(len(self._volumes)))
+        """Integrity of the edges as cells see it."""
+        self._integrity[: len(self._volumes)] = self._graph.cell_integrity(np.arange(len(self._volumes)))
 
 
 class Projection:
@@ -102,46 +116,46 @@ class Projection:
 
     idle = False
 
-    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
-        self._edges = _Edges(equations, graph)
+    def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
+        self._edges = _Edges(stress, graph)
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
         """Released: what the projected energy lost at this displacement as edges broke."""
         before = self._edges.energy()
         if not broke:
-            return 0.0, before
+            return Lost(0.0, before)
         self.restore()
         after = self._edges.energy()
-        return before - after, after
+        return Lost(before - after, after)
 
     def restore(self) -> None:
-        """Integrity follows from the patterns."""
+        """Integrity follows from that of the edges."""
         self._edges.update()
 
 
 class ClosingChi(Chi):
     """chi beside the springs of broken edges (forms.closing)."""
 
-    def __init__(self, equations: Equilibrium, graph: EdgeGraph) -> None:
-        super().__init__(equations, graph)
-        self._edges = _Edges(equations, graph)
+    def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
+        super().__init__(stress, graph)
+        self._edges = _Edges(stress, graph)
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> tuple[float, float]:
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
         """Released: what the energy lost at this displacement as chi fell and edges broke."""
         before = self._edges.energy()
-        self._lower(stress, psi)
+        _, loss, died = self._lower(stress, psi)
         if broke:
             self._edges.update()
         after = self._edges.energy()
-        return before - after, after
+        return Lost(before - after, after, loss, died)
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""
         self._edges.update()
 
 
-def make_degradation(equations: Equilibrium, graph: EdgeGraph) -> Degradation:
-    """The approach of the study."""
-    if equations.chi is None:
-        return Projection(equations, graph)
-    return Chi(equations, graph) if equations.integrity is None else ClosingChi(equations, graph)
+def make_degradation(stress: Stress, graph: EdgeGraph) -> Degradation:
+    """The approach that the stress has fields for."""
+    if stress.chi is None:
+        return Projection(stress, graph)
+    return Chi(stress, graph) if stress.integrity is None else ClosingChi(stress, graph)

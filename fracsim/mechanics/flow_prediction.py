@@ -3,7 +3,7 @@
     extrapolated    F_p goes on as it did in the step before: an elastic step's cost (after IMPL-EX: Oliver, Huespe and
                     Cante 2008, who extrapolate the multiplier of the flow)
     implicit        the flow of the step itself (forms.plasticity): exact in steps of any size where loading goes on
-    staggered       nothing (M22): no relaxation at all
+    staggered       nothing (M22): no prediction at all
 
 Without any the stress of a yielding bar is too high by 3 mu times the strain of a step.
 """
@@ -28,7 +28,7 @@ MOST = 0.9  # norm of dt D: with less than 1 no stretch turns over
 UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]  # I
 
 
-class Relaxation(Protocol):
+class FlowPrediction(Protocol):
     """What is done about the flow of a step before it is known."""
 
     form: Any  # of forms.plasticity: virtual work and tangent; None where the energy of F_e says it all
@@ -38,9 +38,6 @@ class Relaxation(Protocol):
 
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
         """`cells` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
-
-    def undo(self) -> None:
-        """Take `flowed` back."""
 
 
 class Implicit:
@@ -63,9 +60,6 @@ class Implicit:
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
         """Nothing to remember."""
 
-    def undo(self) -> None:
-        """Nothing to forget."""
-
 
 class Extrapolated:
     """F_p^-1 (I + dt D) stands in for F_p^-1 while a step is solved, D = (exp(-beta e) - I) / dt of the last step.
@@ -80,7 +74,6 @@ class Extrapolated:
         self._inverse = inverse
         self._cells: Cells = np.empty(0, np.int32)
         self._rate: Values = np.empty((6, 0))
-        self._before: tuple[Cells, Values] = self._cells, self._rate
         self._held: Values | None = None  # (9, n) F_p^-1 of the cells, while another stands in for it
 
     def begin(self, dt: float, fraction: float) -> None:
@@ -96,12 +89,7 @@ class Extrapolated:
 
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
         """The rate of the step."""
-        self._before = self._cells, self._rate
         self._cells, self._rate = cells, (power - UNIT) / dt
-
-    def undo(self) -> None:
-        """The rate of the step before."""
-        self._cells, self._rate = self._before
 
     @property
     def memory(self) -> Values:

@@ -1,7 +1,8 @@
-"""The mass matrix, lumped to the nodes or consistent with the shape functions: made once, for it is constant.
+"""Inertia M a, with a mass matrix lumped to the nodes or consistent with the shape functions: made once.
 
 Lumped (vertex quadrature, the default) is a vector: inertia costs one product, and a node of debris keeps its own mass.
 Consistent is a sparse matrix with the pattern of the tangent: higher frequencies come out too high instead of too low.
+As a term of the form it would be integrated anew in every tangent.
 """
 
 from __future__ import annotations
@@ -12,17 +13,18 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 
-from ..mesh.domain import Domain
+from .dolfinx_calls import assemble_matrix
 from .kernels import compile_form
+from .term import Level, Term
+from .vectors import Assembler
 
 Values = npt.NDArray[np.float64]
 
 
 class Mass(Protocol):
-    """What the equations need of a mass matrix; values are those of the owned dofs."""
+    """What the balance needs of a mass matrix; values are those of the owned dofs."""
 
     lumped: Values  # kg, of each dof
     diagonal: bool  # whether it is the lumped one; the other also couples the nodes of dead cells
@@ -36,15 +38,51 @@ class Mass(Protocol):
     def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
         """tangent += factor M, leaving rows and columns of prescribed dofs decoupled."""
 
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+
+
+class Inertia(Term):
+    """M a."""
+
+    name = "inertia"
+
+    def __init__(self, u: fem.Function, mass: Mass) -> None:
+        self._u, self._mass = u, mass
+        self._level: Level | None = None
+
+    def begin(self, level: Level) -> None:
+        """The scheme's acceleration."""
+        self._level = level
+
+    @property
+    def mass_factor(self) -> float:
+        """c_a."""
+        assert self._level is not None
+        return self._level.c_a
+
+    def acceleration(self) -> Values | None:
+        """c_a (u - u_a); None where the scheme keeps inertia out of the balance."""
+        assert self._level is not None
+        u_a = self._level.u_a
+        return np.asarray(self.mass_factor * (self._u.x.array[: len(u_a)] - u_a)) if self.mass_factor else None
+
+    def scale(self) -> Values | None:
+        """M c_a (u - u_a), M lumped."""
+        assert self._level is not None
+        u_a, factor = self._level.u_a, self.mass_factor
+        return np.asarray(factor * self._mass.lumped * (self._u.x.array[: len(u_a)] - u_a)) if factor else None
+
 
 class LumpedMass:
     """M as a diagonal: int rho w at the vertices."""
 
     diagonal = True
 
-    def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec) -> None:
-        self.lumped = lumped_mass(domain, density)
-        self._diagonal = vector.duplicate()
+    def __init__(self, assembler: Assembler, density: Any) -> None:
+        """`density`: kg/m^3, a UFL coefficient."""
+        self.lumped = lumped_mass(assembler, density)
+        self._diagonal = assembler.vector()
 
     def times(self, values: Values) -> Values:
         """M a."""
@@ -59,21 +97,24 @@ class LumpedMass:
         self._diagonal.array_w[:] = factor * self.lumped
         tangent.setDiagonal(self._diagonal, PETSc.InsertMode.ADD)
 
+    def destroy(self) -> None:
+        """Give the memory back."""
+        self._diagonal.destroy()
+
 
 class ConsistentMass:
     """M = int rho u . w as a matrix."""
 
     diagonal = False
 
-    def __init__(self, domain: Domain, density: Any, vector: PETSc.Vec, bcs: list[fem.DirichletBC]) -> None:
-        self.lumped = lumped_mass(domain, density)
+    def __init__(self, assembler: Assembler, density: Any, bcs: list[fem.DirichletBC]) -> None:
+        """`density`: kg/m^3, a UFL coefficient; `bcs`: on the dofs that the balance prescribes."""
+        self.lumped, domain = lumped_mass(assembler, density), assembler.domain
         u, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         form = compile_form(density * ufl.inner(u, w) * ufl.dx(domain=domain.mesh))
-        self._whole = fem_petsc.assemble_matrix(form)
-        self._whole.assemble()
-        self._free = fem_petsc.assemble_matrix(form, bcs=bcs, diagonal=0.0)
-        self._free.assemble()
-        self._x, self._y = vector.duplicate(), vector.duplicate()
+        self._whole = assemble_matrix(form)
+        self._free = assemble_matrix(form, bcs, diagonal=0.0)
+        self._x, self._y = assembler.vector(), assembler.vector()
 
     def times(self, values: Values) -> Values:
         """M a."""
@@ -101,13 +142,15 @@ class ConsistentMass:
         """One pass over the stored entries: both have the same pattern."""
         tangent.axpy(factor, self._free, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
 
+    def destroy(self) -> None:
+        """Give the memory back."""
+        for kept in (self._whole, self._free, self._x, self._y):
+            kept.destroy()
 
-def lumped_mass(domain: Domain, density: Any) -> Values:
+
+def lumped_mass(assembler: Assembler, density: Any) -> Values:
     """(owned dofs,) share of each node in the mass of its cells, for each component, kg."""
+    domain = assembler.domain
     w, ones = ufl.TestFunction(domain.space), fem.Constant(domain.mesh, np.ones(domain.dim))
     vertices = ufl.dx(domain=domain.mesh, metadata={"quadrature_rule": "vertex", "quadrature_degree": 1})
-    vector = fem_petsc.assemble_vector(compile_form(density * ufl.inner(ones, w) * vertices))
-    vector.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
-    values = vector.array_r.copy()
-    vector.destroy()
-    return values
+    return assembler(compile_form(density * ufl.inner(ones, w) * vertices))

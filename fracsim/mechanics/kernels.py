@@ -18,6 +18,8 @@ from dolfinx.jit import get_options
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
+from ..mesh.domain import Domain
+
 _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
 
@@ -49,7 +51,7 @@ def compile_form(form: ufl.Form) -> fem.Form:
 
 
 class CellForm(fem.Form):
-    """A form over cells of `over`, some of which may be left out later: its kernels stay, and so do its facets.
+    """A form over `cells_measure`, cells of which may be left out later: its kernels stay, and so do its facets.
 
     fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a form
     whose derivatives let one of them vanish.
@@ -76,9 +78,10 @@ class CellForm(fem.Form):
         self._cpp_object = bind(kernels, whole.function_spaces, *fields, domains, {}, whole.mesh)
 
 
-def over(mesh: Any, cells: npt.NDArray[np.int32]) -> ufl.Measure:
-    """Measure of the given owned cells."""
-    return ufl.Measure("dx", domain=mesh, subdomain_data=[(1, cells)])(1)
+def cells_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:
+    """Measure of the given owned cells; None: of all of them."""
+    every = np.arange(domain.cell_count, dtype=np.int32) if cells is None else cells
+    return ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, every)])(1)
 
 
 def persistently[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:

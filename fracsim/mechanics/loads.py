@@ -1,104 +1,142 @@
-"""What acts on the body from outside, as functions of time: prescribed motion, dead loads, following pressure."""
+"""What acts on the body from outside as functions of time: dead loads and following pressure."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
+from ..forms.balance import pressure_work, traction_work
 from ..mesh.domain import Domain, Ints
-from ..study import MOTIONS, Boundary, Study
-from .time_functions import Law, Values, in_time, motion_law
+from .kernels import compile_form
+from .term import Level, Term
+from .time_functions import TimeFunction
+from .vectors import Assembler
+
+Values = npt.NDArray[np.float64]
+OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and what acts on them
 
 
-class Motion:
-    """Prescribed displacement of components of nodes. Where two entries hold one component, the later one counts.
+class _Moving:
+    """UFL constants that follow functions of time."""
 
-    Attributes:
-        dofs: sorted unrolled local dofs (node * d + component), ghosts included.
-        owned: how many of them this rank owns; they come first.
-    """
-
-    def __init__(self, domain: Domain, boundaries: list[Boundary]) -> None:
-        size = domain.dim
-        self._laws: list[Law] = []
-        entry = np.full((len(domain.nodes), size), -1, np.int64)  # row of the value table that holds each component
-        for index, boundary in enumerate(boundaries):
-            if boundary.kind not in MOTIONS:
-                continue
-            law, held = motion_law(boundary, size, f"boundary.{index}")
-            nodes = domain.nodes_of(boundary.on, f"boundary.{index}.on")
-            for component in np.flatnonzero(held):
-                entry[nodes, component] = len(self._laws) * size + component
-            self._laws.append(law)
-        flat = entry.reshape(-1)
-        self.dofs: Ints = np.flatnonzero(flat >= 0).astype(np.int32)
-        self._entry = flat[self.dofs]
-        self.owned = int(np.searchsorted(self.dofs, domain.node_count * size))
-
-    def at(self, t: float) -> Values:
-        """Displacement in m of each of `dofs` at time t."""
-        if not self._laws:
-            return np.empty(0)
-        return np.concatenate([law(t) for law in self._laws])[self._entry]
-
-
-class Forces:
-    """Dead loads and following pressures as UFL terms with constants that `set_time` moves."""
-
-    def __init__(self, domain: Domain, study: Study, density: Any) -> None:
-        self._moving: list[tuple[fem.Constant, Law]] = []
+    def __init__(self, domain: Domain) -> None:
         self._domain = domain
-        self.body = self._body_force(study, density)
-        loaded = [(i, entry) for i, entry in enumerate(study.boundary) if entry.kind not in MOTIONS]
-        ds = surface_measure(domain, [domain.facets_of(entry.on, f"boundary.{i}.on") for i, entry in loaded])
-        self.tractions = self._surface(loaded, "traction", domain.dim, ds)
-        self.pressures = self._surface(loaded, "pressure", 1, ds)
+        self._constants: list[tuple[fem.Constant, TimeFunction]] = []
+
+    def constant(self, function: TimeFunction, size: int) -> fem.Constant:
+        """A constant of `size` components that moves with a function."""
+        value = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.float64(np.nan))
+        self._constants.append((value, function))
+        return value
 
     def set_time(self, t: float) -> bool:
-        """Move every load to time t; whether any of them changed."""
+        """Move all to time t; whether any of them changed."""
         changed = False
-        for constant, law in self._moving:
-            value = law(t).reshape(constant.value.shape)
+        for constant, function in self._constants:
+            value = function(t).reshape(constant.value.shape)
             changed |= not np.array_equal(value, constant.value)
             constant.value[...] = value
         return changed
 
-    def _constant(self, law: Law, size: int) -> fem.Constant:
-        constant = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.float64(np.nan))
-        self._moving.append((constant, law))
-        return constant
 
-    def _body_force(self, study: Study, density: Any) -> Any:
-        """Force per reference volume in N/m^3 as a UFL expression, None where there is none."""
-        load, size = study.load, self._domain.dim
-        force = None
-        if load is not None and load.gravity is not None:
-            force = density * self._constant(in_time(load.gravity, "load.gravity", size), size)
-        if load is not None and load.body_force is not None:
-            extra = self._constant(in_time(load.body_force, "load.body_force", size), size)
-            force = extra if force is None else force + extra
-        return force
+class DeadLoads(Term):
+    """-(int t . w dA + int f . w dX), t in Pa of the reference area and f in N/m^3 of the reference volume.
 
-    def _surface(
-        self, loaded: list[tuple[int, Boundary]], kind: str, size: int, ds: ufl.Measure
-    ) -> list[tuple[fem.Constant, ufl.Measure]]:
-        """(load, measure) of each boundary entry of a kind."""
-        found = []
-        for number, (index, entry) in enumerate(loaded):
-            if entry.kind == kind:
-                law = in_time(getattr(entry, kind), f"boundary.{index}.{kind}", size)
-                found.append((self._constant(law, size), ds(number)))
-        return found
+    Assembled only where a load has changed.
+    """
+
+    name = "dead loads"
+
+    def __init__(
+        self,
+        assembler: Assembler,
+        *,
+        tractions: Sequence[OnFacets] = (),
+        gravity: tuple[Any, TimeFunction] | None = None,
+        body_force: TimeFunction | None = None,
+    ) -> None:
+        """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
+        domain, d = assembler.domain, assembler.domain.dim
+        self._assembler, self._moving = assembler, _Moving(domain)
+        w, dx = ufl.TestFunction(domain.space), ufl.dx(domain=domain.mesh)
+        of_volume = []
+        if gravity is not None:
+            of_volume.append(gravity[0] * self._moving.constant(gravity[1], d))
+        if body_force is not None:
+            of_volume.append(self._moving.constant(body_force, d))
+        parts = [
+            traction_work(self._moving.constant(traction, d), w, ds)
+            for (_, traction), ds in zip(tractions, surface_measures(domain, tractions), strict=True)
+        ]
+        if of_volume:
+            parts.append(ufl.inner(sum(of_volume[1:], of_volume[0]), w) * dx)
+        self._form = compile_form(sum(parts[1:], parts[0]))
+        self.force: Values = np.zeros(assembler.owned)
+
+    def begin(self, level: Level) -> None:
+        """The loads at the time of the balance."""
+        if self._moving.set_time(level.t):
+            self.force = self._assembler(self._form)
+
+    def add_force(self, rows: Values) -> None:
+        """r -= f."""
+        rows -= self.force
+
+    def applied(self) -> Values:
+        """f."""
+        return self.force
+
+    def scale(self) -> Values:
+        """f."""
+        return self.force
 
 
-def surface_measure(domain: Domain, parts: list[Ints]) -> ufl.Measure:
-    """Surface measure whose part `number` is over the exterior facets parts[number]; parts may overlap."""
+class Pressure(Term):
+    """int p J F^-T N . w dA: pressures in Pa that follow the surface; on the reference surface of a linear body."""
+
+    name = "pressure"
+
+    def __init__(self, assembler: Assembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
+        domain = assembler.domain
+        self._assembler, self._u, self.symmetric = assembler, u, linear
+        self._moving = _Moving(domain)
+        normal = ufl.FacetNormal(domain.mesh)
+        w = ufl.TestFunction(domain.space)
+        works = [
+            (self._moving.constant(function, 1), ds)
+            for (_, function), ds in zip(parts, surface_measures(domain, parts), strict=True)
+        ]
+        self._work = lambda w: -sum(pressure_work(p, u, w, normal, ds, linear=linear) for p, ds in works)
+        self._form = compile_form(self._work(w))
+
+    def begin(self, level: Level) -> None:
+        """The pressures at the time of the balance."""
+        self._moving.set_time(level.t)
+
+    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
+        """Virtual work, whatever cells `dx` has."""
+        return self._work(w)
+
+    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+        """Its derivative."""
+        return ufl.derivative(self._work(w), self._u, v)
+
+    def applied(self) -> Values:
+        """(owned dofs,) force of the pressures on the current shape, N (collective)."""
+        return -self._assembler(self._form)
+
+
+def surface_measures(domain: Domain, parts: Sequence[OnFacets]) -> list[ufl.Measure]:
+    """A surface measure for the exterior facets of each part; parts may overlap."""
     kind, topology = fem.IntegralType.exterior_facet, domain.mesh.topology
     entities = [
         (number, fem.compute_integration_domains(kind, topology, facets, domain.dim - 1))
-        for number, facets in enumerate(parts)
+        for number, (facets, _) in enumerate(parts)
     ]
-    return ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
+    ds = ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
+    return [ds(number) for number in range(len(parts))]

@@ -26,7 +26,7 @@ class MaterialFields:
     young: PerCell
     mu: PerCell
     lmbda: PerCell
-    plastic: Any = None  # fracsim.mechanics.plasticity.Plasticity of a body that flows
+    plastic: Any = None  # mechanics.plasticity.Plasticity of a body that flows
 
 
 def material_fields(domain: Domain, material: Material) -> MaterialFields:
@@ -38,7 +38,7 @@ def material_fields(domain: Domain, material: Material) -> MaterialFields:
     if domain.dim == 2 and material.plane == "stress":
         lmbda = plane_stress_lambda(mu, lmbda)
         options = {"reduced": True}
-    energy = ENERGIES[material.energy](_coefficient(domain, mu), _coefficient(domain, lmbda), **options)
+    energy = ENERGIES[material.energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
     return MaterialFields(energy, density, young, mu, lmbda)
 
 
@@ -63,7 +63,8 @@ def per_cell(domain: Domain, source: Any, key: str, regions: dict[str, Region] |
     return values
 
 
-def _coefficient(domain: Domain, value: PerCell) -> Any:
+def coefficient(domain: Domain, value: PerCell) -> Any:
+    """A parameter as a UFL coefficient: a constant, or a field that is constant in each cell."""
     if np.ndim(value) == 0:
         return fem.Constant(domain.mesh, np.float64(value))
     field = fem.Function(domain.cell_scalar)

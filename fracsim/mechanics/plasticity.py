@@ -13,7 +13,7 @@ from dolfinx import fem
 from ..forms.plasticity import Plastic
 from ..mesh.domain import Domain
 from ..study import Study
-from .flow_prediction import Extrapolated, Implicit, Relaxation
+from .flow_prediction import Extrapolated, FlowPrediction, Implicit
 from .material import MaterialFields, PerCell, per_cell
 
 Values = npt.NDArray[np.float64]
@@ -26,10 +26,10 @@ class Plasticity:
     """What the cells remember of their flow.
 
     Attributes:
-        inverse: F_p^-1, DG0, 3 x 3; while a step is solved, what `relaxation` puts in its place.
+        inverse: F_p^-1, DG0, 3 x 3; while a step is solved, what `prediction` puts in its place.
         rows: (cells, 9) its values.
         strain: (cells,) accumulated plastic strain alpha.
-        relaxation: what flow takes off the stress while a step is solved; None where flow only follows it.
+        prediction: what flow takes off the stress while a step is solved; None where flow only follows it.
         fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
     """
 
@@ -47,10 +47,11 @@ class Plasticity:
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
         # explicit steps know u before the stress is asked for: nothing need be extrapolated
         known = table.update == "extrapolated" and study.time.scheme == "explicit"
-        self.relaxation = self._relaxation(domain, "implicit" if known else table.update)
+        self.prediction = self._prediction(domain, "implicit" if known else table.update)
         self.refresh()
+        self._memory: Values | None = None
 
-    def _relaxation(self, domain: Domain, update: str) -> Relaxation | None:
+    def _prediction(self, domain: Domain, update: str) -> FlowPrediction | None:
         if update == "implicit":
             return Implicit(domain, self.energy, self.frobenius)
         return Extrapolated(self.rows) if update == "extrapolated" else None
@@ -62,31 +63,42 @@ class Plasticity:
 
     def refresh(self) -> None:
         """What flow within a step has to know of `strain`."""
-        if not isinstance(self.relaxation, Implicit):
+        if not isinstance(self.prediction, Implicit):
             return
         Y = self.resistance(self.strain)
         soft = (self.hardening < 0) & (WEAKEST * self._yield >= Y)  # as soft as it gets
-        self.relaxation.refresh(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
+        self.prediction.refresh(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
+
+    def changed(self) -> None:
+        """Cells flowed: what `memory` gave is of the past."""
+        self._memory = None
 
     def memory(self) -> Values:
-        """(cells, 10) F_p^-1 and alpha, for a checkpoint; with six of the last flow between them where it matters."""
-        self.begin(0.0)  # a step that failed may have left another in its place
-        last = [self.relaxation.memory] if isinstance(self.relaxation, Extrapolated) else []
-        return np.column_stack([self.rows, *last, self.strain])
+        """(cells, 10) F_p^-1 and alpha; with six of the last flow between them where it matters."""
+        if self._memory is None:
+            self.begin(0.0)  # a step that failed may have left another in its place
+            last = [self.prediction.memory] if isinstance(self.prediction, Extrapolated) else []
+            self._memory = np.column_stack([self.rows, *last, self.strain])
+        return self._memory
 
-    def restore(self, memory: Values) -> None:
-        """Take up what `memory` gave, whichever the update was."""
+    def recall(self, memory: Values) -> bool:
+        """Be as `memory` says, whichever the update was; whether that is anything else than now."""
+        self.begin(0.0)
+        if memory is self._memory:
+            return False
         self.rows[:] = memory[:, :9]
         self.strain[:] = memory[:, -1]
-        if isinstance(self.relaxation, Extrapolated) and memory.shape[1] > 10:
-            self.relaxation.memory = memory[:, 9:-1]
+        if isinstance(self.prediction, Extrapolated) and memory.shape[1] > 10:
+            self.prediction.memory = memory[:, 9:-1]
         self.refresh()
+        self._memory = memory
+        return True
 
     def begin(self, dt: float) -> None:
         """A step of dt is to be solved; with 0: it is done."""
         self.dt, self.fraction = dt, -math.expm1(-self.rate * dt) if dt else 0.0
-        if self.relaxation is not None:
-            self.relaxation.begin(dt, self.fraction)
+        if self.prediction is not None:
+            self.prediction.begin(dt, self.fraction)
 
 
 def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:

@@ -18,7 +18,7 @@ root without hardening (with nu for 1 - exp(-nu dt), so that halving the step wo
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,7 @@ from ..forms.plasticity import Trial
 from .kernels import CellExpression
 from .plasticity import Plasticity
 from .spectrum import deviatoric_power, eigenvalues, times
-
-if TYPE_CHECKING:
-    from .balance import Equilibrium
+from .stress import Stress
 
 Values = npt.NDArray[np.float64]
 Cells = npt.NDArray[np.int32]
@@ -39,23 +37,23 @@ ITERATIONS = 12  # of the secant; one does for small elastic strains
 BLOCK = 4096  # cells at a time: their arrays stay in the cache
 
 
-class Flow:
-    """The flow of a step, once its displacement is known.
+class ReturnMapping:
+    """The flow of a step, once its displacement is known: a part of stepping.after_step.
 
     Attributes:
         stored: this rank's share of int psi dX after it, J; without damage.
     """
 
-    def __init__(self, equations: Equilibrium) -> None:
-        plastic = equations.material.plastic
+    stored: float | None = 0.0
+
+    def __init__(self, stress: Stress) -> None:
+        plastic, domain = stress.material.plastic, stress.domain
         assert plastic is not None
         self.plastic: Plasticity = plastic
-        self._equations, domain = equations, equations.domain
-        rotation = equations.rotation.field if equations.rotation is not None else None
-        trial, of = Trial(plastic.energy, equations.u, rotation), (domain.comm, domain.mesh)
+        self._stress, self._flowed = stress, True
+        trial, of = Trial(plastic.energy, stress.u, stress.R), (domain.comm, domain.mesh)
         self._state = CellExpression(*of, trial.state(), domain.cell_count)
-        self.stress = CellExpression(*of, trial.measures(), domain.cell_count)
-        self._before: tuple[Cells, Values, Values] | None = None
+        self._measures = CellExpression(*of, trial.measures(), domain.cell_count)
 
     def begin(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""
@@ -68,7 +66,6 @@ class Flow:
         state = self._state()
         measure, Y = self.measured(state), plastic.resistance(plastic.strain)
         cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
-        self._before = cells, plastic.rows[cells], plastic.strain[cells]
         power, lost, psi = np.empty((6, len(cells))), 0.0, state[:, 2]
         if plastic.fraction > 0:
             for part in (slice(k, k + BLOCK) for k in range(0, len(cells), BLOCK)):
@@ -77,30 +74,32 @@ class Flow:
                 power[:, part] = block.find()
                 lost += self._lost(block)
                 psi[where] = block.after[:, 2]
-        self.stored = float(self._equations.domain.volumes @ psi)
-        if plastic.relaxation is not None and dt:
-            plastic.relaxation.flowed(cells, power, dt)
+        self.stored = float(self._stress.domain.volumes @ psi)
+        if plastic.prediction is not None and dt:
+            plastic.prediction.flowed(cells, power, dt)
         plastic.begin(0.0)
         if len(cells) and plastic.hardening:
             plastic.refresh()
+        if len(cells) or self._flowed:
+            plastic.changed()
+        self._flowed = len(cells) > 0
         return lost
 
-    def undo(self) -> None:
-        """Take the last flow back: the step will be solved again."""
-        assert self._before is not None
-        cells, inverse, strain = self._before
-        self.plastic.rows[cells], self.plastic.strain[cells] = inverse, strain
-        if self.plastic.relaxation is not None:
-            self.plastic.relaxation.undo()
-        self.plastic.refresh()
+    def memory(self) -> Values:
+        """What the cells remember of their flow."""
+        return self.plastic.memory()
+
+    def recall(self, memory: Values) -> bool:
+        """The cells remember no more than that."""
+        return self.plastic.recall(memory)
 
     def _put_back(self) -> None:
         """F_p of the step's start, in place of what it was solved with."""
-        if self.plastic.relaxation is None:
+        if self.plastic.prediction is None:
             return
-        self.plastic.relaxation.begin(0.0, 0.0)
-        if self.plastic.relaxation.form is None and self._equations.rotation is not None:
-            self._equations.rotation.update()  # it was that of another F_e
+        self.plastic.prediction.begin(0.0, 0.0)
+        if self.plastic.prediction.form is None:
+            self._stress.displaced()  # its rotation was that of another F_e
 
     def measured(self, stress: Values) -> Values:
         """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
@@ -116,8 +115,8 @@ class Flow:
         # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
-        chi = 1.0 if self._equations.chi is None else self._equations.chi.x.array[cells]
-        return float(np.sum(chi * self._equations.domain.volumes[cells] * (psi_trial - psi - over / 2 * flowed)))
+        chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[cells]
+        return float(np.sum(chi * self._stress.domain.volumes[cells] * (psi_trial - psi - over / 2 * flowed)))
 
 
 class _Return:
@@ -128,7 +127,7 @@ class _Return:
         size: (n,) sqrt(2/3) |e|.    beta: (n,) the root.
     """
 
-    def __init__(self, flow: Flow, cells: Cells, state: Values, measure: Values) -> None:
+    def __init__(self, flow: ReturnMapping, cells: Cells, state: Values, measure: Values) -> None:
         self._flow, self.cells, self._measure = flow, cells, measure
         plastic = flow.plastic
         self.alpha, self._start = plastic.strain[cells], np.ascontiguousarray(plastic.rows[cells].T)
@@ -149,7 +148,7 @@ class _Return:
         """Let the cells flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
 
         Where the last two excesses promise that the next secant step is the root (errors of the secant multiply), it is
-        taken and not looked at. A beta of 1 has no deviator left to relax: the Frobenius norm of a large pressure may
+        taken and not looked at. A beta of 1 has no deviator left to lose: the Frobenius norm of a large pressure may
         stay above yield.
         """
         plastic, q = self._flow.plastic, self._measure
@@ -173,21 +172,21 @@ class _Return:
     def _left(self, live: Any) -> Values:
         """What the excess of cells is above exp(-nu dt) of the old one, Pa, at their beta."""
         plastic, cells = self._flow.plastic, self.cells[live]
-        self._relax(live)
-        self.after[live] = stress = self._flow.stress(cells)
+        self._return(live)
+        self.after[live] = stress = self._flow._measures(cells)
         Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], cells)
         return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
 
     def _settle(self, cells: Any, before: Values) -> None:
         """A last step from the beta `before`: small, so that the measures go along straight lines."""
-        self._relax(cells)
+        self._return(cells)
         step, now = self.beta[cells] - before, self.after[cells]
         slope = np.divide(step, before, out=np.zeros_like(step), where=before > 0)
         now[:, :2] += slope[:, None] * (now - self.trial[cells])[:, :2]
         now[:, 2] -= self.J[cells] * now[:, 0] * self.size[cells] * step  # s : e of a von Mises stress along e
         self.after[cells] = now
 
-    def _relax(self, cells: Any) -> None:
+    def _return(self, cells: Any) -> None:
         """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
         power = deviatoric_power(self._C[:, cells], self._values[:, cells], self._logs[:, cells], -self.beta[cells] / 2)
         self._flow.plastic.rows[self.cells[cells]] = times(self._start[:, cells], power).T

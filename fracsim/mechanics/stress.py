@@ -8,7 +8,8 @@ forms.plasticity          the elastic part of F, and what flow within a step tak
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,54 +20,86 @@ from dolfinx import fem
 from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
-from ..mesh.domain import Domain
-from ..study import Fracture, Study
+from ..mesh.simplices import local_edges
+from .kernels import CellForm, cells_measure, compile_form
 from .material import MaterialFields
 from .rotation import RotationField
+from .term import Form, Level, Term
+from .vectors import Assembler
 
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 # Share of the stiffness that a detached piece keeps in a quasi-static study: small enough not to carry load, large
 # enough that the tangent stays regular (a condition number of 1e16 would not do).
 RESIDUAL_STIFFNESS = 1e-8
 
 
-class InternalForces:
-    """Forms of the stress in a body with displacement u.
+@dataclass(frozen=True)
+class Weakening:
+    """How broken edges weaken the energy of their cells (METHOD section 4).
 
     Attributes:
+        approach: "chi", the energy fades; "edge", the strain is projected on intact edges.
+        closes: whether broken edges resist being shorter than at rest.
+    """
+
+    approach: str = "chi"
+    closes: bool = False
+
+
+class Stress(Term):
+    """int chi P : grad w dX of a body with displacement u.
+
+    Attributes:
+        domain, u: the mesh and its displacement.    material: the undamaged body.
         chi: degradation field of the approach "chi", None otherwise.
-        integrity: 1 or 0 for each edge of each cell in the approach "edge" or where cracks close, None otherwise.
-        unilateral: whether broken edges resist being shortened.
+        integrity: a number in [0, 1] for each edge of each cell in the approach "edge" or where cracks close.
+        closes: whether broken edges resist being shortened.
         energy: the energy that is assembled; material.energy is that of the undamaged body.
         rotation: polar rotation of the elastic part of F, for energies that need it.
     """
 
-    def __init__(self, domain: Domain, u: fem.Function, study: Study, material: MaterialFields, inertia: bool) -> None:
-        self._domain, self._u, self._material = domain, u, material
-        self._floor = 0.0 if inertia else RESIDUAL_STIFFNESS
+    name = "stress"
+
+    def __init__(
+        self,
+        assembler: Assembler,
+        u: fem.Function,
+        material: MaterialFields,
+        weakening: Weakening | None = None,
+        *,
+        floor: float = 0.0,
+    ) -> None:
+        """`weakening`: None where nothing breaks. `floor`: share of the stiffness that every cell keeps."""
+        domain = self.domain = assembler.domain
+        self._assembler, self.u, self.material, self._floor = assembler, u, material, floor
         self.chi: fem.Function | None = None
         self.integrity: fem.Function | None = None
-        self.unilateral = study.fracture is not None and study.fracture.unilateral
-        self.energy: Energy = material.energy if study.fracture is None else self._damaged(study.fracture)
+        self.closes = weakening is not None and weakening.closes
+        self.energy: Energy = material.energy if weakening is None else self._weakened(weakening)
         self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
+        self.symmetric = material.plastic is None or not material.plastic.frobenius
+        whole = cells_measure(domain)
+        self._energy_form = compile_form(self._stored_energy(whole))
+        self._alone = CellForm(self.work(ufl.TestFunction(domain.space), whole))
 
-    def _damaged(self, fracture: Fracture) -> Energy:
-        """The energy with the fields of damage that the study's approach needs."""
-        whole: Any = self._material.energy
-        if fracture.approach == "chi":
+    # --- the energy and its fields ---
+
+    def _weakened(self, weakening: Weakening) -> Energy:
+        """The energy with the fields of damage that the approach needs."""
+        whole: Any = self.material.energy
+        if weakening.approach == "chi":
             self.chi = self._whole_cells("chi", 1)
-            if not fracture.unilateral:
-                return self._material.energy
-        from ..mesh.simplices import local_edges
-
-        edges: list[Any] = np.asarray(local_edges(self._domain.dim)).tolist()  # type: ignore[assignment]
+            if not weakening.closes:
+                return self.material.energy
+        edges: list[Any] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
         self.integrity = self._whole_cells("integrity", len(edges))
-        if fracture.approach == "edge":
+        if weakening.approach == "edge":
             from ..forms.damage import EdgeProjected
 
             whole = EdgeProjected(whole, self.integrity, edges, self._floor)
-        if not fracture.unilateral:
+        if not weakening.closes:
             return whole
         from ..forms.closing import Closing
 
@@ -75,48 +108,45 @@ class InternalForces:
 
     def _whole_cells(self, name: str, components: int) -> fem.Function:
         """A DG0 field of ones: nothing is broken yet."""
-        space = self._domain.cell_scalar if components == 1 else self._domain.cell_vector(components)
+        space = self.domain.cell_scalar if components == 1 else self.domain.cell_vector(components)
         field = fem.Function(space, name=name)
         field.x.array[:] = 1.0
         return field
 
-    def damage(self) -> list[Values]:
-        """Copies of the values of chi and integrity, as far as there are any."""
-        return [field.x.array.copy() for field in self._fields]
+    @property
+    def fields(self) -> list[fem.Function]:
+        """chi and integrity, as far as there are any."""
+        return [field for field in (self.chi, self.integrity) if field is not None]
 
-    def exchange_damage(self, values: list[Values]) -> list[Values]:
-        """Put in what `damage` has returned; returns what was there."""
-        found = self.damage()
-        for field, value in zip(self._fields, values, strict=True):
+    def exchange(self, values: Sequence[Values]) -> list[Values]:
+        """Put other values into `fields`; returns copies of those that were there."""
+        found = [field.x.array.copy() for field in self.fields]
+        for field, value in zip(self.fields, values, strict=True):
             field.x.array[:] = value
         return found
 
-    @property
-    def _fields(self) -> list[fem.Function]:
-        return [field for field in (self.chi, self.integrity) if field is not None]
-
     def _elastic_part(self) -> Any:
         """What the energy takes of F: all of it, or what plastic flow left (d x d)."""
-        F = deformation_gradient(self._u)
-        if self._material.plastic is None:
+        F = deformation_gradient(self.u)
+        if self.material.plastic is None:
             return F
-        part = self._material.energy.elastic_part(F)  # type: ignore[attr-defined]
-        return part if self._domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
+        part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
+        return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
 
     @property
-    def factor(self) -> fem.Function | None:
+    def multiplier(self) -> fem.Function | None:
         """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
-        return self.chi if self.energy is self._material.energy else None
+        return self.chi if self.energy is self.material.energy else None
 
     @property
-    def dead(self) -> npt.NDArray[np.bool_] | None:
+    def stressless(self) -> Flags | None:
         """(owned cells,) flags of those without any stress, for ever; None where a broken cell keeps some of it."""
-        if self.factor is None or self._floor:
+        if self.multiplier is None or self._floor:
             return None
-        return np.asarray(self.factor.x.array[: self._domain.cell_count] == 0)
+        return np.asarray(self.multiplier.x.array[: self.domain.cell_count] == 0)
 
     @property
-    def stiffness_left(self) -> Any:
+    def remaining_stiffness(self) -> Any:
         """chi, 1 where there is none; in a quasi-static study with a floor, so that the tangent stays regular."""
         return self._floored(self.chi)
 
@@ -126,38 +156,69 @@ class InternalForces:
         return self._floor + (1 - self._floor) * chi if self._floor else chi
 
     @property
-    def _R(self) -> Any:
+    def R(self) -> fem.Function | None:
+        """The field of `rotation`."""
         return self.rotation.field if self.rotation is not None else None
 
-    @property
-    def _relaxation(self) -> Any:
-        """Virtual work and tangent of a step that is solved with its own flow; None for all others."""
-        plastic = self._material.plastic
-        return plastic.relaxation.form if plastic is not None and plastic.relaxation is not None else None
+    # --- as a term of the balance ---
 
-    def stored(self, dx: ufl.Measure) -> ufl.Form:
-        """Elastic energy, J."""
-        return elastic_energy(self.energy, self._u, dx, chi=self._floored(self.factor), rotation=self._R)
+    def begin(self, level: Level) -> None:
+        """What flow takes off the stress of a step that is to be solved."""
+        if self.material.plastic is not None and level.dt:
+            self.material.plastic.begin(level.share * level.dt)
+
+    def displaced(self) -> None:
+        """u has moved."""
+        if self.rotation is not None:
+            self.rotation.update()
+
+    @property
+    def _flow_form(self) -> Any:
+        """Virtual work and tangent of a step that is solved with its own flow; None for all others."""
+        plastic = self.material.plastic
+        return plastic.prediction.form if plastic is not None and plastic.prediction is not None else None
+
+    def _stored_energy(self, dx: ufl.Measure) -> ufl.Form:
+        return elastic_energy(self.energy, self.u, dx, chi=self._floored(self.multiplier), rotation=self.R)
 
     def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, as flow within the step leaves it."""
-        relaxed = self._relaxation
-        if relaxed is None:
-            return internal_work(self.energy, self._u, w, dx, chi=self._floored(self.factor), rotation=self._R)
-        return relaxed.work(self._u, w, dx, chi=self.stiffness_left, rotation=self._R) + self._springs(w, dx)
+        flow = self._flow_form
+        if flow is None:
+            return internal_work(self.energy, self.u, w, dx, chi=self._floored(self.multiplier), rotation=self.R)
+        return flow.work(self.u, w, dx, chi=self.remaining_stiffness, rotation=self.R) + self._springs(w, dx)
 
-    def stiffness(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
-        relaxed = self._relaxation
-        if relaxed is None:
-            return ufl.derivative(self.work(w, dx), self._u, v)
-        tangent = relaxed.tangent(self._u, v, w, dx, chi=self.stiffness_left, rotation=self._R)
+        flow = self._flow_form
+        if flow is None:
+            return ufl.derivative(self.work(w, dx), self.u, v)
+        tangent = flow.tangent(self.u, v, w, dx, chi=self.remaining_stiffness, rotation=self.R)
         springs = self._springs(w, dx)
-        return tangent + (ufl.derivative(springs, self._u, v) if springs else 0)
+        return tangent + (ufl.derivative(springs, self.u, v) if springs else 0)
 
-    def _springs(self, w: Any, dx: ufl.Measure) -> ufl.Form | int:
+    def _springs(self, w: Any, dx: ufl.Measure) -> Form:
         """Virtual work of closing cracks in a body that flows."""
-        if not self.unilateral:
+        if not self.closes:
             return 0
         alone: Any = replace(self.energy, chi=0)  # type: ignore[type-var]
-        return internal_work(alone, self._u, w, dx)
+        return internal_work(alone, self.u, w, dx)
+
+    def stored(self) -> float:
+        """int psi dX at the current u, this rank's share, J."""
+        return float(fem.assemble_scalar(self._energy_form))
+
+    def force(self) -> Values:
+        """(owned dofs,) forces of the stress alone at the current u, N."""
+        return self._assembler(self._alone)
+
+    def damage_changed(self) -> None:
+        """Cells without stress are not integrated from here on: they would add zeros for ever."""
+        if (dead := self.stressless) is not None:
+            self._alone.leave_out(dead)
+
+    def corners(self, cells: npt.NDArray[np.integer]) -> Values:
+        """(n, d + 1, d) corners of cells in the configuration that the energy's stress belongs to, m."""
+        nodes, d = self.domain.cell_nodes[cells], self.domain.dim
+        corners = self.domain.nodes[nodes]
+        return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d)[nodes]

@@ -10,14 +10,14 @@ from ..mesh.bodies import bodies_of, free_motion, not_held
 from ..mesh.domain import Domain
 from ..mesh.ranks import on_root
 from ..meshes.data import MeshData
-from .loads import Motion
+from .prescribed_motion import PrescribedMotion
 from .time_functions import format_point
 
 
-def check_supports(domain: Domain, motion: Motion) -> None:
+def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
     """InputError where a body of the mesh keeps a rigid motion that no prescribed component stops (collective)."""
     held = np.zeros(domain.node_count * domain.dim, bool)
-    held[motion.dofs[: motion.owned]] = True
+    held[motion.owned] = True
     flags = domain.gather_nodes(held.reshape(-1, domain.dim))
     on_root(domain.comm, lambda: _check(domain.source, flags))
 

@@ -60,6 +60,7 @@ class Assembly:
         if not back and (alive == room or alive > share * room):
             return False
         self._dead = dead.copy()
+        self.matrix.destroy()
         self._make()
         return True
 
@@ -70,3 +71,7 @@ class Assembly:
         self._sum.scatter_reverse()
         self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
         self.matrix.assemble()
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's matrix back."""
+        self.matrix.destroy()

@@ -1,4 +1,4 @@
-"""Laws in time: constants and tables of the study file as functions of t. No DOLFINx here."""
+"""Functions of time: constants and tables of the study file as functions of t. No DOLFINx here."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..errors import InputError
 from ..study import Boundary, TimeTable
 
 Values = npt.NDArray[np.float64]
-Law = Callable[[float], Values]
+TimeFunction = Callable[[float], Values]
 AXES = "xyz"
 
 
-def in_time(value: Any, key: str, size: int) -> Law:
+def in_time(value: Any, key: str, size: int) -> TimeFunction:
     """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
     table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
     times = np.asarray(table.time)
@@ -38,7 +38,7 @@ def format_point(point: Iterable[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
-def integral_in_time(value: Any, key: str, size: int) -> Law:
+def integral_in_time(value: Any, key: str, size: int) -> TimeFunction:
     """The integral from t = 0 of a constant or a table: exact, by trapezia between the corners of the table."""
     rate = in_time(value, key, size)
     corners = np.array(value.time) if isinstance(value, TimeTable) else np.empty(0)
@@ -52,7 +52,7 @@ def integral_in_time(value: Any, key: str, size: int) -> Law:
     return integrated
 
 
-def motion_law(boundary: Boundary, size: int, key: str) -> tuple[Law, npt.NDArray[np.bool_]]:
+def motion_function(boundary: Boundary, size: int, key: str) -> tuple[TimeFunction, npt.NDArray[np.bool_]]:
     """Displacement over time of a boundary entry, and which components it holds."""
     if boundary.fix is not None:
         held = np.array([axis in boundary.fix for axis in AXES[:size]])

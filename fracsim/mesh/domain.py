@@ -106,6 +106,13 @@ class Domain:
         """Index in the input mesh of every owned cell."""
         return np.asarray(self.mesh.topology.original_cell_index[: self.cell_count], np.int64)
 
+    def with_ghosts(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(owned and ghost dofs,) values from those of the owned dofs of the displacement space (collective)."""
+        result = fem.Function(self.space)
+        result.x.array[: len(owned)] = owned
+        result.x.scatter_forward()
+        return np.asarray(result.x.array)
+
     @cached_property
     def gather_nodes(self) -> Gather:
         return Gather(self.comm, self.node_input[: self.node_count])

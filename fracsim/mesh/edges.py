@@ -23,7 +23,9 @@ class EdgeGraph:
     Attributes:
         cell_edges: (cells, k) local edge index of each cell's local edges, k = 3 or 6.
         cell_nodes: (cells, d + 1) local node index.
-        broken: (edges,) bool for owned and ghost edges, the same on every rank that has the edge.
+        integrity: (edges,) of owned and ghost edges, from 1 (whole) to 0 (broken), never rising; the same on every rank
+            that has the edge.
+        broken: (edges,) bool, integrity is 0.
         pattern: (cells,) uint8, bit k set where local edge k is broken.
     """
 
@@ -38,7 +40,8 @@ class EdgeGraph:
         connectivity = topology.connectivity(domain.dim, 1).array
         self.cell_edges: Ints = connectivity[: domain.cell_count * len(edges)].reshape(-1, len(edges))
         self.cell_nodes = domain.cell_nodes
-        self.broken = np.zeros(self.edge_count + self.index_map.num_ghosts, bool)
+        self.integrity = np.ones(self.edge_count + self.index_map.num_ghosts)
+        self.broken = np.zeros(len(self.integrity), bool)
         self.pattern = np.zeros(domain.cell_count, np.uint8)
         self._shared = la.vector(self.index_map, 1, np.int32)
 
@@ -63,11 +66,43 @@ class EdgeGraph:
         new = self.on_any_rank(flags) & ~self.broken
         count = int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
         if count:
-            self.broken |= new
-            touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
-            bits = 1 << np.arange(self.cell_edges.shape[1])
-            self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
+            self.integrity[new] = 0.0
+            self._note_broken(new)
         return count
+
+    def weaken(self, integrity: npt.NDArray[np.float64]) -> int:
+        """Lower integrity to the least (edges,) that any rank gives an edge; returns how many broke (collective)."""
+        least = np.minimum(self.integrity, self._least_of_ranks(integrity))
+        new = (least == 0) & ~self.broken
+        self.integrity[:] = least
+        self._note_broken(new)
+        return int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
+
+    def set_integrity(self, integrity: npt.NDArray[np.float64]) -> None:
+        """Be as an earlier time left it: (edges,), owned and ghost."""
+        self.integrity[:] = integrity
+        self.broken[:], self.pattern[:] = False, 0
+        self._note_broken(self.integrity == 0)
+
+    def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
+        """Edges (edges,) are broken from here on."""
+        self.broken |= new
+        touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
+        bits = 1 << np.arange(self.cell_edges.shape[1])
+        self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
+
+    def _least_of_ranks(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(edges,) the least value that any rank gives an edge (collective)."""
+        if self.domain.comm.size == 1:
+            return values
+        every, first = self.domain.comm.allgather(values[self.edge_count :]), self.index_map.local_range[0]
+        result = la.vector(self.index_map, 1, np.float64)
+        result.array[:] = values
+        for ghosts, ghost_values in zip(self.domain.comm.allgather(self.index_map.ghosts), every, strict=True):
+            own = (ghosts >= first) & (ghosts < first + self.edge_count)
+            np.minimum.at(result.array, ghosts[own] - first, ghost_values[own])
+        result.scatter_forward()
+        return np.asarray(result.array)
 
     def break_idle(self) -> int:
         """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
@@ -98,6 +133,10 @@ class EdgeGraph:
         """(n, k) whether each local edge of the cells is intact."""
         bits = np.arange(self.cell_edges.shape[1])
         return np.asarray((self.pattern[cells, None] >> bits) & 1 == 0)
+
+    def cell_integrity(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+        """(n, k) integrity of each local edge of the cells."""
+        return self.integrity[self.cell_edges[cells]]
 
     def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.balance import Equilibrium
+from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
 from ..mesh.ranks import Gather, on_root
 from ..meshes.data import MeshData
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
+_SOMETIMES = ("drag", "out_of_balance")
 
 
 def checkpoint_path(folder: Path) -> Path:
@@ -38,7 +40,7 @@ def write_checkpoint(
     folder: Path,
     domain: Domain,
     state: State,
-    equations: Equilibrium,
+    stress: Stress,
     record: EdgeRecord | None = None,
     surfaces: BrittleSurfaces | None = None,
 ) -> Path:
@@ -48,11 +50,12 @@ def write_checkpoint(
     """
     d = domain.dim
     arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
-    if state.drag is not None:
-        arrays["drag"] = domain.gather_nodes(state.drag.reshape(-1, d))
-    if equations.chi is not None:
-        arrays["chi"] = domain.gather_cells(equations.chi.x.array[: domain.cell_count])
-    if (plastic := equations.material.plastic) is not None:
+    for name in _SOMETIMES:
+        if (values := getattr(state, name)) is not None:
+            arrays[name] = domain.gather_nodes(values.reshape(-1, d))
+    if stress.chi is not None:
+        arrays["chi"] = domain.gather_cells(stress.chi.x.array[: domain.cell_count])
+    if (plastic := stress.material.plastic) is not None:
         arrays["plastic"] = domain.gather_cells(plastic.memory())
     if record is not None:
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
@@ -79,40 +82,36 @@ def read_checkpoint(
     folder: Path,
     domain: Domain,
     state: State,
-    equations: Equilibrium,
+    stress: Stress,
     record: EdgeRecord | None = None,
     surfaces: BrittleSurfaces | None = None,
-) -> None:
-    """Bring a checkpoint into the state, chi and the record with its graph (collective).
+) -> State:
+    """The state of a checkpoint, with chi and the record with its graph brought to it (collective).
 
     InputError where there is no checkpoint that fits.
     """
     path, comm = checkpoint_path(folder), domain.comm
-    plastic = equations.material.plastic
+    plastic = stress.material.plastic
     arrays = on_root(comm, lambda: _read(path, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
         head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks"), arrays.get("starts")
     clock, names, broken, breaks, starts = comm.bcast(head)
-    for name in _CLOCK:
-        setattr(state, name, clock[name])
 
     def scattered(gather: Gather, name: str) -> npt.NDArray[Any]:
         return gather.scatter(arrays[name] if arrays is not None else None)
 
-    for name in (*_NODAL, "drag"):
-        if name in names:
-            setattr(state, name, scattered(domain.gather_nodes, name).reshape(-1))
+    nodal = {name: scattered(domain.gather_nodes, name).reshape(-1) for name in (*_NODAL, *_SOMETIMES) if name in names}
     if record is not None and broken is not None:
         record.graph.break_edges(record.graph.flags_of_keys(broken))
         record.restore(broken, breaks)
     if surfaces is not None and starts is not None:
         surfaces.starts = starts
-    if equations.chi is not None and "chi" in names:
-        equations.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
+    if stress.chi is not None and "chi" in names:
+        stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
-        plastic.restore(scattered(domain.gather_cells, "plastic"))
-    equations.displace(state.u)
+        plastic.recall(scattered(domain.gather_cells, "plastic"))
+    return replace(state, **{name: clock[name] for name in _CLOCK}, **nodal)
 
 
 def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:

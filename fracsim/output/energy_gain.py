@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..stepping.implicit import Report
 from ..stepping.state import State
+from ..stepping.stepper import StepReport
 
 SHARE = 0.05  # of the energy at play: what steps that are long for the waves in them may gain without a word
 
@@ -23,7 +23,7 @@ class Gained:
         self._least = 0.0 if at_rest else float("inf")
         self.rise, self.scale = 0.0, 0.0
 
-    def look(self, report: Report, state: State) -> None:
+    def look(self, report: StepReport, state: State) -> None:
         """Note a step that was taken."""
         held = report.kinetic + report.elastic
         balance = held + state.dissipated - state.work

@@ -12,8 +12,8 @@ from ufl.core.expr import Expr
 
 from ..forms.energies import full_cauchy_stress, von_mises
 from ..forms.kinematics import deformation_gradient, embed, green_strain
-from ..mechanics.balance import Equilibrium
 from ..mechanics.kernels import CellExpression
+from ..mechanics.stress import Stress
 from ..stepping.state import State
 from .fields_file import Field
 
@@ -28,8 +28,8 @@ _TENSOR6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class Frames:
     """Gathers the fields of a frame to rank 0. Expressions are compiled at the first frame that needs them."""
 
-    def __init__(self, equations: Equilibrium, names: list[str], fracture: Any = None) -> None:
-        self._equations, self._domain, self._fracture = equations, equations.domain, fracture
+    def __init__(self, stress: Stress, names: list[str], fracture: Any = None) -> None:
+        self._stress, self._domain, self._fracture = stress, stress.domain, fracture
         self._names = names
         self._compiled: dict[str, CellExpression] = {}
 
@@ -54,13 +54,13 @@ class Frames:
         if name == "region":
             return self._domain.region.astype(np.int32)
         if name == "plastic_strain":
-            strain: Values = self._equations.material.plastic.strain
+            strain: Values = self._stress.material.plastic.strain
             return strain
         if name == "damage":
             return self._broken_share()
         if name == "chi":
-            assert self._equations.chi is not None
-            return self._equations.chi.x.array[: self._domain.cell_count]
+            assert self._stress.chi is not None
+            return self._stress.chi.x.array[: self._domain.cell_count]
         values = self._carried(name)
         return values[:, 0] if values.shape[1] == 1 else values
 
@@ -72,45 +72,44 @@ class Frames:
     def _carried(self, name: str) -> Values:
         """An expression of the deformation; stress and energy times chi: what the damaged body really carries."""
         if name not in self._compiled:
-            expression = _EXPRESSIONS[name](self._equations)
+            expression = _EXPRESSIONS[name](self._stress)
             self._compiled[name] = CellExpression(
                 self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
             )
         values = self._compiled[name]()
-        if (chi := self._equations.internal.factor) is not None and name != "strain":
+        if (chi := self._stress.multiplier) is not None and name != "strain":
             values *= chi.x.array[: self._domain.cell_count, None]
         if self._fracture is not None and name == "strain":
             values[self._fracture.graph.split] = 0.0  # nodes of several pieces have no strain in common
         return np.nan_to_num(values)
 
 
-def _kinematics(equations: Equilibrium) -> tuple[Any, Expr, Expr | None]:
-    rotation = equations.rotation.field if equations.rotation is not None else None
-    return equations.energy, deformation_gradient(equations.u), rotation
+def _kinematics(stress: Stress) -> tuple[Any, Expr, Expr | None]:
+    return stress.energy, deformation_gradient(stress.u), stress.R
 
 
-def _stress(equations: Equilibrium) -> Expr:
-    stress = full_cauchy_stress(*_kinematics(equations))
-    return ufl.as_vector([stress[i, j] for i, j in _TENSOR6])
+def _tensor(stress: Stress) -> Expr:
+    tensor = full_cauchy_stress(*_kinematics(stress))
+    return ufl.as_vector([tensor[i, j] for i, j in _TENSOR6])
 
 
-def _von_mises(equations: Equilibrium) -> Expr:
-    return von_mises(full_cauchy_stress(*_kinematics(equations)))
+def _von_mises(stress: Stress) -> Expr:
+    return von_mises(full_cauchy_stress(*_kinematics(stress)))
 
 
-def _energy_density(equations: Equilibrium) -> Expr:
-    energy, F, rotation = _kinematics(equations)
+def _energy_density(stress: Stress) -> Expr:
+    energy, F, rotation = _kinematics(stress)
     return energy.psi(F, rotation)
 
 
-def _strain(equations: Equilibrium) -> Expr:
+def _strain(stress: Stress) -> Expr:
     """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (the strain profile of M22 fig. 2)."""
-    E = green_strain(embed(deformation_gradient(equations.u), 1.0))
+    E = green_strain(embed(deformation_gradient(stress.u), 1.0))
     return ufl.sqrt(2 / 3 * ufl.inner(ufl.dev(E), ufl.dev(E)))
 
 
-_EXPRESSIONS: dict[str, Callable[[Equilibrium], Expr]] = {
-    "stress": _stress,
+_EXPRESSIONS: dict[str, Callable[[Stress], Expr]] = {
+    "stress": _tensor,
     "von_mises": _von_mises,
     "energy_density": _energy_density,
     "strain": _strain,

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.balance import Equilibrium
+from ..mechanics.balance import Balance
 from ..mechanics.time_functions import AXES, of_size
 from ..mesh.domain import Domain, Ints
 from ..mesh.ranks import total
-from ..stepping.implicit import Report
 from ..stepping.state import State
+from ..stepping.stepper import StepReport
 from ..study import Probe
 
 COLUMNS = (
@@ -29,8 +29,8 @@ Reading = Callable[[], npt.NDArray[np.float64]]
 class Probes:
     """Displacements and reactions that the study asks for."""
 
-    def __init__(self, equations: Equilibrium, probes: list[Probe]) -> None:
-        self._equations, self._domain = equations, equations.domain
+    def __init__(self, balance: Balance, probes: list[Probe]) -> None:
+        self._balance, self._domain = balance, balance.domain
         self.names: list[str] = []
         self._readings: list[Reading] = []
         for index, probe in enumerate(probes):
@@ -52,12 +52,12 @@ class Probes:
         owned = nodes[nodes < self._domain.node_count]
         if probe.quantity == "displacement":
             return self._mean_displacement(owned)
-        return lambda: self._equations.unbalanced.reshape(-1, self._domain.dim)[owned].sum(axis=0)
+        return lambda: self._balance.reactions.reshape(-1, self._domain.dim)[owned].sum(axis=0)
 
     def _mean_displacement(self, owned: Ints) -> Reading:
         count = total(self._domain.comm, len(owned))[0]
         d = self._domain.dim
-        return lambda: self._equations.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
+        return lambda: self._balance.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
 
 
 def nearest_node(domain: Domain, point: list[float], key: str) -> Ints:
@@ -95,12 +95,12 @@ class History:
             self._note_peaks(dict(zip(self.columns, map(float, row), strict=True)))
 
     def append(
-        self, state: State, report: Report, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
+        self, state: State, report: StepReport, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
     ) -> None:
         """One row; `damage` is (broken edges, split cells, pieces)."""
         values = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
-            report.outcome.newton, report.outcome.krylov, report.seconds, *probes,
+            report.solve.newton, report.solve.krylov, report.seconds, *probes,
         ]  # fmt: skip
         self._note_peaks(dict(zip(self.columns, values, strict=True)))
         if self._file is not None:

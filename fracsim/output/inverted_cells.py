@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mechanics.balance import Equilibrium
+from ..mechanics.stress import Stress
 from ..mesh.ranks import total
 
 FLAT = 1e-6  # a cell with no more than this share of its volume left is none
@@ -27,20 +27,20 @@ class Inverted:
         since: s of the first such frame.
     """
 
-    def __init__(self, equations: Equilibrium, fracture: Any = None) -> None:
-        """`fracture`: the FracturePass, which knows the damaged cells."""
-        self._equations, self._domain = equations, equations.domain
+    def __init__(self, stress: Stress, fracture: Any = None) -> None:
+        """`fracture`: what breaks, which knows the damaged cells."""
+        self._stress, self._domain = stress, stress.domain
         self._graph = fracture.graph if fracture is not None else None
         self.least, self.count, self.since = 1.0, 0, 0.0
 
     def look(self, t: float) -> None:
         """Note the present deformation, at t s (collective)."""
-        if self._equations.material.energy.linear:
+        if self._stress.material.energy.linear:
             return
         domain = self._domain
         cells = np.arange(domain.cell_count) if self._graph is None else np.flatnonzero(~self._graph.damaged)
         rest = domain.nodes[domain.cell_nodes[cells]]
-        J = _spanned(self._equations.corners(cells)) / _spanned(rest)
+        J = _spanned(self._stress.corners(cells)) / _spanned(rest)
         self.least = min(self.least, domain.comm.allreduce(float(J.min(initial=np.inf)), op=MPI.MIN))
         turned = int(total(domain.comm, np.count_nonzero(J <= FLAT))[0])
         if turned and not self.count:

@@ -7,8 +7,8 @@ import time
 
 from mpi4py import MPI
 
-from ..stepping.implicit import Report
 from ..stepping.state import State
+from ..stepping.stepper import StepReport
 from ..study import Study
 
 
@@ -28,7 +28,7 @@ class Progress:
         if self._on:
             sys.stderr.write("\n")
 
-    def update(self, state: State, report: Report, figures: tuple[int, int, int]) -> None:
+    def update(self, state: State, report: StepReport, figures: tuple[int, int, int]) -> None:
         """After each step."""
         if not self._on:
             return
@@ -39,7 +39,7 @@ class Progress:
         broken, _, pieces = figures
         line = (
             f"\r{state.t / self._end:6.1%}  t = {state.t:.4g} s  step {state.step}  {report.seconds:.2f} s/step  "
-            f"Newton {report.outcome.newton}  broken {broken}  pieces {pieces}  left {_clock(left)} "
+            f"Newton {report.solve.newton}  broken {broken}  pieces {pieces}  left {_clock(left)} "
         )
         sys.stderr.write(line.ljust(110))
         sys.stderr.flush()

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fracture.edge_stress import edge_vectors
-from ..mechanics.balance import Equilibrium
+from ..mechanics.stress import Stress
 from ..mesh.simplices import local_edges
 from ..mesh.small_matrices import barycentric_gradients
 
@@ -31,27 +31,25 @@ class EdgeFrequencies:
     springs: Values | None
 
 
-def edge_frequencies(equations: Equilibrium) -> EdgeFrequencies:
+def edge_frequencies(stress: Stress) -> EdgeFrequencies:
     """Those of the current integrity."""
-    domain, integrity = equations.domain, equations.integrity
+    domain, integrity = stress.domain, stress.integrity
     assert integrity is not None
     intact = integrity.x.array.reshape(-1, len(local_edges(domain.dim)))[: domain.cell_count] > 0
     cells = np.flatnonzero(~intact.all(axis=1))
     intact = intact[cells]
-    projected = projected_frequencies(equations, cells, intact) if equations.chi is None else None
-    springs = spring_frequencies(equations, cells, ~intact) if equations.internal.unilateral else None
+    projected = projected_frequencies(stress, cells, intact) if stress.chi is None else None
+    springs = spring_frequencies(stress, cells, ~intact) if stress.closes else None
     return EdgeFrequencies(cells, projected, springs)
 
 
-def projected_frequencies(
-    equations: Equilibrium, cells: npt.NDArray[np.int64], intact: npt.NDArray[np.bool_]
-) -> Values:
+def projected_frequencies(stress: Stress, cells: npt.NDArray[np.int64], intact: npt.NDArray[np.bool_]) -> Values:
     """(n,) omega^2 of cells that carry the projection of their strain on `intact` edges ((n, k) flags), exactly.
 
     With elongations l = n . (u_j - u_i) = B u of intact edges the energy is V/2 l A l, A_ef = P_e : C : P_f and
     P_e = -|d_e| sym(g_i x g_j), so that omega^2 = V lmax(A B B^T) / m.
     """
-    domain, material, d = equations.domain, equations.material, equations.domain.dim
+    domain, material, d = stress.domain, stress.material, stress.domain.dim
     corners = domain.nodes[domain.cell_nodes[cells]]
     edges = edge_vectors(corners)
     length = np.linalg.norm(edges, axis=2, keepdims=True)
@@ -62,7 +60,7 @@ def projected_frequencies(
     return np.asarray((d + 1) / _of(cells, material.density) * highest)
 
 
-def spring_frequencies(equations: Equilibrium, cells: npt.NDArray[np.int64], broken: npt.NDArray[np.bool_]) -> Values:
+def spring_frequencies(stress: Stress, cells: npt.NDArray[np.int64], broken: npt.NDArray[np.bool_]) -> Values:
     """(n,) bounds of omega^2 of the springs of broken edges ((n, k) flags), whichever of them are shortened.
 
     Their stiffness is V k / |d|^2 against elongation; |B B^T|, by its row sums, is at most that of edges that share a
@@ -70,7 +68,7 @@ def spring_frequencies(equations: Equilibrium, cells: npt.NDArray[np.int64], bro
     """
     from ..forms.closing import spring_modulus
 
-    domain, material, d = equations.domain, equations.material, equations.domain.dim
+    domain, material, d = stress.domain, stress.material, stress.domain.dim
     edges = edge_vectors(domain.nodes[domain.cell_nodes[cells]])
     square = np.einsum("nki,nki->nk", edges, edges)
     shortest = np.where(broken, square, np.inf).min(axis=1)

@@ -9,11 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mechanics.balance import Equilibrium
+from ..mechanics.balance import Balance
+from ..mechanics.damping import Drag, Viscosity
+from .after_step import Breaking, Flow, PassResult
 from .frequencies import cell_frequencies, damaged_frequencies
-from .implicit import Stepper
-from .newton import Outcome
 from .state import State
+from .stepper import BalanceStepper, SolveResult, StepSizes
+from .stress_release import released_state
 
 if TYPE_CHECKING:
     from .edge_frequencies import EdgeFrequencies
@@ -24,73 +26,87 @@ SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on th
 REFRESH = 20  # steps between two looks at the shape of the cells
 
 
-class ExplicitStepper(Stepper):
-    """Central differences (forms.schemes.CentralDifference); the study's step is an upper bound."""
+class ExplicitStepper(BalanceStepper):
+    """Central differences (forms.schemes.central_difference); the study's step is an upper bound."""
 
-    _frequencies: Values | None = None
-    _by_edges: EdgeFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
     _arrival: tuple[Values, Values, Values]
 
-    def _fit(self, state: State) -> float:
+    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking) -> None:
+        super().__init__(balance, sizes, flow, breaking)
+        self._frequencies: Values | None = None
+        self._by_edges: EdgeFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
+        self._a, self._b = rayleigh(balance)
+
+    def _size(self, state: State) -> float:
         """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
+        stress = self.balance.stress
         if self._frequencies is None or state.step % REFRESH == 0:
-            self._frequencies = cell_frequencies(self.equations)
-        squares = damaged_frequencies(self.equations, self._frequencies, self._of_edges())
+            self._frequencies = cell_frequencies(stress)
+        squares = damaged_frequencies(stress, self._frequencies, self._of_edges())
         highest = float(np.sqrt(self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)))
-        stable = SAFETY * stable_step(highest, self.equations)
-        left = self.timing.end - state.t
+        stable = SAFETY * stable_step(highest, self._a, self._b)
+        left = self.sizes.end - state.t
         # equal steps to the end rather than a sliver: rounding up never exceeds the bound
         dt = min(state.dt, stable)
         return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
 
     def _of_edges(self) -> EdgeFrequencies | None:
         """What broken edges make of their cells; None where damage has no integrity."""
-        if self._by_edges is None and self.equations.integrity is not None:
+        if self._by_edges is None and self.balance.stress.integrity is not None:
             from .edge_frequencies import edge_frequencies
 
-            self._by_edges = edge_frequencies(self.equations)
+            self._by_edges = edge_frequencies(self.balance.stress)
         return self._by_edges
 
-    def settle(self, state: State) -> None:
+    def settle(self, state: State) -> State:
         """As any stepper; the body's damage may have been changed from outside before, as by a restart."""
         self._by_edges = None
-        super().settle(state)
+        return super().settle(state)
 
-    def _release(self, state: State, solved: Values, damage: list[Values]) -> None:
-        """Edges broke: from here on other cells set the step, too."""
+    def _recalled(self) -> None:
+        super()._recalled()
         self._by_edges = None
-        super()._release(state, solved, damage)
 
-    def _attempt(self, state: State, dt: float) -> Outcome:
+    def _attempt(self, state: State, dt: float) -> SolveResult:
         """u by v and a of the start, then a from the forces there."""
         began = time.perf_counter()
-        equations, held = self.equations, self.equations.held
+        balance, own = self.balance, self.balance.motion.owned
         half = state.v + dt / 2 * state.a
         u = state.u + dt * half
-        u[held] = equations.motion.at(state.t + dt)[: len(held)]
-        half[held] = (u[held] - state.u[held]) / dt
-        equations.c_a, equations.c_v = equations.scheme.rates(dt)
-        equations.hold(state.t + dt, u, half)
-        if self.flow is not None:
-            self.flow.begin(dt)
-        unbalanced = equations.forces_in_balance()
-        drag = equations.damping.mass if equations.damping is not None else 0.0
+        u[own] = balance.motion.at(state.t + dt)[: len(own)]
+        half[own] = (u[own] - state.u[own]) / dt
+        if "flow" in state.memory:
+            self.flow.recall(state.memory["flow"])
+        balance.look_at(state.t + dt, u, half, dt=dt)
+        self.flow.begin(dt)
+        unbalanced = balance.forces()
         # mass damping at the velocity of the end, not of half-way: second order
-        a: Values = np.asarray(-unbalanced / (equations.mass * (1 + drag * dt / 2)), np.float64)
-        a[held] = 0.0
+        a: Values = np.asarray(-unbalanced / (balance.mass.lumped * (1 + self._a * dt / 2)), np.float64)
+        a[own] = 0.0
         self._arrival = u, half + dt / 2 * a, a
         self.phases["solve"] += time.perf_counter() - began
         finite = self.comm.allreduce(bool(np.isfinite(unbalanced).all()), op=MPI.LAND)
-        return Outcome(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
+        return SolveResult(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         return self._arrival
 
+    def _released(self, end: State, solved: Values, result: PassResult) -> State:
+        """Edges broke: from here on other cells set the step, too."""
+        self._by_edges = None
+        return released_state(self.balance, end, solved, result.before, None)
 
-def stable_step(highest: float, equations: Equilibrium) -> float:
-    """2/omega (sqrt(1 + xi^2) - xi) in s, xi = (a/omega + b omega)/2 of Rayleigh damping taken half a step late."""
+
+def rayleigh(balance: Balance) -> tuple[float, float]:
+    """(a in 1/s, b in s) of Rayleigh damping a M + b K."""
+    a = sum(term.a for term in balance.terms if isinstance(term, Drag))
+    return a, sum(term.b for term in balance.terms if isinstance(term, Viscosity))
+
+
+def stable_step(highest: float, a: float, b: float) -> float:
+    """2/omega (sqrt(1 + xi^2) - xi) in s of the highest omega in 1/s, xi = (a/omega + b omega)/2 of Rayleigh damping
+    taken half a step late."""
     if highest == 0:
         return float("inf")
-    damping = equations.damping
-    xi = 0.0 if damping is None else (damping.mass / highest + damping.stiffness * highest) / 2
+    xi = (a / highest + b * highest) / 2
     return float(2 / highest * (np.sqrt(1 + xi**2) - xi))

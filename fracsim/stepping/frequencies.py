@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.balance import Equilibrium
+from ..mechanics.stress import Stress
 from ..mesh.small_matrices import barycentric_gradients
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 
 
-def cell_frequencies(equations: Equilibrium) -> Values:
+def cell_frequencies(stress: Stress) -> Values:
     """(cells,) upper bounds of omega^2 of each cell on its own, 1/s^2, undamaged and in its current shape.
 
     A P1 simplex has lumped mass rho V / (d + 1) a node and energy V (mu |sym H|^2 + lambda/2 (tr H)^2), H = grad u.
@@ -28,28 +28,26 @@ def cell_frequencies(equations: Equilibrium) -> Values:
     hence omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L). No assembled body is faster than its fastest cell
     (Irons and Treharne 1971).
     """
-    domain, d = equations.domain, equations.domain.dim
-    corners = domain.nodes[domain.cell_nodes]
-    if not equations.material.energy.linear:
-        corners = corners + equations.u.x.array.reshape(-1, d)[domain.cell_nodes]
+    domain, d = stress.domain, stress.domain.dim
+    corners = stress.corners(np.arange(domain.cell_count))
     with np.errstate(divide="ignore", invalid="ignore"):
         gradients = barycentric_gradients(corners)
         spread = np.einsum("nai,naj->nij", gradients, gradients)
     flat = ~np.isfinite(spread).all(axis=(1, 2))
     spread[flat] = 0.0  # a cell without volume has forces, but no bound; the others set the step
     largest, trace = np.linalg.eigvalsh(spread)[:, -1], np.trace(spread, axis1=1, axis2=2)
-    material = equations.material
+    material = stress.material
     return np.asarray((d + 1) / material.density * (2 * material.mu * largest + material.lmbda * trace))
 
 
-def damaged_frequencies(equations: Equilibrium, whole: Values, edges: EdgeFrequencies | None) -> Values:
+def damaged_frequencies(stress: Stress, whole: Values, edges: EdgeFrequencies | None) -> Values:
     """(cells,) the bounds of `cell_frequencies`, `whole`, as damage leaves them, 1/s^2; `whole` itself without damage.
 
     chi, which may fall in any step, scales them. With the approach "edge" a cell can become *faster*: the projection on
     some of its edges is oblique, with a norm of 1.2 to 2.7 in good cells and hundreds in slivers. The springs of
     closing cracks are added. `edges`: None where damage has no integrity.
     """
-    chi = equations.chi
+    chi = stress.chi
     squares = whole if chi is None else np.asarray(whole * chi.x.array[: len(whole)])
     if edges is None or not len(edges.cells):
         return squares

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..errors import InputError
-from ..mechanics.balance import Equilibrium
+from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .petsc_options import Options, OptionSet, refusing
-from .preconditioner import MULTIGRID, Age, Preconditioner
+from .preconditioner import MULTIGRID, Due, Preconditioner
+from .stepper import SolveResult
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -38,60 +36,56 @@ FACTORISED = 100_000
 
 # A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
 # preconditioner is made anew anyhow, every dead cell goes.
-ROOMY = 0.9
+SHRINK_BELOW = 0.9
 
 _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a solve ended."""
-
-    converged: bool
-    newton: int
-    krylov: int
-    reason: str  # a sentence where it did not converge
-
-
 class Solver:
-    """SNES on an `Equilibrium`, set up once and kept for the whole run."""
+    """SNES on a `Balance`, set up once and kept for the whole run.
 
-    def __init__(self, equations: Equilibrium, given: Options) -> None:
-        self.equations = equations
-        chosen = _chosen(equations, given)
+    Attributes:
+        linear_failures: linear solves that failed outright and were taken as no correction.
+    """
+
+    def __init__(self, balance: Balance, given: Options) -> None:
+        """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
+        self.balance = balance
+        self.linear_failures = 0
+        chosen = _chosen(balance, given)
         self._options = OptionSet(chosen)
-        snes = self.snes = PETSc.SNES().create(equations.domain.comm)
+        snes = self.snes = PETSc.SNES().create(balance.domain.comm)
         snes.setOptionsPrefix(self._options.prefix)
-        snes.setFunction(equations.assemble_residual, equations.residual)
-        self._near_null = rigid_body_modes(equations.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
+        snes.setFunction(lambda _, x, b: balance.free_residual(x, b), balance.vector)
+        self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
         self._take_tangent()
-        self._x, self._correction = equations.residual.duplicate(), equations.residual.duplicate()
+        self._x, self._correction = balance.vector.duplicate(), balance.vector.duplicate()
         self._configure(given)
         snes.setConvergenceTest(self._converged)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
-            snes.ksp, self._options, keep=self._iterative, may_change=_may_change(equations, given)
+            snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
         self._first = 0.0
 
     def _take_tangent(self) -> None:
-        """Solve with the matrix that the equations have now."""
-        tangent = self.equations.tangent
-        self.snes.setJacobian(self._assemble_tangent, tangent, tangent)
+        """Solve with the matrix that the balance has now."""
+        tangent = self.balance.tangent
+        self.snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), tangent, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
 
-    def _fit(self) -> None:
+    def _shrink(self) -> None:
         """Where the body was damaged, see whether a smaller tangent does (collective)."""
         preconditioner = self._preconditioner
         preconditioner.look()
-        worn = preconditioner.age == Age.WORN
-        if preconditioner.age != Age.FRESH and self.equations.fit_tangent(1.0 if worn else ROOMY):
+        everything = preconditioner.due == Due.REBUILD
+        if preconditioner.due != Due.NOTHING and self.balance.shrink_tangent(1.0 if everything else SHRINK_BELOW):
             self._take_tangent()
-            preconditioner.age = Age.WORN
+            preconditioner.due = Due.REBUILD
 
     def _configure(self, given: Options) -> None:
         try:
@@ -103,34 +97,36 @@ class Solver:
             raise
 
     def _set_up_at_rest(self) -> None:
-        self.equations.assemble_tangent(self.snes, self._x, self.equations.tangent, self.equations.tangent)
-        self.snes.ksp.setOperators(self.equations.tangent)
+        self._assemble(self.balance.tangent)
+        self.snes.ksp.setOperators(self.balance.tangent)
         self.snes.ksp.setUp()
 
-    def solve(self, guess: npt.NDArray[np.float64]) -> Outcome:
+    # --- a solve, and what is tried where it fails ---
+
+    def solve(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution."""
-        outcome = self._attempt(guess)
-        if self._linear_failure(outcome):
+        result = self._attempt(guess)
+        if self._linear_failure(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
-            self._preconditioner.age, self._preconditioner.keep = Age.WORN, False
-            outcome = self._attempt(guess)
+            self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
+            result = self._attempt(guess)
             self._preconditioner.keep = self._iterative
-        tired = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
-        if self._linear_failure(outcome) and self.snes.ksp.getType() == "cg" and not tired:
+        stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
+        if self._linear_failure(result) and self.snes.ksp.getType() == "cg" and not stalled:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             self.snes.ksp.setGMRESRestart(RESTART)
-            outcome = self._attempt(guess)
+            result = self._attempt(guess)
             self.snes.ksp.setType("cg")
-        if self._linear_failure(outcome) and self._may_factorise():
-            outcome = self._attempt_directly(guess)
-        return outcome
+        if self._linear_failure(result) and self._may_factorise():
+            result = self._attempt_directly(guess)
+        return result
 
     def _may_factorise(self) -> bool:
-        dofs = self.equations.residual.getSize()
+        dofs = self.balance.vector.getSize()
         return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
-    def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> Outcome:
+    def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         """Factors instead of iterations, for a tangent that no Krylov method gets through: pieces that hang by a
         thread, or no compressibility. A shorter step would be no easier.
         """
@@ -140,62 +136,73 @@ class Solver:
         ksp.pc.reset()
         ksp.pc.setType("lu")
         ksp.pc.setFactorSolverType("mumps")
-        self._preconditioner.age, self._preconditioner.keep = Age.WORN, False
-        outcome = self._attempt(guess)
+        self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
+        result = self._attempt(guess)
         ksp.pc.reset()
         ksp.pc.setType(preconditioner)
         ksp.pc.setFromOptions()
         ksp.setType(kind)
-        self._preconditioner.age, self._preconditioner.keep = Age.WORN, True
-        return outcome
+        self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
+        return result
 
-    def yielding(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(owned dofs,) by how much the body at its present u yields to a force on free dofs in a step, linearly, m.
+    def _linear_failure(self, result: SolveResult) -> bool:
+        return not result.converged and self.snes.ksp.reason < 0
 
-        0 where the linear solve fails: near incompressibility tangents may be indefinite.
+    def _attempt(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+        self._shrink()
+        self._x.array_w[:] = guess
+        extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
+        self.snes.solve(None, self._x)
+        snes, reason = self.snes, self.snes.reason
+        self.balance.displace_to(self._x)
+        if reason > 0 and self._single:  # Newton's method has evaluated them for its test
+            self.balance.update_reactions()
+        krylov = snes.getLinearSolveIterations() + extended
+        return SolveResult(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
+
+    # --- linear solves by themselves ---
+
+    def linear_response(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m.
+
+        0 where the linear solve fails, which is counted: near incompressibility tangents may be indefinite.
         """
-        equations, ksp = self.equations, self.snes.ksp
-        self._fit()
-        b = equations.residual
-        b.array_w[:] = force
-        self._assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
-        ksp.setOperators(equations.tangent)
-        ksp.solve(b, self._correction)
-        return self._correction.array_r.copy() if ksp.reason > 0 else np.zeros_like(force)
+        self._shrink()
+        self.balance.vector.array_w[:] = force
+        if not self._solve_linear():
+            return np.zeros_like(force)
+        result: npt.NDArray[np.float64] = self._correction.array_r.copy()
+        return result
+
+    def _extend(self) -> int:
+        """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
+        self.balance.extension_residual(self._x, self.balance.vector)
+        self._solve_linear()
+        self._x.axpy(-1.0, self._correction)
+        return int(self.snes.ksp.its)
+
+    def _solve_linear(self) -> bool:
+        """K correction = balance.vector at the present u; whether it was solved."""
+        tangent, ksp = self.balance.tangent, self.snes.ksp
+        self._assemble_tangent(tangent)
+        ksp.setOperators(tangent)
+        ksp.solve(self.balance.vector, self._correction)
+        self.linear_failures += ksp.reason <= 0
+        return bool(ksp.reason > 0)
+
+    def _assemble(self, tangent: PETSc.Mat) -> None:
+        self.balance.assemble_tangent(tangent)
+
+    def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
+        """K and what its preconditioner is due."""
+        self._assemble(tangent)
+        self._preconditioner.refresh(tangent)
 
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
         self._preconditioner.damage_changed()
 
-    def _linear_failure(self, outcome: Outcome) -> bool:
-        return not outcome.converged and self.snes.ksp.reason < 0
-
-    def _attempt(self, guess: npt.NDArray[np.float64]) -> Outcome:
-        self._fit()
-        self._x.array_w[:] = guess
-        extended = self._extend() if self.equations.largest_gap(guess) > LARGE_GAP else 0
-        self.snes.solve(None, self._x)
-        snes, reason = self.snes, self.snes.reason
-        self.equations.load_displacement(self._x)
-        if reason > 0 and self._single:  # Newton's method has evaluated them for its test
-            self.equations.update_reactions()
-        krylov = snes.getLinearSolveIterations() + extended
-        return Outcome(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
-
-    def _extend(self) -> int:
-        """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
-        equations, ksp = self.equations, self.snes.ksp
-        b = equations.residual
-        equations.assemble_extension(self._x, b)
-        self._assemble_tangent(self.snes, self._x, equations.tangent, equations.tangent)
-        ksp.setOperators(equations.tangent)
-        ksp.solve(b, self._correction)
-        self._x.axpy(-1.0, self._correction)
-        return int(ksp.its)
-
-    def _assemble_tangent(self, snes: Any, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
-        self.equations.assemble_tangent(snes, x, A, P)
-        self._preconditioner.refresh(P)
+    # --- when it is done ---
 
     def _sentence(self) -> str:
         why = _SNES.get(self.snes.reason, str(self.snes.reason)).lower().removeprefix("diverged_").replace("_", " ")
@@ -214,34 +221,36 @@ class Solver:
             return int(reason.DIVERGED_FNORM_NAN)
         if its == 0:
             self._first = norm
-        scale, floor = self.equations.force_scale()
+        scale, floor = self.balance.force_scale()
         if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
             return int(reason.CONVERGED_FNORM_RELATIVE)
         return int(reason.ITERATING)
 
-    def forget_options(self) -> None:
-        """Take this solver's options out of PETSc's database; it must not be used any more."""
+    def destroy(self) -> None:
+        """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
         self._options.remove()
+        for kept in (self.snes, self._x, self._correction):
+            kept.destroy()
+        if self._near_null is not None:
+            self._near_null.destroy()
 
 
-def _chosen(equations: Equilibrium, given: Options) -> Options:
+def _chosen(balance: Balance, given: Options) -> Options:
     """The study's options over the defaults."""
     multigrid = given.get("pc_type", "gamg") == "gamg"
     chosen = DEFAULTS | (MULTIGRID if multigrid else {})
-    if multigrid and equations.scheme.inertia:
+    if multigrid and balance.scheme.inertia:
         # no aggregates across edges that carry nothing; without inertia every edge keeps RESIDUAL_STIFFNESS
         chosen |= {"pc_gamg_threshold": 0.0}
-    plastic = equations.material.plastic
-    turned = plastic is not None and plastic.frobenius  # pressure makes flow easier, flow makes no pressure
-    if turned or (equations.forces.pressures and not equations.material.energy.linear):
-        chosen |= {"ksp_type": "gmres"}  # the tangent of this or of a following pressure is not symmetric
+    if not balance.symmetric:
+        chosen |= {"ksp_type": "gmres"}
     return chosen | given
 
 
-def _may_change(equations: Equilibrium, given: Options) -> bool:
+def _may_change(balance: Balance, given: Options) -> bool:
     """Whether multigrid of another kind may take over: nobody asked for this one, and inertia holds what hangs."""
     own = not any(key.startswith(("pc_", "mg_")) for key in given)
-    return own and equations.scheme.inertia
+    return own and balance.scheme.inertia
 
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:

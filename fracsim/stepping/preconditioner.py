@@ -34,59 +34,59 @@ OF_PIECES: Options = {
     "mg_levels_pc_type": "sor",
 }
 
-WORN_BY = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
-WORN_BY_OF_PIECES = 1.1  # the same where setting up costs little
+REBUILD_ABOVE = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
+REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
 
 
-class Age(IntEnum):
-    """State of the preconditioner."""
+class Due(IntEnum):
+    """What has to be done before the next solve."""
 
-    FRESH = 0
-    DATED = 1  # same coarse spaces, new operators
-    WORN = 2  # everything anew
+    NOTHING = 0
+    REFRESH = 1  # new operators on the same coarse spaces
+    REBUILD = 2  # everything anew
 
 
 class Preconditioner:
     """The preconditioner of one KSP.
 
     Attributes:
-        age: what has to be done before the next solve.    keep: whether it serves more than one tangent.
+        due: what has to be done before the next solve.    keep: whether it serves more than one tangent.
     """
 
     def __init__(self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart."""
         self._ksp, self._options = ksp, options
-        self.age, self.keep = Age.WORN, keep
-        self._may_change, self._broken, self._worn_by = may_change, False, WORN_BY
+        self.due, self.keep = Due.REBUILD, keep
+        self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
         self._fresh_its = self._whole_its = 0
 
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh at the next tangent."""
-        self.age, self._broken = max(self.age, Age.DATED), True
+        self.due, self._broken = max(self.due, Due.REFRESH), True
 
     def refresh(self, tangent: PETSc.Mat) -> None:
-        """Set up what has aged for a tangent that is solved with next. Done here, since SNES knows a fixed lag only."""
+        """Set up what is due for a tangent that is solved with next. Done here, since SNES knows a fixed lag only."""
         self.look()
         ksp = self._ksp
-        if self.age == Age.FRESH:
+        if self.due == Due.NOTHING:
             return
-        if self.age == Age.WORN:
+        if self.due == Due.REBUILD:
             ksp.pc.reset()
             self._fresh_its = 0
         ksp.pc.setReusePreconditioner(False)
         ksp.setOperators(tangent)
         ksp.setUp()
-        self.age = Age.FRESH
+        self.due = Due.NOTHING
 
     def look(self) -> None:
-        """See from the iterations of the last solve whether it is worn (more than once does no harm)."""
+        """See from the iterations of the last solve whether a rebuild is due (more than once does no harm)."""
         its = self._ksp.its
-        if self.age == Age.FRESH:
+        if self.due == Due.NOTHING:
             self._look_at(its)
-        # also where damage has dated it: coarse spaces from before a crack carry the motion of one side to the other
-        if self._fresh_its and its > self._worn_by * self._fresh_its + 2:
-            self.age = Age.WORN
+        # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
+        if self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
+            self.due = Due.REBUILD
 
     def _look_at(self, its: int) -> None:
         """Iterations of a solve since it was set up."""
@@ -96,10 +96,10 @@ class Preconditioner:
             if self._broken and self._may_change and its > IN_PIECES * self._whole_its + 2:
                 self._change()
         if not self.keep:
-            self.age = max(self.age, Age.DATED)
+            self.due = max(self.due, Due.REFRESH)
 
     def _change(self) -> None:
-        self._may_change, self._worn_by, self.age = False, WORN_BY_OF_PIECES, Age.WORN
+        self._may_change, self._rebuild_above, self.due = False, REBUILD_ABOVE_OF_PIECES, Due.REBUILD
         self._options.change(OF_PIECES)
         self._ksp.pc.reset()
         self._ksp.pc.setFromOptions()

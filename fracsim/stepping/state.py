@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,17 +11,20 @@ import numpy.typing as npt
 Values = npt.NDArray[np.float64]
 
 
-@dataclass
+@dataclass(frozen=True)
 class State:
-    """Owned dofs at time t.
+    """A body at time t; arrays are of the owned dofs, and are not written to once they are here.
 
     Attributes:
         t: s.        step: steps taken.        dt: size of the next step, s.
         u, v, a: (owned dofs,) displacement, velocity, acceleration in m, m/s, m/s^2.
-        dissipated: energy lost to fracture and damping, J.    work: external work, J (both summed over ranks).
+        dissipated: energy lost to fracture, flow and damping, J.    work: external work, J (both summed over ranks).
         easy: steps in a row that went without halving.
-        elastic: elastic energy at t on this rank, J.
+        elastic: stored energy at t on this rank, J.
         forces: loads and reactions where the last step balanced them, N.    drag: damping forces there, N.
+        memory: what parts of the body remember of their past, by name (damage, flow): see stepping.memory.
+        out_of_balance: (owned dofs,) residual that the last step ended with, N; None: none but the solver's tolerance.
+        before: (displacement a step ago, size of that step), from which a load path is extrapolated; None: unknown.
     """
 
     u: Values
@@ -35,3 +39,6 @@ class State:
     elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))
     drag: Values | None = None
+    memory: dict[str, Any] = field(default_factory=dict)
+    out_of_balance: Values | None = None
+    before: tuple[Values, float] | None = None

@@ -9,40 +9,44 @@ doubled.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.balance import Equilibrium
-from .newton import Solver
+from ..mechanics.balance import Balance
 from .state import State
 
 Values = npt.NDArray[np.float64]
 
 
-def release(equations: Equilibrium, solver: Solver | None, state: State, solved: Values, damage: list[Values]) -> None:
-    """Bring forces and acceleration of the state to the damage of now; `damage`: as it was before (collective).
+def released_state(
+    balance: Balance,
+    end: State,
+    solved: Values,
+    before: Sequence[Values],
+    response: Callable[[Values], Values] | None,
+) -> State:
+    """The end of a step with the forces and the acceleration that belong to the damage of now (collective).
 
-    Forces are those at `solved`, where a balances them: the end of a step of generalized-alpha is an extrapolation.
+    `before`: the fields of damage as they were. `solved`: (owned dofs,) displacement at which the step's forces
+    balance; the end of a step of generalized-alpha is an extrapolation. `response`: displacement that forces (owned
+    dofs,) cause in a step, linearly; None where steps resolve all motion (explicit ones).
     """
-    held = equations.held
-    before = equations.unbalanced[held]
-    equations.update_reactions()
-    if not equations.scheme.remembers:
-        state.forces[held] += equations.unbalanced[held] - before
-        return
-    equations.displace(solved)
-    after = equations.internal_force()
-    damage = equations.exchange_damage(damage)
-    released = equations.internal_force() - after
-    change = _acceleration(equations, solver, np.where(equations.free, released, 0.0))
-    equations.exchange_damage(damage)
-    equations.displace(state.u)
-    state.forces[held] -= released[held]
-    state.a = state.a + change
-
-
-def _acceleration(equations: Equilibrium, solver: Solver | None, released: Values) -> Values:
-    """(owned dofs,) what forces released at the start of a step add to a, m/s^2."""
-    if solver is None:  # explicit steps resolve all motion
-        return equations.inertia.solve(released, equations.free)
-    return equations.c_a * solver.yielding(released)
+    own, forces = balance.motion.owned, end.forces.copy()
+    reactions = balance.reactions[own]
+    balance.update_reactions()
+    if not balance.scheme.remembers:
+        forces[own] += balance.reactions[own] - reactions
+        return replace(end, forces=forces)
+    balance.displace(solved)
+    after = balance.stress.force()
+    now = balance.stress.exchange(before)
+    lost = balance.stress.force() - after
+    free = np.where(balance.motion.free, lost, 0.0)
+    change = balance.mass.solve(free, balance.motion.free) if response is None else balance.c_a * response(free)
+    balance.stress.exchange(now)
+    balance.displace(end.u)
+    forces[own] -= lost[own]
+    return replace(end, forces=forces, a=end.a + change)

@@ -39,7 +39,8 @@ class Fracture(Table):
     kernel: Literal["linear", "constant", "gaussian"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
     unilateral: Flag = False  # a broken edge shorter than at rest carries pressure: cracks close
-    passes: Annotated[int, Field(ge=1, strict=True)] = 1  # solve and break again within a step until nothing new breaks
+    # most times that a step is solved and broken; default: 1, in quasi-static studies until nothing changes
+    passes: Annotated[int, Field(ge=1, strict=True)] | None = None
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.time_functions import AXES, format_point, in_time, motion_law, of_size
+from ..mechanics.time_functions import AXES, format_point, in_time, motion_function, of_size
 from ..mesh.bodies import bodies_of, not_held
 from ..meshes.data import MeshData
 from . import MOTIONS, Box, Brittle, Plane, Study
@@ -83,7 +83,7 @@ def _check_held(study: Study, dim: int) -> None:
     held = np.zeros(dim, bool)
     for i, entry in enumerate(study.boundary):
         if entry.kind in MOTIONS:
-            held |= motion_law(entry, dim, f"boundary.{i}")[1]
+            held |= motion_function(entry, dim, f"boundary.{i}")[1]
     if not held.all():
         raise InputError(not_held("the body", f"moving along {AXES[int(np.argmin(held))]}"))
 
@@ -126,7 +126,7 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     for i, entry in enumerate(study.boundary):
         key = f"boundary.{i}"
         if entry.kind in MOTIONS:
-            motion_law(entry, dim, key)
+            motion_function(entry, dim, key)
         else:
             in_time(getattr(entry, entry.kind), f"{key}.{entry.kind}", dim if entry.kind == "traction" else 1)
     if study.load is not None:

@@ -124,7 +124,7 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _explicit_steps_once(self) -> Study:
-        if self.time.scheme == "explicit" and self.fracture is not None and self.fracture.passes > 1:
+        if self.time.scheme == "explicit" and self.fracture is not None and (self.fracture.passes or 1) > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 

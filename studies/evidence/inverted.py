@@ -52,14 +52,14 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     state = stepper.start(None)
     middle = (domain.lower + domain.upper) / 2
     state.u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
-    scene.equations.displace(state.u)
+    scene.balance.displace(state.u)
     stepper.settle(state)
-    energies, newton = [total(comm, scene.equations.elastic_energy())[0]], []
+    energies, newton = [total(comm, scene.balance.elastic_energy())[0]], []
     while state.t < study["time"]["end"] * (1 - 1e-12):
         report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)
         newton.append(report.outcome.newton)
-    watch = Inverted(scene.equations)
+    watch = Inverted(scene.balance)
     watch.look(state.t)
     if comm.rank == 0 and (note := watch.note(energy)):
         print(f"fracsim: note: {note}", file=sys.stderr)

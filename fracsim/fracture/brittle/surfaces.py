@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...mechanics.balance import Equilibrium
+from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
 from ...mesh.ranks import from_root, total
 from ...study import Brittle
+from ..criterion import Average, CarriedStress, Edges
 from ..strength import Strength
 from .level_set import DirectionField
 from .pattern import Load, Opened, Pattern
@@ -32,9 +32,12 @@ class BrittleSurfaces:
         spacing: least distance of starts, m.
     """
 
-    def __init__(self, equations: Equilibrium, graph: EdgeGraph, strength: Strength, brittle: Brittle) -> None:
-        self._equations, self._graph, self._strength, self._brittle = equations, graph, strength, brittle
-        self._domain = equations.domain
+    def __init__(
+        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, brittle: Brittle
+    ) -> None:
+        self._stress, self._graph, self.strength, self._brittle = stress, graph, strength, brittle
+        self._domain = stress.domain
+        self._carried = CarriedStress(stress, graph, average, whole_tensor=True)
         self.spacing = brittle.spacing if brittle.spacing is not None else SPACING * self._domain.mean_edge
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut: Values = np.full(len(graph.broken), np.nan)
@@ -45,27 +48,37 @@ class BrittleSurfaces:
         """Surfaces that may still start."""
         return self._brittle.surfaces - len(self.starts)
 
-    def __call__(self, cells: Cells, averaged: Values, everywhere: Callable[[], Values]) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the edges that new surfaces cut (collective).
-
-        `cells`: those that may be overloaded, and their averaged stress (n, 3 or 6) in Pa. `everywhere`: that of all
-        cells, worked out where surfaces follow it.
-        """
-        load = self._overloaded(cells, averaged)
+    def __call__(self, stress: Values) -> tuple[Edges, Values]:
+        """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""
+        none = np.empty(0, np.int64), np.empty(0)
+        if not self.left:
+            return none
+        carried, active = self._carried(stress)
+        load = self._overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
         if not total(self._domain.comm, len(load.cell))[0]:
-            return np.zeros(len(self.cut), bool)
+            return none
         parts = self._domain.comm.gather(load)
-        field = self._field(everywhere()) if self._brittle.shape == "curved" else None
+        curved = self._brittle.shape == "curved"
+        field = self._field(self._carried.everywhere(carried, active)) if curved else None
         broken = self._graph.broken_keys()
         opened: Opened = from_root(self._domain.comm, lambda: self._open(parts, broken, field))
         self.starts = np.concatenate([self.starts, opened.starts])
-        return self._cut_edges(opened)
+        edges = self._cut_edges(opened)
+        return edges, np.ones(len(edges))
+
+    def memory(self) -> tuple[Values, Values]:
+        """Where surfaces have started, and where they cut."""
+        return self.starts, self.cut.copy()
+
+    def recall(self, memory: tuple[Values, Values]) -> None:
+        """No more surfaces than that."""
+        self.starts, self.cut[:] = memory
 
     def _overloaded(self, cells: Cells, averaged: Values) -> Load:
         """Those of the cells whose largest principal stress reaches their strength."""
         dim = self._domain.dim
         stress = tensors(averaged, dim)
-        may = np.flatnonzero(upper_bound(stress) >= self._strength.weakest)
+        may = np.flatnonzero(upper_bound(stress) >= self.strength.weakest)
         cells, stress = cells[may], stress[may]
         load = largest(stress) / self._strength_of(cells)
         over = np.flatnonzero(load >= 1)
@@ -74,11 +87,11 @@ class BrittleSurfaces:
 
     def _strength_of(self, cells: Cells) -> Values:
         """(n,) Pa: the mean over the edges of each cell."""
-        return np.asarray(self._strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
+        return np.asarray(self.strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
 
     def _gradients(self, cells: Cells) -> Values:
         """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0)."""
-        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._equations.corners(cells)
+        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.corners(cells)
         span, moved = (corners[:, 1:] - corners[:, :1] for corners in (rest, now))
         return np.swapaxes(np.linalg.solve(span, moved), 1, 2)
 
@@ -93,7 +106,7 @@ class BrittleSurfaces:
         """What the pass opens, on rank 0."""
         if self._pattern is None:
             assert self._domain.source is not None
-            settle = self._equations.chi is not None
+            settle = self._stress.chi is not None
             self._pattern = Pattern(self._domain.source, self._brittle, self.spacing, settle)
         load = Load(*(np.concatenate([getattr(part, name) for part in parts]) for name in Load.__annotations__))
         order = np.argsort(load.cell)
@@ -102,9 +115,8 @@ class BrittleSurfaces:
         along = DirectionField.of(self._pattern.body, *field) if field is not None else None
         return self._pattern.open(load, broken, self.starts, most, along)
 
-    def _cut_edges(self, opened: Opened) -> npt.NDArray[np.bool_]:
-        """Flags of local edges; where they are cut is kept."""
-        flags = np.zeros(len(self.cut), bool)
+    def _cut_edges(self, opened: Opened) -> Edges:
+        """(n,) local edges that are cut; where is kept."""
         local, place = self._graph.find_keys(opened.keys)
-        flags[local], self.cut[local] = True, opened.cut[place]
-        return flags
+        self.cut[local] = opened.cut[place]
+        return local

@@ -1,0 +1,133 @@
+"""Which edges fail: those whose averaged normal stress reaches their strength (METHOD section 3)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mechanics.stress import Stress
+from ..mesh.edges import EdgeGraph
+from .edge_stress import carried_by, edge_vectors, frobenius_norm, normal_stress
+from .strength import Strength
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Edges = npt.NDArray[np.integer]
+
+
+class Criterion(Protocol):
+    """Finds the edges that fail."""
+
+    def __call__(self, stress: Values) -> tuple[Edges, Values]:
+        """(n,) local edges and their load over strength, 1 or more, from the undamaged stress (cells, 3 or 6) in Pa.
+
+        The same edges on all ranks once what each has found is joined (collective).
+        """
+
+    def memory(self) -> Any:
+        """What it remembers of earlier passes, never to be written to again."""
+
+    def recall(self, memory: Any) -> None:
+        """Remember no more than that."""
+
+
+class Average(Protocol):
+    """A non-local average (fracture.nonlocal_average)."""
+
+    def __call__(self, values: Values, active: Flags | None = None) -> Values:
+        """Averages (cells, n) of cell values (cells, n); cells not `active` enter none."""
+
+    def reaching(
+        self, values: Values, size: Values, bound: float, active: Flags | None = None
+    ) -> tuple[npt.NDArray[np.int64], Values]:
+        """Cells (m,) whose average may reach a bound, and those averages (m, n)."""
+
+
+class CarriedStress:
+    """The stress that the intact edges of the cells carry, averaged where there is a radius."""
+
+    def __init__(self, stress: Stress, graph: EdgeGraph, average: Average | None, *, whole_tensor: bool) -> None:
+        """`whole_tensor`: more is asked of it than the normal stress along intact edges."""
+        self._stress, self._graph, self._average = stress, graph, average
+        self._dim, self._comm = stress.domain.dim, stress.domain.comm
+        # by edges and locally there is no need: an intact edge has the same normal stress in the whole tensor
+        self._leaves_out = whole_tensor or average is not None
+
+    def __call__(self, stress: Values) -> tuple[Values, Flags | None]:
+        """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
+        graph = self._graph
+        damaged = np.flatnonzero(graph.damaged)
+        if not self._comm.allreduce(len(damaged)):
+            return stress, None
+        active = ~graph.split
+        carried = np.where(active[:, None], stress, 0.0)
+        if self._leaves_out:
+            whole = damaged[active[damaged]]
+            carried[whole] = carried_by(stress[whole], self._stress.corners(whole), graph.intact(whole))
+        return carried, active
+
+    def reaching(self, carried: Values, active: Flags | None, bound: float) -> tuple[npt.NDArray[np.int64], Values]:
+        """Cells whose averaged stress may reach a bound in Pa along some direction, and that stress (collective).
+
+        No normal stress exceeds the Frobenius norm of its tensor, and no average exceeds the average of the norms:
+        most cells are passed over after one product.
+        """
+        size = frobenius_norm(carried, self._dim)
+        if self._average is not None:
+            return self._average.reaching(carried, size, bound, active)
+        cells = np.flatnonzero(size >= bound)
+        return cells, carried[cells]
+
+    def everywhere(self, carried: Values, active: Flags | None) -> Values:
+        """(cells, 3 or 6) the averaged stress of all cells (collective)."""
+        return carried if self._average is None else self._average(carried, active)
+
+
+class OverloadedEdges:
+    """Edges whose normal stress in one of their cells reaches the strength.
+
+    Attributes:
+        strength: of each edge in each cell.
+    """
+
+    def __init__(
+        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, cap: float | None = None
+    ) -> None:
+        """`cap`: share of all edges that may fail in one pass, those loaded most first."""
+        self.strength, self._stress, self._graph = strength, stress, graph
+        self._carried = CarriedStress(stress, graph, average, whole_tensor=False)
+        self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
+
+    def __call__(self, stress: Values) -> tuple[Edges, Values]:
+        """Edges and loads."""
+        carried, active = self._carried(stress)
+        edges, load = self.overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
+        return (edges, load) if self._most is None else self._strongest(edges, load, self._most)
+
+    def overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[Edges, Values]:
+        """Intact local edges of some cells whose normal stress in their stress (n, 3 or 6) reaches the strength."""
+        edges = self._graph.cell_edges[cells]
+        along = normal_stress(averaged, edge_vectors(self._stress.corners(cells)))
+        strength = self.strength(cells, edges)
+        over = (along >= strength) & ~self._graph.broken[edges]
+        return edges[over], along[over] / strength[over]
+
+    def _strongest(self, edges: Edges, load: Values, most: int) -> tuple[Edges, Values]:
+        """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
+        keys = self._graph.edge_keys(edges.astype(np.int64))
+        every = np.concatenate(self._stress.domain.comm.allgather(np.column_stack([keys, -load])))
+        order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
+        _, first = np.unique(every[order, :2], axis=0, return_index=True)
+        chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)
+        wanted = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
+        return edges[wanted[edges]], load[wanted[edges]]
+
+    def memory(self) -> Any:
+        """Nothing."""
+        return None
+
+    def recall(self, memory: Any) -> None:
+        """Nothing."""

@@ -1,0 +1,92 @@
+"""Rayleigh damping a M v + b K v: drag in proportion to mass, viscosity in proportion to stiffness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from ..forms.balance import viscous_work
+from .inertia import Mass
+from .kernels import CellForm, cells_measure
+from .stress import Stress
+from .term import Level, Term
+from .vectors import Assembler
+
+Values = npt.NDArray[np.float64]
+
+
+class Drag(Term):
+    """a M v, a in 1/s."""
+
+    name = "drag"
+
+    def __init__(self, u: fem.Function, mass: Mass, a: float) -> None:
+        self.a = a
+        self._u, self._mass = u, mass
+        self._level: Level | None = None
+
+    def begin(self, level: Level) -> None:
+        """The scheme's velocity."""
+        self._level = level
+
+    @property
+    def mass_factor(self) -> float:
+        """a c_v."""
+        assert self._level is not None
+        return self.a * self._level.c_v
+
+    def acceleration(self) -> Values:
+        """a c_v (u - u_v)."""
+        assert self._level is not None
+        u_v = self._level.u_v
+        return np.asarray(self.mass_factor * (self._u.x.array[: len(u_v)] - u_v))
+
+    def drag(self) -> Values:
+        """a M v."""
+        assert self._level is not None
+        level, u = self._level, self._u.x.array[: len(self._level.u_v)]
+        return self.a * self._mass.times(level.c_v * (u - level.u_v))
+
+
+class Viscosity(Term):
+    """int chi b (C : Edot) : sym(F_n^T grad w) dX, b in s (forms.balance.viscous_work)."""
+
+    name = "viscosity"
+
+    def __init__(self, assembler: Assembler, u: fem.Function, stress: Stress, b: float) -> None:
+        domain = assembler.domain
+        self.b = b
+        self._assembler, self._u, self._stress = assembler, u, stress
+        self._u_n, self._u_v = fem.Function(domain.space), fem.Function(domain.space)
+        self._c_v = fem.Constant(domain.mesh, np.float64(0.0))
+        self._form = CellForm(self.work(ufl.TestFunction(domain.space), cells_measure(domain)))
+
+    def begin(self, level: Level) -> None:
+        """The start of the step and its velocity: coefficients of the form."""
+        for field, values in ((self._u_n, level.u), (self._u_v, level.u_v)):
+            field.x.array[: len(values)] = values
+            field.x.scatter_forward()
+        self._c_v.value = level.c_v
+
+    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
+        """Virtual work."""
+        stress, rate = self._stress, self._c_v * (self._u - self._u_v)
+        chi = stress.remaining_stiffness
+        return viscous_work(stress.material.energy, rate, self._u_n, w, dx, b=self.b, chi=chi)
+
+    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+        """Its derivative."""
+        return ufl.derivative(self.work(w, dx), self._u, v)
+
+    def drag(self) -> Values:
+        """Forces of the viscosity (collective)."""
+        return self._assembler(self._form)
+
+    def damage_changed(self) -> None:
+        """Cells without stress have no viscosity either."""
+        if (dead := self._stress.stressless) is not None:
+            self._form.leave_out(dead)

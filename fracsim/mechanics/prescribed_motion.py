@@ -1,0 +1,73 @@
+"""Prescribed motion: dofs whose displacement is a function of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from mpi4py import MPI
+
+from ..mesh.domain import Domain, Ints
+from .time_functions import TimeFunction
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Entry = tuple[Ints, Flags, TimeFunction]
+
+
+class PrescribedMotion:
+    """Prescribed displacement of components of nodes. Where two entries name one component, the later one counts.
+
+    Attributes:
+        dofs: sorted unrolled local dofs (node * d + component), ghosts included.
+        owned: those that this rank owns; they come first.    free: (owned dofs,) all others, flags.
+        bcs: the Dirichlet condition, at the values of `set`; empty where no rank has one.
+    """
+
+    def __init__(self, domain: Domain, entries: Sequence[Entry]) -> None:
+        """`entries`: local nodes, (d,) which of their components move as told, and d displacements in m."""
+        size = domain.dim
+        self._domain, self._functions = domain, [function for _, _, function in entries]
+        row = np.full((len(domain.nodes), size), -1, np.int64)  # of the value table, for each component
+        for index, (nodes, components, _) in enumerate(entries):
+            for component in np.flatnonzero(components):
+                row[nodes, component] = index * size + component
+        flat = row.reshape(-1)
+        self.dofs: Ints = np.flatnonzero(flat >= 0).astype(np.int32)
+        self._row = flat[self.dofs]
+        owned = domain.node_count * size
+        self.owned: Ints = self.dofs[: int(np.searchsorted(self.dofs, owned))]
+        self.free: Flags = np.ones(owned, bool)
+        self.free[self.owned] = False
+        self._values = fem.Function(domain.space)
+        self.bcs = [self._condition()] if domain.comm.allreduce(len(self.dofs)) else []
+
+    def _condition(self) -> fem.DirichletBC:
+        # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
+        pair: list[Ints] = [self.dofs, self.dofs]
+        return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type, type-var]
+
+    def at(self, t: float) -> Values:
+        """Displacement in m of each of `dofs` at time t."""
+        if not self._functions:
+            return np.empty(0)
+        return np.concatenate([function(t) for function in self._functions])[self._row]
+
+    def set(self, values: Values) -> None:
+        """What each of `dofs` shall be at, m."""
+        self._values.x.array[self.dofs] = values
+
+    @property
+    def values(self) -> Values:
+        """(owned,) what each of `owned` shall be at, m."""
+        result: Values = self._values.x.array[self.owned]
+        return result
+
+    def largest_gap(self, u: Values) -> float:
+        """Farthest that one of `owned` in u (owned dofs,) is from its value, in mean edge lengths (collective)."""
+        if not self.bcs:
+            return 0.0
+        gap = np.max(np.abs(u[self.owned] - self.values), initial=0.0)
+        return float(self._domain.comm.allreduce(gap, op=MPI.MAX)) / self._domain.mean_edge

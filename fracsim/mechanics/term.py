@@ -1,0 +1,109 @@
+"""What adds to the balance of forces, and what a term is told.
+
+    r(u) = assembled sum of virtual works  +  M (sum of accelerations)  +  sum of nodal forces  =  0
+
+A term gives one or more of the three kinds: a form (stress, viscosity, pressure), of which all terms together are one
+compiled kernel; an acceleration, multiplied by the mass matrix once for all terms; or forces on nodes (dead loads,
+contact). Residual, tangent, reactions, the residual's scale and the energy book run over one list of terms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from petsc4py import PETSc
+
+Values = npt.NDArray[np.float64]
+Form = ufl.Form | int  # 0: none
+
+
+@dataclass(frozen=True)
+class Level:
+    """Where in time forces balance, and the affine rates of the scheme there (forms.schemes).
+
+    Attributes:
+        t: s.        dt: size of the step, s; 0 where a state is only looked at.
+        u, v: (owned dofs,) state at the start of the step in m, m/s.
+        c_a, c_v: of a = c_a (u - u_a) and v = c_v (u - u_v), 1/s^2 and 1/s.    u_a, u_v: (owned dofs,) m.
+        share: of dt that has passed at t.
+    """
+
+    t: float
+    dt: float
+    u: Values
+    v: Values
+    c_a: float
+    c_v: float
+    u_a: Values
+    u_v: Values
+    share: float = 1.0
+
+
+class Term:
+    """A term of the balance that adds nothing: the base of all others, which say what they add.
+
+    Signs are those of r: internal and inertial forces positive, forces on the body from outside negative.
+    """
+
+    name: ClassVar[str] = ""
+    symmetric: bool = True  # whether its share of the tangent is
+
+    def begin(self, level: Level) -> None:
+        """A step (or a look at a state) begins. Collective."""
+
+    def displaced(self) -> None:
+        """u has moved. Collective."""
+
+    def work(self, w: Any, dx: ufl.Measure) -> Form:
+        """Virtual work in N m over the cells of `dx`, a form linear in the test function w. Asked once, at set-up."""
+        return 0
+
+    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> Form:
+        """Derivative of `work` in the direction v, as far as Newton's method shall know it."""
+        return 0
+
+    def acceleration(self) -> Values | None:
+        """(owned dofs,) what M is multiplied with at the current u, m/s^2."""
+        return None
+
+    @property
+    def mass_factor(self) -> float:
+        """Derivative of `acceleration` with respect to u, 1/s^2: a factor of M in the tangent."""
+        return 0.0
+
+    def add_force(self, rows: Values) -> None:
+        """Add nodal forces at the current u to r, (owned dofs,) in N."""
+
+    def add_stiffness(self, K: PETSc.Mat) -> None:
+        """Add the derivative of `add_force` to the assembled tangent; entries outside its pattern need `couples`."""
+
+    def couples(self) -> npt.NDArray[np.int64] | None:
+        """(n, 2) pairs of global nodes that it couples beyond those of a cell; None: none, or as the last time."""
+        return None
+
+    def stored(self) -> float:
+        """Energy that it stores at the current u, this rank's share, J."""
+        return 0.0
+
+    def applied(self) -> Values | None:
+        """(owned dofs,) force on the body from outside at the current u, N: what does external work."""
+        return None
+
+    def drag(self) -> Values | None:
+        """(owned dofs,) force at the current u whose work is lost, N."""
+        return None
+
+    def scale(self) -> Values | None:
+        """(owned dofs,) forces that r is the balance of, for its convergence test, N."""
+        return None
+
+    def longest_step(self, change: Values) -> float:
+        """Largest share (0, 1] of a change of u (owned dofs,) that is allowed, on this rank."""
+        return 1.0
+
+    def damage_changed(self) -> None:
+        """Edges broke, or cells lost stiffness. Not collective."""

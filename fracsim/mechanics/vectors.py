@@ -1,0 +1,54 @@
+"""Assembled vectors: forms summed into PETSc vectors over all ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from ..mesh.domain import Domain
+from .dolfinx_calls import assemble_into, create_vector
+
+Values = npt.NDArray[np.float64]
+
+
+class Assembler:
+    """Assembles linear forms over a domain's displacement space, with one vector that is kept.
+
+    Attributes:
+        domain: the mesh.    owned: dofs of this rank.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        self.domain = domain
+        self.owned = domain.node_count * domain.dim
+        self._kept = self.vector()
+
+    def vector(self) -> PETSc.Vec:
+        """A new vector over the dofs, ghosts included."""
+        return create_vector(self.domain.space)
+
+    def __call__(self, form: fem.Form) -> Values:
+        """(owned dofs,) copy of an assembled form (collective)."""
+        return self.into(self._kept, form).array_r.copy()
+
+    def into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+        """Assemble into b, which loses what it held (collective)."""
+        return self.summed(self.into_unsummed(b, form))
+
+    def into_unsummed(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+        """This rank's part alone."""
+        with b.localForm() as local:
+            local.set(0.0)
+        assemble_into(b, form)
+        return b
+
+    def summed(self, b: PETSc.Vec) -> PETSc.Vec:
+        """b with the parts that other ranks have assembled for its owned dofs (collective)."""
+        b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        return b
+
+    def destroy(self) -> None:
+        """Give the memory back."""
+        self._kept.destroy()

@@ -1,0 +1,278 @@
+"""Advancing in time: a state goes in, the next one comes out, with what happened in between.
+
+    state = stepper.start()
+    state, report = stepper.advance(state)
+
+`BalanceStepper` is what all schemes that step a balance of forces share. A step is attempted, halved where the solve
+fails, and grows back after easy ones; then the body flows and breaks.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import NotConverged
+from ..mechanics.balance import Balance, driven
+from ..mesh.ranks import total
+from .after_step import Breaking, Flow, PassResult
+from .energy_book import acting, work_done
+from .state import State
+
+Values = npt.NDArray[np.float64]
+
+EASY_STEPS = 4  # steps in a row without trouble before a halved step is doubled again
+
+
+@dataclass(frozen=True)
+class SolveResult:
+    """How a solve ended."""
+
+    converged: bool
+    newton: int
+    krylov: int
+    reason: str  # a sentence where it did not converge
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """A step that was taken: what history.csv says of it (sums over ranks)."""
+
+    dt: float
+    solve: SolveResult
+    broken: int
+    kinetic: float
+    elastic: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class StepSizes:
+    """Sizes of steps, s: the largest, the end of the run, the smallest; `adapt`: halve a step that fails."""
+
+    step: float
+    end: float
+    smallest: float
+    adapt: bool = True
+
+
+@dataclass
+class Trouble:
+    """What went wrong on the way without ending the run: counts over its steps.
+
+    Attributes:
+        steps_failed: attempts that did not converge, and were tried again otherwise.
+        unbalanced_steps: steps that ended out of balance, for the body weakened by a break had no solution.
+    """
+
+    steps_failed: int = 0
+    unbalanced_steps: int = 0
+
+
+class Stepper(Protocol):
+    """One way to get from a state to the next.
+
+    Attributes:
+        phases: seconds by what they were spent on.    trouble: counts of what failed on the way.
+    """
+
+    phases: dict[str, float]
+    trouble: Trouble
+
+    def start(self, velocity: Values | None = None) -> State:
+        """The state at t = 0, at rest or with a velocity (owned dofs,) in m/s (collective)."""
+
+    def settle(self, state: State) -> State:
+        """The state with the forces and accelerations that belong to its displacement and velocity (collective)."""
+
+    def resume(self, state: State) -> State:
+        """The state of a checkpoint, with a body whose damage and flow were read from it (collective)."""
+
+    def advance(self, state: State) -> tuple[State, StepReport]:
+        """Take one step, as large as state.dt allows (collective). Raises NotConverged at the smallest step."""
+
+
+class BalanceStepper:
+    """What explicit, implicit and quasi-static steps share."""
+
+    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking) -> None:
+        self.balance, self.sizes, self.flow, self.breaking = balance, sizes, flow, breaking
+        self.comm = balance.domain.comm
+        self.trouble = Trouble()
+        self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
+
+    # --- the state at the start ---
+
+    def start(self, velocity: Values | None = None) -> State:
+        """The state at t = 0: at rest, or with a velocity, and in a dynamic study M a = f."""
+        n = self.balance.owned
+        v = np.zeros(n) if velocity is None else velocity
+        return self.settle(State(np.zeros(n), v, np.zeros(n), dt=self.sizes.step))
+
+    def settle(self, state: State) -> State:
+        """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
+        balance, free = self.balance, self.balance.motion.free
+        balance.look_at(state.t, state.u, state.v)
+        applied, drag, a = balance.applied(), balance.drag(), state.a
+        unbalanced = balance.stress.force() - applied
+        if drag is not None:
+            unbalanced = unbalanced + drag
+        if balance.scheme.remembers:
+            a = balance.mass.solve(-unbalanced, free)
+        forces = applied + np.where(free, 0.0, unbalanced)
+        return replace(state, a=a, forces=forces, drag=drag, memory=self._memory())
+
+    def resume(self, state: State) -> State:
+        """The state of a checkpoint, with a body whose damage and flow were read from it."""
+        balance = self.balance
+        self.breaking.restored()
+        self._recalled()
+        balance.displace(state.u)
+        return replace(state, elastic=balance.stress.stored(), memory=self._memory())
+
+    # --- a step ---
+
+    def advance(self, state: State) -> tuple[State, StepReport]:
+        """Take one step, as large as state.dt allows. Raises NotConverged at the smallest step."""
+        began = time.perf_counter()
+        self._recall(state)
+        while True:
+            dt = self._size(state)
+            solve = self._attempt(state, dt)
+            if solve.converged:
+                break
+            self.trouble.steps_failed += 1
+            state = self._easier(state, dt, solve)
+        return self._finish(state, dt, solve, began)
+
+    def _memory(self) -> dict[str, object]:
+        return {"damage": self.breaking.memory(), "flow": self.flow.memory()}
+
+    def _recall(self, state: State) -> None:
+        if "damage" in state.memory and self.breaking.recall(state.memory["damage"]):
+            self._recalled()
+
+    def _recalled(self) -> None:
+        """The body is damaged otherwise than it was: an earlier state is stepped once more."""
+        self.balance.damage_changed()
+
+    def _begin(self, state: State, dt: float) -> None:
+        """The step begins, for the first time or once more: with what the body had flowed at its start."""
+        if "flow" in state.memory:
+            self.flow.recall(state.memory["flow"])
+        self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
+
+    def _size(self, state: State) -> float:
+        """The step to take: no further than the end, and no sliver left over before it."""
+        left = self.sizes.end - state.t
+        return left if left < state.dt * (1 + 1e-9) else state.dt
+
+    def _attempt(self, state: State, dt: float) -> SolveResult:
+        """Solve the step: the balance is left at what was found, whether that is a solution or not."""
+        raise NotImplementedError
+
+    def _easier(self, state: State, dt: float, solve: SolveResult) -> State:
+        """The state from which to try again: half the step, down to the smallest."""
+        sizes = self.sizes
+        if not sizes.adapt or dt / 2 < sizes.smallest:
+            floor = "time.adapt is off" if not sizes.adapt else f"the smallest step is {sizes.smallest:g} s"
+            raise NotConverged(
+                f"no solution at t = {state.t + dt:g} s with a step of {dt:g} s ({floor}). {solve.reason}. "
+                f"Last good time: {state.t:g} s"
+            )
+        return replace(state, dt=dt / 2, easy=0)
+
+    def _grown(self, state: State) -> State:
+        """After an easy step a halved one may double again."""
+        if state.dt < self.sizes.step and state.easy + 1 >= EASY_STEPS:
+            return replace(state, dt=min(2 * state.dt, self.sizes.step), easy=0)
+        return replace(state, easy=state.easy + 1)
+
+    # --- its end ---
+
+    @staticmethod
+    def now() -> float:
+        """s, of a clock that times phases."""
+        return time.perf_counter()
+
+    def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
+        """Arrive at the end of the step, let the body flow and break, and book it."""
+        solve, broken, released = self._passes(state, dt, solve)
+        balance, lumped = self.balance, self.balance.mass.diagonal and self.balance.scheme.inertia
+        solved, acted = balance.u.x.array[: balance.owned].copy(), acting(balance, lumped=lumped)
+        u, v, a = self._arrive(state, dt)
+        work, viscous = work_done(balance, state, u, v, *acted, lumped=lumped)
+        forces, drag = acted
+        end = replace(
+            state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag, before=(state.u, dt)
+        )
+        flowed = self._let_flow()
+        end, result = self._break(end, solved)
+        lost = viscous + (result.released + released + flowed)
+        return self._booked(end, dt, solve, began, result.broken + broken, result.elastic, work, lost)
+
+    def _passes(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
+        """All passes of the step but its last: the solve with all iterations counted, the edges that broke, and the
+        energy that they released on this rank, J. Here: none."""
+        return solve, 0, 0.0
+
+    def _booked(
+        self, end: State, dt: float, solve: SolveResult, began: float, broken: int, elastic: float, work: float,
+        lost: float,
+    ) -> tuple[State, StepReport]:  # fmt: skip
+        """The end of the step with its energies; those given are of this rank, J."""
+        balance = self.balance
+        elastic += sum(term.stored() for term in balance.terms if term is not balance.stress)
+        kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
+        work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
+        end = replace(
+            end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, memory=self._memory()
+        )
+        return self._grown(end), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
+
+    def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
+        """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
+        balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned
+        x = balance.u.x.array[: balance.owned].copy()
+        u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
+        if scheme.rings:
+            v[own], a[own] = driven(dt, *(each[own] for each in (u, state.u, state.v)))
+        if scheme.alpha_f:
+            self.flow.begin(dt)
+            balance.look_at(state.t + dt, u, v, a)
+            balance.update_reactions()
+        return u, v, a
+
+    def _let_flow(self) -> float:
+        """Let the body flow, once it has arrived; returns the energy lost to it on this rank, J."""
+        began = time.perf_counter()
+        lost = self.flow()
+        if self.flow.stored is not None:
+            self.phases["plasticity"] = self.phases.get("plasticity", 0.0) + time.perf_counter() - began
+        return lost
+
+    def _break(self, end: State, solved: Values) -> tuple[State, PassResult]:
+        """A pass, and the state with the forces and the acceleration that it leaves.
+
+        `solved`: (owned dofs,) displacement at which the step's forces balance.
+        """
+        began = time.perf_counter()
+        result = self.breaking()
+        if result.broken:
+            end = self._released(end, solved, result)
+        self._damage_changed(result)
+        self.phases[self.breaking.phase] += time.perf_counter() - began
+        return end, result
+
+    def _released(self, end: State, solved: Values, result: PassResult) -> State:
+        """The state once what broke has let go."""
+        raise NotImplementedError
+
+    def _damage_changed(self, result: PassResult) -> None:
+        """Cells lost stiffness: forms are bound once to the cells that are left."""
+        if result.died:
+            self.balance.damage_changed()
