@@ -86,9 +86,13 @@ class Scene:
 
 def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
-    domain = distribute(comm, on_root(comm, lambda: checked_mesh(study)))
+    return scene_on(distribute(comm, on_root(comm, lambda: checked_mesh(study))), study)
+
+
+def scene_on(domain: Domain, study: Study, material: MaterialFields | None = None) -> Scene:
+    """The scene of a study on a mesh that is there; `material`: in place of the study's own."""
     scheme = make_scheme(study.time)
-    balance = _balance(study, domain, scheme, _material(study, domain))
+    balance = _balance(study, domain, scheme, material or _material(study, domain))
     if not scheme.inertia:
         check_supports(domain, balance.motion)
     flow = _flow(study, balance)

@@ -91,7 +91,7 @@ def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
 
 def take_step(run: Any) -> None:
     """A step as `fracsim run` takes it, without a frame."""
-    report = run.scene.stepper.advance(run.state)
+    run.state, report = run.scene.stepper.advance(run.state)
     run.history.append(run.state, report, run._figures(), run.scene.probes())
 
 
@@ -100,8 +100,10 @@ def break_now(run: Any, flags: Any) -> None:
     fracture = run.scene.fracture
     fracture.graph.break_edges(flags)
     fracture.graph.break_idle()
-    values = fracture._evaluate()
-    fracture.degradation(True, values[:, :-1], values[:, -1])
+    fracture.degradation(True, *fracture.evaluate())
+    fracture.changed()
+    run.state = run.scene.stepper.remember(run.state)
+    run.scene.balance.damage_changed()
     run.scene.solver.damage_changed()
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
@@ -113,8 +117,12 @@ def test_a_large_constant_kernel_is_the_mean_over_the_body(body: Body) -> None:
 
 def test_radius_zero_builds_no_average() -> None:
     """R = 0 is local: there is no matrix."""
-    scene, _ = make_scene(fracture={"strength": 1.0, "radius": 0.0})
-    assert scene.fracture._average is None
+    code = (
+        "import sys; sys.path.insert(0, 'tests'); from support.scenes import make_scene;"
+        "make_scene(fracture={'strength': 1.0, 'radius': 0.0});"
+        "assert 'fracsim.fracture.nonlocal_average' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], timeout=100)
 
 
 @pytest.mark.parametrize("at_once", (0, 5e7), ids=("rows made as needed", "all rows"))
@@ -127,7 +135,7 @@ def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"},
         fracture={"strength": 1.0, "radius": 0.25},
     )
-    average, n = scene.fracture._average, scene.domain.cell_count
+    average, n = NonlocalAverage(scene.domain, 0.25, "linear"), scene.domain.cell_count
     other = NonlocalAverage(scene.domain, 0.25, "linear")
     rng = np.random.default_rng(4)
     for active in (None, rng.uniform(size=n) < 0.7):

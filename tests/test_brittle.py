@@ -58,7 +58,7 @@ def strained(dim: int, F: Any, energy: str = "linear", **tables: Any) -> Scene:
 
 def cuts(scene: Scene) -> tuple[Any, Any]:
     """(n, 2) sorted keys of the edges that surfaces cut, and where."""
-    cut = scene.fracture.surfaces.cut
+    cut = scene.fracture.criterion.cut
     own = np.flatnonzero(~np.isnan(cut))
     keys = scene.fracture.graph.edge_keys(own)
     order = np.lexsort(keys.T[::-1])
@@ -75,7 +75,7 @@ def test_a_planar_cut_halves_a_cylinder(axis: list[float]) -> None:
     mesh = {"builder": "cylinder", "radius": 0.25, "length": 1.0, "h": 0.1, "axis": "x"}
     scene = strained(3, stretched(3, axis), mesh=mesh, fracture={"strength": 0.05, "approach": "edge"})
     assert scene.fracture().broken > 0
-    made, start = scene_surface(scene), scene.fracture.surfaces.starts
+    made, start = scene_surface(scene), scene.fracture.criterion.starts
     assert made.pieces == 2 and start.shape == (1, 3)
     above = volume_above(mesh_of(scene), start[0], np.array(axis) / np.linalg.norm(axis))
     total = float(scene.domain.volumes.sum())
@@ -90,7 +90,7 @@ def test_a_planar_cut_is_flat(dim: int, approach: str) -> None:
     scene.fracture()
     keys, cut = cuts(scene)
     normal = np.array([1.0, 0.3, 0.2][:dim]) / np.linalg.norm([1.0, 0.3, 0.2][:dim])
-    height = (cut_points(mesh_of(scene).points, keys, cut) - scene.fracture.surfaces.starts[0]) @ normal
+    height = (cut_points(mesh_of(scene).points, keys, cut) - scene.fracture.criterion.starts[0]) @ normal
     at_node = np.minimum(cut, 1 - cut) <= 2 * NEAREST
     assert np.abs(height[~at_node]).max() < 1e-9
     assert at_node.mean() <= (0.1 if approach == "chi" else 0.0)
@@ -101,7 +101,7 @@ def test_split_cells_carry_nothing_and_idle_edges_break() -> None:
     """Every cell that the plane crosses comes apart, so chi is 0 there and 1 elsewhere."""
     scene = strained(3, stretched(3, [1.0, 0.3, 0.2]))
     scene.fracture()
-    graph, chi = scene.fracture.graph, scene.equations.chi.x.array
+    graph, chi = scene.fracture.graph, scene.balance.stress.chi.x.array
     assert graph.split.any() and np.array_equal(chi == 0, graph.split)
     assert np.all(chi[~graph.damaged] == 1)
 
@@ -189,9 +189,9 @@ def test_surfaces_are_counted_over_the_run_and_keep_their_distance() -> None:
     counts = []
     for _ in range(5):
         scene.fracture()
-        counts.append(len(scene.fracture.surfaces.starts))
+        counts.append(len(scene.fracture.criterion.starts))
     assert counts == [2, 4, 5, 5, 5]
-    distance = cdist(*(scene.fracture.surfaces.starts,) * 2) + np.eye(5)
+    distance = cdist(*(scene.fracture.criterion.starts,) * 2) + np.eye(5)
     assert distance.min() >= 0.15
 
 
@@ -199,7 +199,7 @@ def test_the_cell_over_its_strength_starts_first() -> None:
     """Stress 0.056 everywhere (E e = 0.06 at most): the weak region breaks, and with it off nothing does."""
     weak = {"strength": 1.0, "approach": "chi"}
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture=weak)
-    assert scene.fracture().broken == 0 and len(scene.fracture.surfaces.starts) == 0
+    assert scene.fracture().broken == 0 and len(scene.fracture.criterion.starts) == 0
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture={"strength": 0.06 * (1 - 1e-5)})
     assert scene.fracture().broken > 0
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture={"strength": 0.06 * (1 + 1e-5)})
@@ -352,7 +352,7 @@ def test_a_run_writes_the_exact_halves(tmp_path: Path) -> None:
     """
     run = Run(build_scene(MPI.COMM_SELF, make_study(**PULL)), tmp_path)
     run()
-    x = run.scene.fracture.surfaces.starts[0]
+    x = run.scene.fracture.criterion.starts[0]
     above = volume_above(mesh_of(run.scene), x, np.array([1.0, 0.0, 0.0]))
     assert above == pytest.approx((1 - x[0]) * 0.09, rel=1e-12)
     with (tmp_path / "pieces.csv").open(newline="") as file:
@@ -386,14 +386,14 @@ def test_a_restart_remembers_its_surfaces(tmp_path: Path) -> None:
     whole = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "whole")
     whole()
     stopped = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "parts")
-    surfaces = stopped.scene.fracture.surfaces
+    surfaces = stopped.scene.fracture.criterion
     stopped._interrupt.reason = lambda: "the test" if len(surfaces.starts) else ""  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
-    assert len(surfaces.starts) == 1 and len(whole.scene.fracture.surfaces.starts) == 4
+    assert len(surfaces.starts) == 1 and len(whole.scene.fracture.criterion.starts) == 4
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "parts", restart=True)
     again()
-    np.testing.assert_allclose(again.scene.fracture.surfaces.starts, whole.scene.fracture.surfaces.starts, rtol=1e-14)
+    np.testing.assert_allclose(again.scene.fracture.criterion.starts, whole.scene.fracture.criterion.starts, rtol=1e-14)
     assert again.record is not None and whole.record is not None
     assert np.array_equal(again.record.graph.broken, whole.record.graph.broken)
     np.testing.assert_allclose(again.record.cut, whole.record.cut, atol=1e-8)
@@ -410,7 +410,7 @@ def test_several_passes_open_surfaces_one_after_the_other() -> None:
     tables["boundary"][1] = {"on": "right", "displacement": {"time": [0, 10], "value": [[0, 0, 0], [0.1, 0, 0]]}}
     scene, state = make_scene(**{key: value for key, value in tables.items() if key != "output"})
     march(scene, state)
-    assert len(scene.fracture.surfaces.starts) == 1
+    assert len(scene.fracture.criterion.starts) == 1
 
 
 # --- what is off, and what is wrong ---------------------------------------------------------------------------------
@@ -420,7 +420,7 @@ def test_a_study_without_brittle_imports_nothing_of_it() -> None:
     code = (
         "import sys; sys.path.insert(0, 'tests'); from support.scenes import make_scene, march;"
         "scene, state = make_scene(fracture={'strength': 1.0}); march(scene, state, 1);"
-        "assert scene.fracture.surfaces is None;"
+        "assert scene.fracture.criterion is None;"
         "assert not [name for name in sys.modules if name.startswith('fracsim.fracture.brittle')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], timeout=100)

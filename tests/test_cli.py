@@ -83,7 +83,7 @@ Run(scene, Path({str(tmp_path / "out")!r}))()
 parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mechanics.plasticity")
 parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
 parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage")
-print(scene.equations.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
+print(scene.balance.stress.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.splitlines()[-1] == "None None []"

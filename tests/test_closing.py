@@ -29,8 +29,8 @@ def cut(scene: Scene, at: float) -> None:
     graph = scene.fracture.graph
     side = scene.domain.nodes[graph.edge_nodes][:, :, 0] > at
     graph.break_edges(side[:, 0] != side[:, 1])
-    if scene.equations.chi is not None:
-        scene.equations.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
+    if scene.balance.stress.chi is not None:
+        scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
     scene.fracture.degradation.restore()
 
 
@@ -135,13 +135,13 @@ def test_equal_bars_exchange_their_velocities(approach: str, energy: str) -> Non
     left = x < 0.5
     scene.fracture.graph.broken[:] = False
     scene.fracture.graph.pattern[:] = 0
-    if scene.equations.chi is not None:
-        scene.equations.chi.x.array[:] = 1.0
+    if scene.balance.stress.chi is not None:
+        scene.balance.stress.chi.x.array[:] = 1.0
     cut(scene, 0.5)
     state.v.reshape(-1, 2)[left, 0] = speed
-    scene.stepper.settle(state)
+    state.settle()
     energies = [report.kinetic + report.elastic for report in each_step(scene, state)]
-    mass = scene.equations.mass.reshape(-1, 2)[:, 0]
+    mass = scene.balance.mass.lumped.reshape(-1, 2)[:, 0]
     v = state.v.reshape(-1, 2)[:, 0]
     before = 0.5 * float(mass[left] @ np.full(left.sum(), speed) ** 2)
     means = [float(mass[part] @ v[part] / mass[part].sum()) for part in (left, ~left)]
@@ -159,8 +159,8 @@ def test_turning_a_closed_body_costs_nothing(energy: str) -> None:
     Q = np.array([[np.cos(1.1), -np.sin(1.1)], [np.sin(1.1), np.cos(1.1)]])
     energies = []
     for x in (X + u, (X + u) @ Q.T):
-        scene.equations.displace((x - X).reshape(-1))
-        energies.append(scene.equations.elastic_energy())
+        scene.balance.displace((x - X).reshape(-1))
+        energies.append(scene.balance.stress.stored())
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
 
 
@@ -172,11 +172,11 @@ def test_energy_against_dense_matrices(dim: int, approach: str, energy: str) -> 
     mesh = {"builder": "box", "size": [1.0] * dim, "h": 0.5, "pattern": "unstructured"}
     fracture = {"strength": 1.0, "approach": approach, "unilateral": True}
     scene, _ = make_scene(mesh=mesh, material=material, fracture=fracture, time={"step": 0.1, "end": 1.0})
-    equations, rng = scene.equations, np.random.default_rng(7)
+    balance, rng = scene.balance, np.random.default_rng(7)
     whole = rng.uniform(size=(scene.domain.cell_count, len(local_edges(dim)))) < 0.4
-    equations.integrity.x.array[:] = whole.reshape(-1)  # type: ignore[union-attr]
-    if equations.chi is not None:
-        equations.chi.x.array[:] = 0.0
+    balance.stress.integrity.x.array[:] = whole.reshape(-1)  # type: ignore[union-attr]
+    if balance.stress.chi is not None:
+        balance.stress.chi.x.array[:] = 0.0
     X = scene.domain.nodes
     u = rng.uniform(-0.05, 0.05, X.size)
 
@@ -186,12 +186,12 @@ def test_energy_against_dense_matrices(dim: int, approach: str, energy: str) -> 
             sum_ += cell_energy(X[nodes], x[nodes], whole[c], approach, energy)
         return sum_
 
-    equations.displace(u)
-    assert equations.elastic_energy() == pytest.approx(dense(u), rel=1e-12)
+    balance.displace(u)
+    assert balance.stress.stored() == pytest.approx(dense(u), rel=1e-12)
     direction = rng.uniform(-1, 1, X.size)
     h = 1e-6
     slope = (dense(u + h * direction) - dense(u - h * direction)) / (2 * h)
-    assert equations.internal_force() @ direction == pytest.approx(slope, rel=1e-5)
+    assert balance.stress.force() @ direction == pytest.approx(slope, rel=1e-5)
 
 
 def cell_energy(X: Values, x: Values, whole: npt.NDArray[np.bool_], approach: str, energy: str) -> float:
@@ -222,7 +222,7 @@ def test_without_damage_it_changes_nothing(energy: str) -> None:
     for unilateral in (False, True):
         scene, _ = make_scene(material=SOFT | {"energy": energy}, fracture={"strength": 1.0, "unilateral": unilateral})
         deform(scene, np.array([[0.9, 0.1], [0.0, 1.1]]))
-        forces.append(np.append(scene.equations.internal_force(), scene.equations.elastic_energy()))
+        forces.append(np.append(scene.balance.stress.force(), scene.balance.stress.stored()))
     np.testing.assert_allclose(forces[1], forces[0], atol=1e-14)
 
 
@@ -242,8 +242,8 @@ def test_no_cell_is_faster_than_its_edges_let_it(dim: int) -> None:
         if not any(flags):
             continue
         acting = np.tile(flags, (len(cells), 1))
-        exact = projected_frequencies(scene.equations, chosen, acting)
-        bounds = spring_frequencies(scene.equations, chosen, acting)
+        exact = projected_frequencies(scene.balance, chosen, acting)
+        bounds = spring_frequencies(scene.balance, chosen, acting)
         for nodes, projected, bound in zip(cells, exact, bounds, strict=True):
             dyads, along = edge_strains(X[nodes], edges[list(flags)])
             eps = np.einsum("ea,eij->aij", along, dyads)
@@ -278,12 +278,12 @@ def test_explicit_steps_stay_stable_with_damage(approach: str, unilateral: bool)
     )  # fmt: skip
     graph, rng = scene.fracture.graph, np.random.default_rng(5)
     graph.break_edges(rng.uniform(size=len(graph.broken)) < 0.4)
-    if scene.equations.chi is not None:
-        scene.equations.chi.x.array[: scene.domain.cell_count][graph.damaged] = 0.5
-        scene.equations.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
+    if scene.balance.stress.chi is not None:
+        scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.damaged] = 0.5
+        scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
     scene.fracture.degradation.restore()
     state.v[:] = rng.uniform(-1e-3, 1e-3, len(state.v))
-    scene.stepper.settle(state)
+    state.settle()
     energies = [report.kinetic + report.elastic for report in march(scene, state, 2000)]
     assert max(energies) < 1.5 * energies[0]
 
@@ -298,11 +298,11 @@ def test_shortened_edges_let_no_tension_through() -> None:
         material=SOFT | {"energy": "neo-hookean"}, fracture={"strength": float("inf"), "unilateral": True},
         time={"step": 0.1, "end": 1.0},
     )  # fmt: skip
-    equations = scene.equations
-    equations.chi.x.array[:] = 0.0  # type: ignore[union-attr]
-    equations.integrity.x.array[:] = 0.0  # type: ignore[union-attr]
+    balance = scene.balance
+    balance.stress.chi.x.array[:] = 0.0  # type: ignore[union-attr]
+    balance.stress.integrity.x.array[:] = 0.0  # type: ignore[union-attr]
     deform(scene, np.diag([0.95, 2.0]))
-    force = equations.internal_force().reshape(-1, 2)
+    force = balance.stress.force().reshape(-1, 2)
     assert np.abs(force[:, 1]).max() < 1e-14
     outward = np.where(scene.domain.nodes[:, 0] > 0.5, 1, -1)
     assert np.all(outward * force[:, 0] < -1e-3)  # the body would burst along x
@@ -313,15 +313,15 @@ def test_the_force_does_not_jump_as_edges_close() -> None:
     step halves the largest change. (Projected strains, with closed edges counted as intact, jump.)"""
     scene, _ = bar("edge", "linear")
     rng = np.random.default_rng(2)
-    scene.equations.integrity.x.array[:] = 0.0  # type: ignore[union-attr]
+    scene.balance.stress.integrity.x.array[:] = 0.0  # type: ignore[union-attr]
     X = scene.domain.nodes
     start, way = rng.uniform(-0.02, 0.02, X.size), rng.uniform(-0.02, 0.02, X.size)
     largest = []
     for steps in (200, 400):
         forces = []
         for s in np.linspace(-1, 1, steps + 1):
-            scene.equations.displace(start + s * way)
-            forces.append(scene.equations.internal_force())
+            scene.balance.displace(start + s * way)
+            forces.append(scene.balance.stress.force())
         largest.append(np.abs(np.diff(forces, axis=0)).max())
     assert largest[1] == pytest.approx(largest[0] / 2, rel=0.05)
 

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence.growth import random_planes
+from support.scenes import Walk
 
 
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
@@ -25,10 +26,10 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
         solver={"snes_type": "ksponly", "ksp_rtol": 1e-6},
     )
     scene = build_scene(MPI.COMM_SELF, data)
-    state = scene.stepper.start(None)
-    before = [scene.stepper.advance(state).outcome.krylov for _ in range(3)][-1]
+    state = Walk(scene)
+    before = [state.advance().solve.krylov for _ in range(3)][-1]
     cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])
-    after = [scene.stepper.advance(state).outcome.krylov for _ in range(3)][-1]
+    after = [state.advance().solve.krylov for _ in range(3)][-1]
     assert scene.fracture.graph.split.any()
     assert after <= 1.25 * before + 2, f"{before} iterations before the crack, {after} after"
 
@@ -47,10 +48,10 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
             solver={"snes_type": "ksponly", "ksp_rtol": 1e-6, **given},
         )
         scene = build_scene(MPI.COMM_SELF, data)
-        state = scene.stepper.start(None)
-        scene.stepper.advance(state)
+        state = Walk(scene)
+        state.advance()
         cut(scene, random_planes(10, scene.domain.lower, scene.domain.upper))
-        krylov.append([scene.stepper.advance(state).outcome.krylov for _ in range(12)][-1])
+        krylov.append([state.advance().solve.krylov for _ in range(12)][-1])
     assert krylov[0] < 0.85 * krylov[1], krylov
 
 
@@ -62,6 +63,6 @@ def cut(scene: Scene, planes: list[Any]) -> None:
         side = (ends - point) @ normal >= 0
         graph.break_edges(side[:, 0] != side[:, 1])
     graph.break_idle()
-    assert scene.equations.chi is not None and scene.solver is not None
-    scene.equations.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
+    assert scene.balance.stress.chi is not None and scene.solver is not None
+    scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
     scene.solver.damage_changed()

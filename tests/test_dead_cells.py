@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
-from fracsim.mechanics.balance import Equilibrium
+from fracsim.mechanics.balance import Balance
 from fracsim.mechanics.flow_prediction import Extrapolated
 from fracsim.mechanics.kernels import CellForm
 from fracsim.run import Run
@@ -42,22 +42,22 @@ def damaged(case: str, dim: int, **tables: Any) -> tuple[Scene, State]:
     sides = [{key: value[:dim] if isinstance(value, list) else value for key, value in side.items()} for side in SIDES]
     mesh = {"builder": "box", "size": [1.0, 0.7, 0.6][:dim], "h": 0.2 if dim == 2 else 0.3, "pattern": "unstructured"}
     scene, state = make_scene(**CASES[case] | {"mesh": mesh, "boundary": sides, "fracture": {"strength": 1e9}} | tables)
-    plastic = scene.equations.material.plastic
-    if plastic is not None and isinstance(plastic.relaxation, Extrapolated):
-        plastic.relaxation.memory = np.random.default_rng(4).uniform(0, 0.5, (scene.domain.cell_count, 6))
-    scene.equations.begin(0.1, 0.1, state.u, state.v, state.a)
-    scene.equations.displace(np.random.default_rng(5).uniform(-0.02, 0.02, len(state.u)))
+    plastic = scene.balance.stress.material.plastic
+    if plastic is not None and isinstance(plastic.prediction, Extrapolated):
+        plastic.prediction.memory = np.random.default_rng(4).uniform(0, 0.5, (scene.domain.cell_count, 6))
+    scene.balance.begin(0.1, 0.1, state.u, state.v, state.a)
+    scene.balance.displace(np.random.default_rng(5).uniform(-0.02, 0.02, len(state.u)))
     weaken(scene)
     return scene, state
 
 
 def forces(scene: Scene) -> list[Values]:
     """Residual, forces of the stress, damping and reactions, copies."""
-    equations = scene.equations
-    drag = equations.viscous_force()
-    parts = [equations.forces_in_balance().copy(), equations.internal_force(), *([] if drag is None else [drag])]
-    equations.update_reactions()
-    return [*parts, equations.unbalanced.copy()]
+    balance = scene.balance
+    drag = balance.drag()
+    parts = [balance.forces().copy(), balance.stress.force(), *([] if drag is None else [drag])]
+    balance.update_reactions()
+    return [*parts, balance.reactions.copy()]
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -66,8 +66,8 @@ def test_forces_and_tangent_without_dead_cells(case: str, dim: int) -> None:
     """They only ever added zeros: not a bit changes, whatever carries the factor chi, facets and supports included."""
     scene, _ = damaged(case, dim)
     whole, tangent = forces(scene), dense_tangent(scene)
-    scene.equations.leave_out_dead_cells()
-    assert np.array_equal(integrated_cells(scene), np.flatnonzero(scene.equations.chi.x.array))
+    scene.balance.damage_changed()
+    assert np.array_equal(integrated_cells(scene), np.flatnonzero(scene.balance.stress.chi.x.array))
     for after, before in zip(forces(scene), whole, strict=True):
         np.testing.assert_array_equal(after, before)
     np.testing.assert_array_equal(dense_tangent(scene), tangent)
@@ -80,38 +80,38 @@ def test_a_smaller_tangent_is_the_same_one(case: str, dim: int) -> None:
     """Without the entries of dead cells: a node that has no other keeps its place on the diagonal, and not a bit of
     what is left changes."""
     scene, _ = damaged(case, dim)
-    equations, tangent = scene.equations, dense_tangent(scene)
-    entries = equations.tangent.getInfo()["nz_used"]
-    equations.leave_out_dead_cells()
+    balance, tangent = scene.balance, dense_tangent(scene)
+    entries = balance.tangent.getInfo()["nz_used"]
+    balance.damage_changed()
     alive = len(integrated_cells(scene)) / scene.domain.cell_count
-    assert not equations.fit_tangent(alive - 0.01)
-    assert equations.fit_tangent(alive + 0.01)
+    assert not balance.shrink_tangent(alive - 0.01)
+    assert balance.shrink_tangent(alive + 0.01)
     np.testing.assert_array_equal(dense_tangent(scene), tangent)
-    assert equations.tangent.getInfo()["nz_used"] < entries
-    assert not equations.fit_tangent(1.0), "nothing died since"
+    assert balance.tangent.getInfo()["nz_used"] < entries
+    assert not balance.shrink_tangent(1.0), "nothing died since"
 
 
 def test_cells_that_are_back_find_room() -> None:
     """A tangent of the body before its last breaks is asked for now and then."""
     scene, _ = damaged("damped", 3)
-    equations, chi = scene.equations, scene.equations.chi.x.array
+    balance, chi = scene.balance, scene.balance.stress.chi.x.array
     chi[:] = 0.5
     whole = dense_tangent(scene)
     chi[::2] = 0.0
-    equations.leave_out_dead_cells()
-    assert equations.fit_tangent(1.0)
+    balance.damage_changed()
+    assert balance.shrink_tangent(1.0)
     chi[:] = 0.5
-    equations.leave_out_dead_cells()
-    assert equations.fit_tangent(0.0)
+    balance.damage_changed()
+    assert balance.shrink_tangent(0.0)
     np.testing.assert_array_equal(dense_tangent(scene), whole)
 
 
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
 def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     """Every edge that breaks and every displacement are those of a run whose matrix keeps its size."""
-    fit, fitted, found = Equilibrium.fit_tangent, [], []
-    for choice in (lambda equations, share: fitted.append(fit(equations, share)) or fitted[-1], lambda *_: False):
-        monkeypatch.setattr(Equilibrium, "fit_tangent", choice)
+    fit, fitted, found = Balance.shrink_tangent, [], []
+    for choice in (lambda balance, share: fitted.append(fit(balance, share)) or fitted[-1], lambda *_: False):
+        monkeypatch.setattr(Balance, "shrink_tangent", choice)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.05, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.0]}],
@@ -120,7 +120,7 @@ def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.Monkey
             solver={"ksp_rtol": 1e-10, "snes_rtol": 1e-10},
         )
         march(scene, state)
-        found.append((state.u.copy(), scene.fracture.graph.broken.copy(), scene.equations.tangent.getInfo()["nz_used"]))
+        found.append((state.u.copy(), scene.fracture.graph.broken.copy(), scene.balance.tangent.getInfo()["nz_used"]))
     (small, torn, entries), (kept, same, all_entries) = found
     assert any(fitted) and entries < all_entries
     assert torn.any() and np.array_equal(torn, same)
@@ -137,33 +137,33 @@ def test_a_consistent_mass_keeps_its_pattern() -> None:
     )
     march(scene, state)
     assert len(integrated_cells(scene)) < scene.domain.cell_count
-    assert not scene.equations.fit_tangent(1.0)
+    assert not scene.balance.shrink_tangent(1.0)
 
 
 def test_no_entry_is_kept_for_nothing() -> None:
     """2 x 2 for each pair of nodes in a living cell, and for each node with itself."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1}, fracture={"strength": 1e9})
-    domain, chi = scene.domain, scene.equations.chi.x.array
+    domain, chi = scene.domain, scene.balance.stress.chi.x.array
     chi[: domain.cell_count] = np.random.default_rng(6).uniform(size=domain.cell_count) < 0.2
-    scene.equations.leave_out_dead_cells()
-    assert scene.equations.fit_tangent(1.0)
+    scene.balance.damage_changed()
+    assert scene.balance.shrink_tangent(1.0)
     pairs = np.eye(domain.node_count, dtype=bool)
     for nodes in domain.cell_nodes[chi[: domain.cell_count] > 0]:
         pairs[np.ix_(nodes, nodes)] = True
-    scene.equations.assemble_tangent(None, None, *(scene.equations.tangent,) * 2)
-    assert scene.equations.tangent.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
+    scene.balance.assemble_tangent(scene.balance.tangent)
+    assert scene.balance.tangent.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
 
 
 def test_every_death_counts_from_all_cells() -> None:
     """Bound again after more cells have died, and after chi was read from elsewhere."""
     scene, _ = damaged("damped", 2)
-    equations, chi = scene.equations, scene.equations.chi.x.array
-    equations.leave_out_dead_cells()
+    balance, chi = scene.balance, scene.balance.stress.chi.x.array
+    balance.damage_changed()
     chi[::2] = 0.0
-    equations.leave_out_dead_cells()
+    balance.damage_changed()
     assert np.array_equal(integrated_cells(scene), np.flatnonzero(chi))
     chi[:] = 0.5
-    equations.leave_out_dead_cells()
+    balance.damage_changed()
     assert len(integrated_cells(scene)) == len(chi)
 
 
@@ -179,9 +179,9 @@ def test_every_death_counts_from_all_cells() -> None:
 def test_cells_that_keep_something_stay(tables: dict[str, Any]) -> None:
     """Springs of cracks, projected strains, and the floor of a quasi-static study."""
     scene, _ = make_scene(**{"fracture": {"strength": 1e9}} | tables)
-    if scene.equations.chi is not None:
-        scene.equations.chi.x.array[:] = 0.0
-    scene.equations.leave_out_dead_cells()
+    if scene.balance.stress.chi is not None:
+        scene.balance.stress.chi.x.array[:] = 0.0
+    scene.balance.damage_changed()
     assert len(integrated_cells(scene)) == scene.domain.cell_count
 
 
@@ -197,7 +197,7 @@ def test_cells_are_left_out_as_they_die_and_not_before(monkeypatch: pytest.Monke
         fracture={"strength": strength},
     )
     march(scene, state)
-    living = np.flatnonzero(scene.equations.chi.x.array)
+    living = np.flatnonzero(scene.balance.stress.chi.x.array)
     assert np.array_equal(integrated_cells(scene), living)
     assert bool(bound) == (len(living) < scene.domain.cell_count) == (strength < 1)
 
@@ -216,8 +216,8 @@ def test_dust_falls(scheme: str, solver: dict[str, Any]) -> None:
     )
     graph = scene.fracture.graph
     graph.break_edges(np.ones(len(graph.broken), bool))
-    values = scene.fracture._evaluate()
-    scene.fracture.degradation(True, values[:, :-1], values[:, -1])
+    scene.fracture.degradation(True, *scene.fracture.evaluate())
+    scene.balance.damage_changed()
     assert len(integrated_cells(scene)) == 0
     march(scene, state)
     fallen = state.u.reshape(-1, 2) - [0.0, -9.81 * 0.1**2 / 2]
@@ -230,8 +230,8 @@ def test_a_restart_leaves_the_same_cells_out(tmp_path: Path) -> None:
     going = Run(build_scene(MPI.COMM_SELF, data), tmp_path)
     graph = going._graph
     graph.break_edges(np.random.default_rng(3).uniform(size=len(graph.broken)) < 0.6)
-    values = going.scene.fracture._evaluate()
-    going.scene.fracture.degradation(True, values[:, :-1], values[:, -1])
+    going.scene.fracture.degradation(True, *going.scene.fracture.evaluate())
+    going.scene.balance.damage_changed()
     going._note_breaks()
     going._checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, data), tmp_path, restart=True)

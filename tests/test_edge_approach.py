@@ -89,15 +89,15 @@ def test_force_and_tangent_are_those_of_the_paper(dim: int) -> None:
     """Eqs. 21 and 22 on every pattern, and symmetric positive semi-definite."""
     scene = scene_of(dim, time={"scheme": "backward-euler", "step": 0.1, "end": 1.0})
     integrity = patterns(scene, 1)
-    scene.equations.integrity.x.array[:] = integrity.reshape(-1)  # type: ignore[union-attr]
+    scene.balance.stress.integrity.x.array[:] = integrity.reshape(-1)  # type: ignore[union-attr]
     u = np.random.default_rng(2).uniform(-0.1, 0.1, scene.domain.nodes.size)
-    scene.equations.displace(u)
+    scene.balance.displace(u)
     K = dense(scene, integrity)
     scale = np.abs(K).max()
-    np.testing.assert_allclose(scene.equations.internal_force(), K @ u, atol=1e-12 * scale)
+    np.testing.assert_allclose(scene.balance.stress.force(), K @ u, atol=1e-12 * scale)
     np.testing.assert_allclose(dense_tangent(scene), K, atol=1e-12 * scale)
     assert np.linalg.eigvalsh(K).min() > -1e-12 * scale
-    assert scene.equations.elastic_energy() == pytest.approx(0.5 * u @ K @ u, rel=1e-12)
+    assert scene.balance.stress.stored() == pytest.approx(0.5 * u @ K @ u, rel=1e-12)
 
 
 @pytest.mark.parametrize("dim", (2, 3))

@@ -34,7 +34,7 @@ def test_no_body_is_faster_than_its_fastest_cell(dim: int) -> None:
     scene, _ = make_scene(mesh=mesh, material=material, time={"scheme": "explicit", "step": 1.0, "end": 1.0})
     X, cells = scene.domain.nodes, scene.domain.cell_nodes
     squares = eigh(stiffness(X, cells, *lame(1.0, 0.3)), np.diag(lumped_mass(X, cells, 1.0)), eigvals_only=True)
-    bound = np.sqrt(cell_frequencies(scene.equations).max())
+    bound = np.sqrt(cell_frequencies(scene.balance).max())
     assert np.sqrt(squares[-1]) <= bound <= 3 * np.sqrt(squares[-1])
 
 
@@ -42,14 +42,14 @@ def test_order_and_energy() -> None:
     """With half the step a mode is off by a quarter; over 1000 steps its energy swings by (w dt)^2, no more."""
     scene, _ = scene_of("explicit", 1.0)
     X, cells = scene.domain.nodes, scene.domain.cell_nodes
-    free = np.setdiff1d(np.arange(X.size), scene.equations.held)
+    free = np.setdiff1d(np.arange(X.size), scene.balance.motion.owned)
     flags = np.isin(np.arange(X.size), free)
     w, shapes = modes(stiffness(X, cells, *lame(1.0, 0.0)), lumped_mass(X, cells, 1.0), flags)
     errors = []
     for dt in (0.02, 0.01):
         scene, state = scene_of("explicit", dt)
         state.v = shapes[:, 1].copy()
-        scene.stepper.settle(state)
+        state.settle()
         march(scene, state, round(1.0 / dt))
         errors.append(np.abs(state.u - shapes[:, 1] * np.sin(w[1]) / w[1]).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
@@ -111,8 +111,8 @@ def test_the_stable_step_follows_every_break(approach: str, unilateral: bool, mo
     monkeypatch.setattr(edge_frequencies, "edge_frequencies", lambda e: evaluations.append(e) or evaluate(e))
     broke, steps = 1, []
     for _ in range(80):
-        squares = damaged_frequencies(scene.equations, cell_frequencies(scene.equations), evaluate(scene.equations))
-        expected, before = SAFETY * stable_step(np.sqrt(squares.max()), scene.equations), len(evaluations)
+        squares = damaged_frequencies(scene.balance, cell_frequencies(scene.balance), evaluate(scene.balance))
+        expected, before = SAFETY * stable_step(np.sqrt(squares.max()), scene.balance), len(evaluations)
         (report,) = march(scene, state, 1)
         assert report.dt == expected
         assert len(evaluations) - before == (broke > 0)

@@ -14,6 +14,7 @@ from fracsim.scene import build_scene
 from fracsim.studies.evidence import extremes
 from fracsim.study.file import validate
 from support.ranks import Arrays, run_on_ranks
+from support.scenes import Walk
 
 
 @pytest.mark.parametrize(("velocity", "step"), [(1e3, 1e-6), (3e6, 1e-2)])
@@ -24,11 +25,11 @@ def test_a_fast_body_flies_on_in_short_steps(velocity: float, step: float) -> No
     study = extremes.flying(velocity, step, 20)
     study["time"]["adapt"] = False
     scene = build_scene(MPI.COMM_WORLD, validate(study, "flying"))
-    state = scene.stepper.start(scene.study.initial)
+    state = Walk(scene)
     for _ in range(20):
-        scene.stepper.advance(state)
+        state.advance()
     u, v = state.u.reshape(-1, 3), state.v.reshape(-1, 3)
-    mass = scene.equations.mass.reshape(-1, 3)[:, :1]
+    mass = scene.balance.mass.lumped.reshape(-1, 3)[:, :1]
     eps = np.finfo(float).eps
     drift = np.abs((mass * v).sum(axis=0) / mass.sum() - [velocity, 0.0, 0.0]).max()
     assert drift <= 20 * 8 * eps * velocity * 20  # each step divides the round-off of u = 20 v dt by dt
@@ -72,14 +73,14 @@ def test_factors_where_iterations_fail() -> None:
     for options in ({"ksp_rtol": 1e-10}, {"ksp_max_it": 3, "ksp_rtol": 1e-10}):
         study = extremes.block(1.5, steps=2) | {"solver": options}
         scene = build_scene(MPI.COMM_WORLD, validate(study, "x"))
-        state = scene.stepper.start(None)
-        scene.stepper.advance(state)
-        assert scene.solver is not None and scene.stepper.failed == 0
+        state = Walk(scene)
+        state.advance()
+        assert scene.solver is not None and scene.stepper.trouble.steps_failed == 0
         ksp = scene.solver.snes.ksp
         assert (ksp.getType(), ksp.pc.getType()) == ("cg", "gamg")
         results.append(state.u)
-        scene.stepper.advance(state)
-        scene.solver.forget_options()
+        state.advance()
+        scene.destroy()
     assert np.allclose(*results, rtol=0, atol=1e-5 * np.abs(results[0]).max())
 
 

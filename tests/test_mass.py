@@ -33,7 +33,7 @@ def test_consistent_mass_is_the_integral(dim: int) -> None:
     """M a of every component equals the dense integral, and its row sums are the lumped mass."""
     mesh = {"builder": "box", "size": [1.0] * dim, "h": 0.4, "pattern": "unstructured"}
     scene, _ = make_scene(mesh=mesh, material=MATERIAL, time={"step": 0.1, "end": 1.0, "mass": "consistent"})
-    domain, inertia = scene.domain, scene.equations.inertia
+    domain, inertia = scene.domain, scene.balance.mass
     M = consistent_mass(domain.nodes, domain.cell_nodes)
     a = np.random.default_rng(2).uniform(-1, 1, domain.nodes.shape)
     np.testing.assert_allclose(inertia.times(a.reshape(-1)).reshape(a.shape), M @ a, atol=1e-14)
@@ -52,11 +52,11 @@ def test_a_mode_of_the_consistent_mass_vibrates_at_its_frequency() -> None:
         boundary=[{"on": "left", "fix": "xy"}],
     )
     X, cells = scene.domain.nodes, scene.domain.cell_nodes
-    free = np.setdiff1d(np.arange(X.size), scene.equations.held)
+    free = np.setdiff1d(np.arange(X.size), scene.balance.motion.owned)
     M = np.kron(consistent_mass(X, cells), np.eye(2))[np.ix_(free, free)]
     squares, vectors = eigh(stiffness(X, cells, *lame(1.0, 0.0))[np.ix_(free, free)], M)
     state.v[free] = vectors[:, 2]
-    scene.stepper.settle(state)
+    state.settle()
     march(scene, state, steps)
     phase = 2 * np.arctan(np.sqrt(squares[2]) * dt / 2) * steps
     np.testing.assert_allclose(state.v[free], np.cos(phase) * vectors[:, 2], atol=1e-9)

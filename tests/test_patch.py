@@ -58,7 +58,7 @@ def patch(dim: int, energy: str, scheme: str, steps: int, plane: str = "strain")
 
 def stress_of(scene: Scene, state: State) -> Values:
     """(cells, 6) Cauchy stress as it is written: xx, xy, xz, yy, yz, zz."""
-    return Frames(scene.equations, ["stress"])(state, None)[1].values
+    return Frames(scene.balance, ["stress"])(state, None)[1].values
 
 
 def expected_stress(energy: str, dim: int, F: Values) -> Values:
@@ -103,7 +103,9 @@ def test_dynamic_patch(energy: str, scheme: str, dim: int) -> None:
     velocity = X @ GRADIENT[dim].T / (0.1 * steps)
     state.v = velocity.reshape(-1).copy()
     for report in each_step(scene, state):
-        assert report.kinetic == pytest.approx(0.5 * scene.equations.mass @ velocity.reshape(-1) ** 2, rel=TOLERANCE)
+        assert report.kinetic == pytest.approx(
+            0.5 * scene.balance.mass.lumped @ velocity.reshape(-1) ** 2, rel=TOLERANCE
+        )
         np.testing.assert_allclose(state.u.reshape(X.shape), state.t * velocity, atol=TOLERANCE)
         np.testing.assert_allclose(state.v.reshape(X.shape), velocity, atol=TOLERANCE / 0.1)
 
@@ -132,7 +134,7 @@ def test_reactions_carry_the_stress(dim: int) -> None:
     """In the patch the reactions on a face add up to P N A, and all of them to zero."""
     scene, state = patch(dim, "neo-hookean", "quasi-static", 1)
     march(scene, state)
-    X, forces = positions(scene), scene.equations.unbalanced.reshape(-1, dim)
+    X, forces = positions(scene), scene.balance.reactions.reshape(-1, dim)
     np.testing.assert_allclose(forces.sum(axis=0), 0, atol=TOLERANCE * YOUNG)
     # virtual work of the reactions: sum f x X^T = V P for every virtual gradient
     P = law_of(ENERGIES["neo-hookean"](MU, LAMBDA), dim).P(np.eye(dim) + GRADIENT[dim])

@@ -36,7 +36,7 @@ class Vibration:
 
     def amplitude(self) -> float:
         """Modal coordinate phi . M u."""
-        return float(self.shape @ (self.scene.equations.mass * self.state.u))
+        return float(self.shape @ (self.scene.balance.mass.lumped * self.state.u))
 
 
 def discrete_modes(boundary: list[dict[str, Any]]) -> tuple[Values, Values]:
@@ -44,7 +44,7 @@ def discrete_modes(boundary: list[dict[str, Any]]) -> tuple[Values, Values]:
     scene, _ = make_scene(mesh=MESH, material=MATERIAL, boundary=boundary)
     X, cells = positions(scene), scene.domain.cell_nodes
     free = np.ones(X.size, bool)
-    free[scene.equations.held] = False
+    free[scene.balance.motion.owned] = False
     return modes(stiffness(X, cells, MU, LAMBDA), lumped_mass(X, cells, 3.0), free)
 
 
@@ -60,7 +60,7 @@ def vibrate(scheme: str, steps: int, periods: float = 1.0, number: int = 0, **ta
         **tables,
     )
     state.v = shapes[:, number].copy()
-    scene.stepper.settle(state)
+    state.settle()
     return Vibration(scene, state, float(w[number]), shapes[:, number])
 
 
@@ -172,7 +172,7 @@ def test_work_is_energy_plus_dissipation(case: dict[str, Any]) -> None:
     d(1/2 v M v) = du . M (a0 + a1) / 2, d(elastic) = du . (f0 + f1) / 2, and M a + f + drag = load at both ends.
     """
     scene, state = make_scene(mesh=MESH, material=MATERIAL, time={"scheme": "newmark", "step": 0.1, "end": 4.0}, **case)
-    start = scene.equations.kinetic_energy(state.v)
+    start = scene.balance.kinetic_energy(state.v)
     for report in each_step(scene, state):
         balance = start + state.work - report.kinetic - report.elastic - state.dissipated
         assert balance == pytest.approx(0, abs=SOLVED)
@@ -259,7 +259,7 @@ def test_damping_does_not_hold_a_rigid_spin_back() -> None:
             damping={"stiffness": 1e-4},
             time={"scheme": "newmark", "step": 1.0 / steps, "end": 1.0},
         )
-        kinetic = scene.equations.kinetic_energy(state.v)
+        kinetic = scene.balance.kinetic_energy(state.v)
         march(scene, state)
         losses.append(abs(state.dissipated) / kinetic)
     assert slopes(losses)[-1] == pytest.approx(2, abs=0.2)

@@ -54,7 +54,7 @@ def test_set_takes_whole_tables_and_every_toml_type(tmp_path: Path) -> None:
     assert found.boundary[1].on == "top" and found.boundary[1].pressure.value == [0, 2.5]  # type: ignore[union-attr]
     assert (found.time.adapt, found.output.every, found.output.fields) == (False, 7, ["stress"])
     assert found.solver == {"snes_max_it": 3, "ksp_type": "cg"}
-    assert found.fracture is not None and found.fracture.strength == float("inf")
+    assert found.fracture is not None and found.fracture.criterion.strength == float("inf")
 
 
 def test_the_last_set_counts(tmp_path: Path) -> None:

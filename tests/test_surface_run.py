@@ -56,7 +56,7 @@ def test_mass_and_momentum_of_the_pieces(torn: Run) -> None:
     mass = np.array([float(row["mass"]) for row in rows])
     velocity = np.array([[float(row["velocity_x"]), float(row["velocity_y"])] for row in rows])
     assert mass.sum() == pytest.approx(250.0, rel=1e-10)
-    nodes = (torn.scene.equations.mass * torn.state.v).reshape(-1, 2).sum(axis=0)
+    nodes = (torn.scene.balance.mass.lumped * torn.state.v).reshape(-1, 2).sum(axis=0)
     assert mass @ velocity == pytest.approx(nodes, rel=1e-8, abs=1e-8 * np.abs(nodes).max())
 
 

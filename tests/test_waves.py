@@ -77,7 +77,7 @@ def test_a_clamped_end_doubles_the_stress() -> None:
     scene, state = bar([{"on": "left", "fix": "xy"}], end=1.8)
     reaction, impulse = 0.0, 0.0
     for _ in each_step(scene, state):
-        now = scene.equations.unbalanced[scene.equations.held].sum()
+        now = scene.balance.reactions[scene.balance.motion.owned].sum()
         impulse += DT * (reaction + now) / 2
         reaction = now
     assert -impulse == pytest.approx(2 * PULL * AREA * (state.t - 1.0), abs=2 * PULL * AREA * FRONT)
@@ -87,7 +87,7 @@ def test_momentum_is_the_impulse_of_the_load() -> None:
     """A free bar gains p A t, whatever its waves do: the trapezoidal rule integrates a constant load exactly."""
     scene, state = bar([], end=1.5)
     for _ in each_step(scene, state):
-        momentum = (scene.equations.mass * state.v).reshape(-1, 2).sum(axis=0)
+        momentum = (scene.balance.mass.lumped * state.v).reshape(-1, 2).sum(axis=0)
         np.testing.assert_allclose(momentum, [PULL * AREA * state.t, 0], atol=1e-10 * PULL)
 
 
@@ -96,15 +96,15 @@ def test_momentum_is_the_impulse_of_the_load() -> None:
 
 def lowest_frequency(scene: Scene) -> float:
     """f1 in Hz of K and M as the program assembles them, held dofs left out."""
-    equations = scene.equations
-    x = equations.residual.duplicate()
+    balance = scene.balance
+    x = balance.vector.duplicate()
     x.set(0.0)
-    equations.assemble_tangent(None, x, equations.tangent, equations.tangent)
-    K = csr_matrix(equations.tangent.getValuesCSR()[::-1], shape=equations.tangent.size)
-    free = np.ones(len(equations.mass), bool)
-    free[equations.held] = False
-    mass = equations.mass[free]
-    K = K[free][:, free] - (diags(equations.c_a * mass) if equations.scheme.inertia else 0)
+    balance.assemble_tangent(balance.tangent)
+    K = csr_matrix(balance.tangent.getValuesCSR()[::-1], shape=balance.tangent.size)
+    free = np.ones(len(balance.mass.lumped), bool)
+    free[balance.motion.owned] = False
+    mass = balance.mass.lumped[free]
+    K = K[free][:, free] - (diags(balance.c_a * mass) if balance.scheme.inertia else 0)
     value = eigsh(K.tocsc(), k=1, M=diags(mass).tocsc(), sigma=0, which="LM", return_eigenvectors=False)[0]
     return float(np.sqrt(value) / (2 * np.pi))
 
@@ -118,7 +118,7 @@ def cantilever(size: list[float], h: float, **tables: Any) -> Scene:
         "time": {"scheme": "newmark", "step": 1.0, "end": 1.0},
     }
     scene, state = make_scene(**plain | tables)
-    scene.equations.begin(1.0, 1.0, state.u, state.v, state.a)
+    scene.balance.begin(1.0, 1.0, state.u, state.v, state.a)
     return scene
 
 

@@ -4,8 +4,7 @@
         return vectors of kind "mpi" and takes the form first, as here; fem.petsc.LinearProblem and NonlinearProblem
         (unused) were rewritten; fem.Form keeps `module` and `ufcx_form` (mechanics.kernels binds kernels through them);
         mesh.create_mesh takes the element before the points; la.InsertMode stays.
-0.11    la.matrix_csr and la.vector move their `_cpp_object` behind properties; io.distribute_entity_data takes the mesh's
-        geometry layout from the mesh.
+0.11    not looked at yet.
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ class Unbreakable:
     not_finite = 0
     phase = "energies"
 
-    def __init__(self, balance: Balance, flow: Flow) -> None:
-        self._balance, self._flow = balance, flow
+    def __init__(self, balance: Balance, flow: Flow | None = None) -> None:
+        self._balance, self._flow = balance, flow or NoFlow()
 
     def __call__(self) -> PassResult:
         """The elastic energy is all there is to tell."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
@@ -33,6 +36,8 @@ LARGE_GAP = 0.01
 RESTART = 200
 # dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
 FACTORISED = 100_000
+# solves that start with factors once iterations have failed: the first time, and at most
+FIRST_SPELL, LONGEST_SPELL = 8, 256
 
 # A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
 # preconditioner is made anew anyhow, every dead cell goes.
@@ -70,6 +75,7 @@ class Solver:
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
         self._first = 0.0
+        self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
@@ -104,7 +110,25 @@ class Solver:
     # --- a solve, and what is tried where it fails ---
 
     def solve(self, guess: npt.NDArray[np.float64]) -> SolveResult:
-        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution."""
+        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution.
+
+        Where iterations fail the system is factorised. The next solves start with factors then: as many as the spell
+        says, which doubles each time that iterations fail again, and is short again once they do not.
+        """
+        if self._with_factors:
+            self._with_factors -= 1
+            result = self._attempt_directly(guess)
+            if not self._linear_failure(result):
+                return result
+        result = self._attempt_iteratively(guess)
+        if not self._linear_failure(result):
+            self._spell = FIRST_SPELL
+        elif self._may_factorise():
+            result = self._attempt_directly(guess)
+            self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+        return result
+
+    def _attempt_iteratively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         result = self._attempt(guess)
         if self._linear_failure(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
@@ -118,8 +142,6 @@ class Solver:
             self.snes.ksp.setGMRESRestart(RESTART)
             result = self._attempt(guess)
             self.snes.ksp.setType("cg")
-        if self._linear_failure(result) and self._may_factorise():
-            result = self._attempt_directly(guess)
         return result
 
     def _may_factorise(self) -> bool:
@@ -127,7 +149,12 @@ class Solver:
         return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
     def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> SolveResult:
-        """Factors instead of iterations, for a tangent that no Krylov method gets through: pieces that hang by a
+        with self._factors():
+            return self._attempt(guess)
+
+    @contextmanager
+    def _factors(self) -> Iterator[None]:
+        """Factors instead of iterations, for tangents that no Krylov method gets through: pieces that hang by a
         thread, or no compressibility. A shorter step would be no easier.
         """
         ksp = self.snes.ksp
@@ -137,13 +164,12 @@ class Solver:
         ksp.pc.setType("lu")
         ksp.pc.setFactorSolverType("mumps")
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
-        result = self._attempt(guess)
+        yield
         ksp.pc.reset()
         ksp.pc.setType(preconditioner)
         ksp.pc.setFromOptions()
         ksp.setType(kind)
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
-        return result
 
     def _linear_failure(self, result: SolveResult) -> bool:
         return not result.converged and self.snes.ksp.reason < 0
@@ -168,9 +194,10 @@ class Solver:
         0 where the linear solve fails, which is counted: near incompressibility tangents may be indefinite.
         """
         self._shrink()
-        self.balance.vector.array_w[:] = force
-        if not self._solve_linear():
-            return np.zeros_like(force)
+        with self._factors() if self._with_factors else nullcontext():
+            self.balance.vector.array_w[:] = force
+            if not self._solve_linear():
+                return np.zeros_like(force)
         result: npt.NDArray[np.float64] = self._correction.array_r.copy()
         return result
 

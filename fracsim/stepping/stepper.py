@@ -132,7 +132,11 @@ class BalanceStepper:
         self.breaking.restored()
         self._recalled()
         balance.displace(state.u)
-        return replace(state, elastic=balance.stress.stored(), memory=self._memory())
+        return replace(self.remember(state), elastic=balance.stress.stored())
+
+    def remember(self, state: State) -> State:
+        """The state with the damage and the flow that the body has now, whoever brought them about."""
+        return replace(state, memory=self._memory())
 
     # --- a step ---
 

@@ -170,12 +170,11 @@ class VirtualNodes:
     def __init__(self, run: Any, whole: Any) -> None:
         """`run` has the cuts; the motion is that of the `whole` body: nodes that a cut set loose are no part of a cell
         any more, and would turn the cells inside out that the copies are."""
-        from ...mechanics.balance import Equilibrium
         from ...mechanics.material import material_fields
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
-        from ...scene import make_scheme, make_stepper
-        from ...stepping.newton import Solver
+        from ...scene import make_stepper, scene_on
+        from ...stepping.after_step import NoFlow, Unbreakable
         from .virtual_nodes import duplicate
 
         began = time.perf_counter()
@@ -184,13 +183,11 @@ class VirtualNodes:
         domain = distribute(old.comm, self._mesh(old))
         share = self.new.share[domain.cell_input]
         material = material_fields(domain, study.material)
-        material = replace(material, density=share * material.density)
-        equations = Equilibrium(domain, study, material, make_scheme(study.time))
-        assert equations.chi is not None
-        equations.chi.x.array[: len(share)] = share
-        solver = Solver(equations, study.solver)
-        self.stepper = make_stepper(equations, solver, study.time, None)
-        self.state = self.stepper.start(None)
+        scene = scene_on(domain, study, replace(material, density=share * material.density))
+        assert scene.balance.stress.chi is not None
+        scene.balance.stress.chi.x.array[: len(share)] = share
+        self.stepper = make_stepper(scene.balance, study.time, NoFlow(), Unbreakable(scene.balance), scene.solver)
+        self.state = scene.start()
         self._take_over(whole.state, domain)
         self.unknowns = 3 * len(self.new.node)
         self.rebuild = time.perf_counter() - began
@@ -212,12 +209,12 @@ class VirtualNodes:
     def _take_over(self, state: Any, domain: Any) -> None:
         """Displacement and velocity of the old nodes for all copies of them."""
         source = self.new.node[domain.node_input]
-        self.state.u, self.state.v = (x.reshape(-1, 3)[source].ravel().copy() for x in (state.u, state.v))
-        self.state.t, self.state.step = state.t, state.step
-        self.stepper.settle(self.state)
+        u, v = (x.reshape(-1, 3)[source].ravel().copy() for x in (state.u, state.v))
+        self.state = self.stepper.settle(replace(self.state, u=u, v=v, t=state.t, step=state.step))
 
     def step(self) -> Any:
-        return self.stepper.advance(self.state)
+        self.state, report = self.stepper.advance(self.state)
+        return report
 
 
 def _facet_nodes(domain: Any, facets: Any) -> Any:

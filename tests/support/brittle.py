@@ -96,7 +96,7 @@ def scene_surface(scene: Scene) -> Split:
     assert scene.domain.source is not None
     skeleton, graph = Skeleton(scene.domain.source), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
-    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.surfaces.cut[own])
+    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut[own])
     pattern = scene.domain.gather_cells(graph.pattern)
     assert pattern is not None
     return split(skeleton, pattern, cut)

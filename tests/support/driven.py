@@ -11,14 +11,16 @@ from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence import extremes
 from fracsim.study.file import validate
 
+from .scenes import Walk
+
 
 def stepped(study: dict[str, Any], steps: int) -> tuple[Scene, Any, Any]:
     """The scene, its state and the last report after some steps (collective)."""
     study = study | {"solver": {"snes_rtol": 1e-6, "ksp_rtol": 1e-5}}
     scene = build_scene(MPI.COMM_WORLD, validate(study, "driven"))
-    state = scene.stepper.start(scene.study.initial)
+    state = Walk(scene)
     for _ in range(steps):
-        report = scene.stepper.advance(state)
+        report = state.advance()
     return scene, state, report
 
 
@@ -38,13 +40,13 @@ def nearly_incompressible(scheme: str) -> list[float]:
     scene, state, report = stepped(study, 12)
     broken = MPI.COMM_WORLD.allreduce(scene.fracture.graph.broken_count)
     gained = report.kinetic + report.elastic + state.dissipated - state.work
-    return [scene.stepper.failed, broken, report.elastic, gained / state.work]
+    return [scene.stepper.trouble.steps_failed, broken, report.elastic, gained / state.work]
 
 
 def crushed() -> list[float]:
     """(cells, smallest J, s) that are told of a block mirrored along x."""
     scene, state, _ = stepped(extremes.block(-1.0, steps=1, confined=True), 1)
-    watch = Inverted(scene.equations)
+    watch = Inverted(scene.balance.stress)
     watch.look(state.t)
     return [watch.count, watch.least, watch.since]
 
@@ -52,7 +54,7 @@ def crushed() -> list[float]:
 def flown() -> list[float]:
     """(attempts that failed, kinetic energy in J) of a fast body in short steps."""
     scene, _, report = stepped(extremes.flying(1e3, 1e-6), 20)
-    return [scene.stepper.failed, report.kinetic]
+    return [scene.stepper.trouble.steps_failed, report.kinetic]
 
 
 if __name__ == "__main__":

@@ -48,14 +48,14 @@ def lumped_mass(nodes: Values, cells: npt.NDArray[np.integer], density: float) -
 
 def dense_tangent(scene: Scene) -> Values:
     """The assembled tangent at the present displacement, without inertia, as a dense matrix (serial)."""
-    equations = scene.equations
-    x = equations.residual.duplicate()
-    x.array_w[:] = equations.u.x.array
-    equations.assemble_tangent(None, x, equations.tangent, equations.tangent)
-    matrix = equations.tangent.copy()
+    balance = scene.balance
+    x = balance.vector.duplicate()
+    x.array_w[:] = balance.u.x.array
+    balance.assemble_tangent(balance.tangent)
+    matrix = balance.tangent.copy()
     dense = matrix.convert(PETSc.Mat.Type.DENSE).getDenseArray().copy()
     x.destroy()
-    return dense - (equations.c_a * np.diag(equations.mass) if equations.scheme.inertia else 0.0)
+    return dense - (balance.c_a * np.diag(balance.mass.lumped) if balance.scheme.inertia else 0.0)
 
 
 def modes(K: Values, mass: Values, free: npt.NDArray[np.bool_]) -> tuple[Values, Values]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -12,8 +13,8 @@ from mpi4py import MPI
 
 from fracsim.meshes.data import MeshData
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping.implicit import Report
 from fracsim.stepping.state import State
+from fracsim.stepping.stepper import StepReport
 from fracsim.study import Study
 
 Values = npt.NDArray[np.float64]
@@ -34,20 +35,52 @@ def make_study(**tables: Any) -> Study:
     return Study.model_validate(plain | tables)
 
 
-def make_scene(**tables: Any) -> tuple[Scene, State]:
-    """A scene on every rank of the world, and its state at t = 0."""
-    study = make_study(**tables)
-    scene = build_scene(MPI.COMM_WORLD, study)
-    return scene, scene.stepper.start(study.initial)
+class Walk:
+    """A scene on its way: the state of the moment, whose attributes it has, and the steps.
+
+    Setting an attribute changes the state: `walk.v = ...`.
+    """
+
+    state: State
+
+    def __init__(self, scene: Scene) -> None:
+        vars(self).update(scene=scene, state=scene.start())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(vars(self)["state"], name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        vars(self)["state"] = value if name == "state" else replace(self.state, **{name: value})
+
+    def advance(self) -> StepReport:
+        """Take a step."""
+        self.state, report = vars(self)["scene"].stepper.advance(self.state)
+        return report
+
+    def remember(self) -> None:
+        """The body was damaged by hand: go on from there."""
+        scene = vars(self)["scene"]
+        scene.fracture.changed()
+        self.state = scene.stepper.remember(self.state)
+
+    def settle(self) -> None:
+        """Forces and accelerations that belong to the displacement and the velocity."""
+        self.state = vars(self)["scene"].stepper.settle(self.state)
 
 
-def each_step(scene: Scene, state: State) -> Iterator[Report]:
+def make_scene(**tables: Any) -> tuple[Scene, Walk]:
+    """A scene on every rank of the world, at t = 0."""
+    scene = build_scene(MPI.COMM_WORLD, make_study(**tables))
+    return scene, Walk(scene)
+
+
+def each_step(scene: Scene, state: Walk) -> Iterator[StepReport]:
     """Advance to the end of the study; `state` can be looked at after each step."""
     while state.t < scene.study.time.end * (1 - 1e-12):
-        yield scene.stepper.advance(state)
+        yield state.advance()
 
 
-def march(scene: Scene, state: State, steps: int | None = None) -> list[Report]:
+def march(scene: Scene, state: Walk, steps: int | None = None) -> list[StepReport]:
     """Advance to the end of the study, or by a number of steps."""
     return list(islice(each_step(scene, state), steps))
 
@@ -63,7 +96,7 @@ def positions(scene: Scene) -> Values:
     return scene.domain.nodes[: scene.domain.node_count]
 
 
-def displacement(scene: Scene, state: State) -> Values:
+def displacement(scene: Scene, state: Walk | State) -> Values:
     """(nodes, d) displacement of the owned nodes."""
     return state.u.reshape(-1, scene.domain.dim)
 
@@ -76,7 +109,7 @@ def cell_corners(scene: Scene) -> Values:
 def deform(scene: Scene, F: Values) -> None:
     """Give the body the homogeneous displacement u = (F - I) X."""
     X = positions(scene)
-    scene.equations.displace((X @ (F - np.eye(len(F))).T).reshape(-1))
+    scene.balance.displace((X @ (F - np.eye(len(F))).T).reshape(-1))
 
 
 def at_nodes(points: Values, values: Values) -> list[dict[str, Any]]:

@@ -24,7 +24,7 @@ def run(name: str, folder: Path) -> Found:
     scene, state = make_scene(**{"solver": TIGHT} | RUNS[name])
     domain, graph = scene.domain, scene.fracture.graph
     record = EdgeRecord(graph)
-    output = SurfaceOutput(folder, domain, scene.equations.material.density, record)
+    output = SurfaceOutput(folder, domain, scene.balance.stress.material.density, record)
     output.write(state, [])
     for number, report in enumerate(each_step(scene, state), start=1):
         if report.broken:

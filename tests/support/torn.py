@@ -103,7 +103,7 @@ def pieces(label: str) -> Found:
     count = graph.break_edges(ends[:, 0] != ends[:, 1])
     bodies = find_pieces(graph)
     d = domain.dim
-    masses = bodies.totals(domain, scene.equations.mass[::d])
+    masses = bodies.totals(domain, scene.balance.mass.lumped[::d])
     return {
         f"pieces-{label}": np.array([bodies.count, count]),
         f"piece-{label}": domain.gather_nodes(bodies.of_node[: domain.node_count]),
@@ -134,36 +134,36 @@ def edges(domain: Domain) -> Found:
 
 def weaken(scene: Scene) -> None:
     """Give the cells a chi that follows from their place in the input: 0 in one of three, anything in the others."""
-    domain, chi = scene.domain, scene.equations.chi
+    domain, chi = scene.domain, scene.balance.stress.chi
     assert chi is not None
     chi.x.array[: domain.cell_count] = np.where(domain.cell_input % 3, np.cos(domain.cell_input) ** 2, 0.0)
 
 
 def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
     """Owned cells that the residual is assembled over."""
-    return np.array(scene.equations._residual._cpp_object.domains(IntegralType.cell, 1))
+    return np.array(scene.balance._work._cpp_object.domains(IntegralType.cell, 1))
 
 
 def dead_cells() -> Found:
     """Residual and tangent of the damped block with its dead cells, without, and without their entries, and how many
     cells those are."""
     scene, state = make_scene(**RUNS["block"])
-    domain, equations = scene.domain, scene.equations
-    equations.begin(0.05, 0.05, state.u, state.v, state.a)
-    equations.displace(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
+    domain, balance = scene.domain, scene.balance
+    balance.begin(0.05, 0.05, state.u, state.v, state.a)
+    balance.displace(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
     weaken(scene)
-    x, y = equations.residual.duplicate(), equations.residual.duplicate()
+    x, y = balance.vector.duplicate(), balance.vector.duplicate()
     x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
     found: Found = {}
     for name in ("with", "without", "fitted-without"):
         if name.startswith("fitted"):
-            assert equations.fit_tangent(0.7)
-        equations.assemble_tangent(None, x, equations.tangent, equations.tangent)
-        equations.tangent.mult(x, y)
+            assert balance.shrink_tangent(0.7)
+        balance.assemble_tangent(balance.tangent)
+        balance.tangent.mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
-        found[f"residual-{name}-dead"] = domain.gather_nodes(equations.forces_in_balance().reshape(-1, domain.dim))
+        found[f"residual-{name}-dead"] = domain.gather_nodes(balance.forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
-        equations.leave_out_dead_cells()
+        balance.damage_changed()
     return found
 
 
@@ -173,11 +173,11 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
     found[f"{name}-u"] = domain.gather_nodes(state.u.reshape(-1, domain.dim))
     found[f"{name}-v"] = domain.gather_nodes(state.v.reshape(-1, domain.dim))
     found[f"{name}-energy"] = np.array([state.work, state.dissipated])
-    found[f"{name}-mass"] = domain.gather_nodes(scene.equations.mass.reshape(-1, domain.dim))
-    if scene.equations.material.plastic is not None:
-        found[f"{name}-plastic"] = domain.gather_cells(scene.equations.material.plastic.memory())
-    if scene.fracture is not None and scene.equations.chi is not None:
-        found[f"{name}-chi"] = domain.gather_cells(scene.equations.chi.x.array[: domain.cell_count])
+    found[f"{name}-mass"] = domain.gather_nodes(scene.balance.mass.lumped.reshape(-1, domain.dim))
+    if scene.balance.stress.material.plastic is not None:
+        found[f"{name}-plastic"] = domain.gather_cells(scene.balance.stress.material.plastic.memory())
+    if scene.fracture is not None and scene.balance.stress.chi is not None:
+        found[f"{name}-chi"] = domain.gather_cells(scene.balance.stress.chi.x.array[: domain.cell_count])
     if scene.fracture is not None:
         found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
         found[f"{name}-pieces"] = np.array([find_pieces(scene.fracture.graph).count])

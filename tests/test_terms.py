@@ -1,0 +1,127 @@
+"""The balance is a sum of terms: a new one takes a file and a line."""
+
+from __future__ import annotations
+
+import gc
+import resource
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import fracsim.scene as scene_module
+from fracsim.mechanics.kernels import CellForm
+from fracsim.scene import build_scene
+from support.oscillator import exact
+from support.scenes import DIRECT, each_step, make_scene, make_study, march
+from support.spring import Spring
+
+
+@pytest.fixture
+def springs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(scene_module.TERMS, "spring", Spring.of)
+
+
+def test_a_toy_term_moves_the_body(springs: None) -> None:
+    """A rigid block of 4 x 4 nodes with 2 N/m at each: u'' + (k n / m) u = 0, and its springs' energy is in the books.
+
+    Nothing else acts on it, and every node has the same share of mass only in the mean: the block is so stiff that it
+    moves as one.
+    """
+    w = np.sqrt(2.0 * 16 / 1.0)
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 1 / 3},
+        material={"energy": "linear", "young": 1e6, "poisson": 0.0, "density": 1.0},
+        initial={"velocity": [1.0, 0.5]},
+        time={"scheme": "newmark", "step": 0.02 / w, "end": 2 * np.pi / w},
+    )
+    start = scene.balance.kinetic_energy(state.v)
+    for report in each_step(scene, state):
+        mean = state.u.reshape(-1, 2).mean(axis=0)
+        np.testing.assert_allclose(mean, np.array([1.0, 0.5]) * exact(w, state.t, (0.0, 1.0)), atol=2e-4)
+        assert report.kinetic + report.elastic == pytest.approx(start, rel=1e-6)
+
+
+def test_a_toy_term_in_a_static_balance(springs: None) -> None:
+    """Under g each node of the block hangs at rho g / k, in the mean: the tangent knows the springs, so that Newton's
+    method needs one iteration."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 1 / 3},
+        material={"energy": "linear", "young": 1e6, "poisson": 0.0, "density": 1.0},
+        boundary=[{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "displacement": [0.0, "free"]}],
+        load={"gravity": [0.0, -10.0]},
+        time={"scheme": "backward-euler", "step": 1e3, "end": 1e3},
+    )
+    (report,) = march(scene, state)
+    assert state.u.reshape(-1, 2)[:, 1].mean() == pytest.approx(-10.0 / (2.0 * 16), rel=1e-4)
+    assert report.solve.newton == 1
+
+
+def test_no_toy_term_without_its_line() -> None:
+    """The list of terms is what a study asks for, in the order of the sum."""
+    scene, _ = make_scene(load={"gravity": [0.0, -1.0]}, damping={"mass": 1.0, "stiffness": 0.1})
+    assert [term.name for term in scene.balance.terms] == ["stress", "viscosity", "dead loads", "inertia", "drag"]
+    scene, _ = make_scene(
+        boundary=[{"on": "left", "fix": "xy"}], time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}
+    )
+    assert [term.name for term in scene.balance.terms] == ["stress"]
+
+
+def test_a_step_that_breaks_binds_its_forms_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces are compared before and after the breaks of a step, and forms bound to the living cells once, after it."""
+    bound: list[int] = []
+    leave_out = CellForm.leave_out
+    monkeypatch.setattr(CellForm, "leave_out", lambda form, dead: bound.append(1) or leave_out(form, dead))
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1, "pattern": "unstructured"},
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.0]}],
+        fracture={"strength": 0.05},
+        time={"scheme": "newmark", "step": 0.1, "end": 2.0},
+    )
+    forms, most = 4, 0  # of the stress alone, the residual, the residual at supports, the tangent
+    for report in each_step(scene, state):
+        assert len(bound) <= forms and (report.broken or not bound or scene.balance.stress.chi is not None)
+        most = max(most, len(bound))
+        bound.clear()
+    assert most == forms
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_scenes_that_are_dropped_give_their_memory_back() -> None:
+    """200 scenes built, stepped and destroyed in one process: what grows after the first hundred is no scene's."""
+
+    def once() -> None:
+        tables: dict[str, Any] = {
+            "mesh": {"builder": "box", "size": [1.0, 0.5, 0.5], "h": 0.1},
+            "boundary": [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.01, 0.0, 0.0]}],
+            "fracture": {"strength": 1.0}, "solver": {}, "time": {"scheme": "newmark", "step": 0.1, "end": 1.0},
+        }  # fmt: skip
+        scene = build_scene(MPI.COMM_SELF, make_study(**tables))
+        scene.stepper.advance(scene.start())
+        scene.destroy()
+        gc.collect()
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    once()
+    first = peak()
+    for _ in range(100):
+        once()
+    middle = peak()
+    for _ in range(100):
+        once()
+    assert peak() - middle < 2.0, (first, middle, peak())  # MiB: a scene has some 10
+
+
+def test_any_solver_options_are_forgotten() -> None:
+    """PETSc's database is as it was once a scene is destroyed."""
+    from petsc4py import PETSc
+
+    before = dict(PETSc.Options().getAll())
+    scene, state = make_scene(solver=DIRECT)
+    march(scene, state, 1)
+    scene.destroy()
+    assert dict(PETSc.Options().getAll()) == before
