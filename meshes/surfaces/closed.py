@@ -42,6 +42,21 @@ class ClosedSurface:
         """Volume of the material [m^3]."""
         return float(enclosed_volumes(self.points, self.triangles).sum())
 
+    @property
+    def area(self) -> float:
+        """Area of the whole boundary [m^2]."""
+        return float(_areas(self.points, self.triangles).sum())
+
+    @property
+    def sides(self) -> tuple[float, ...]:
+        """Sides of the bounding box [m]: (3,)."""
+        return tuple(np.ptp(self.points, axis=0).tolist())
+
+    @property
+    def extent(self) -> str:
+        """The sides in words."""
+        return " x ".join(f"{side:.4g}" for side in self.sides) + " m"
+
     def part(self, shell: int) -> tuple[Points, Indices]:
         """Points and triangles of one shell."""
         used, triangles = np.unique(self.triangles[self.shell == shell], return_inverse=True)
@@ -54,8 +69,8 @@ def enclosed_volumes(points: Points, triangles: Indices) -> Floats:
     return np.einsum("ki,ki->k", a, np.cross(b, c)) / 6
 
 
-def read_surface(path: str | Path) -> ClosedSurface:
-    """A closed surface from STL, OBJ, PLY or another format with triangles or quads.
+def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
+    """A closed surface from STL, OBJ, PLY or another format with triangles or quads; `scale`: metres per unit of it.
 
     Raises:
         MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, has
@@ -66,7 +81,7 @@ def read_surface(path: str | Path) -> ClosedSurface:
     triangles = np.concatenate([np.zeros((0, 3), np.int64), *map(_triangles, contents.blocks)])
     if len(triangles) == 0 or contents.points.shape[1] != 3:
         raise MeshError(f"Surface file '{path}' holds no triangles in space.")
-    return closed_surface(contents.points, triangles, f"Surface file '{path}'")
+    return closed_surface(scale * contents.points, triangles, f"Surface file '{path}'")
 
 
 def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
@@ -138,8 +153,7 @@ def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
 def _check_areas(points: Points, triangles: Indices, source: str) -> None:
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
-    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
-    areas = np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
+    areas = _areas(points, triangles)
     longest = np.linalg.norm(points[triangles] - points[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
     # Coordinates of single precision move a corner by up to 6e-8 of the body's size.
     flat = np.flatnonzero(areas <= 1e-7 * float(np.ptp(points, axis=0).max()) * longest / 2)
@@ -148,6 +162,11 @@ def _check_areas(points: Points, triangles: Indices, source: str) -> None:
             f"{source} has {len(flat)} triangles without an area, the first at {_place(points, triangles[flat[0]])}; "
             "remesh the surface there."
         )
+
+
+def _areas(points: Points, triangles: Indices) -> Floats:
+    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    return np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
 
 
 def _check_closed(points: Points, triangles: Indices, source: str) -> None:
