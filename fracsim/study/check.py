@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.time_functions import AXES, format_point, in_time, motion_law, of_size
+from ..mechanics.time_functions import in_time, motion_law, of_size
 from ..mesh.bodies import bodies_of, not_held
+from ..mesh.names import check_group, check_regions
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
+from ..meshes.words import AXES, format_point
 from . import MOTIONS, Box, Brittle, Plane, Study
 from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
 
@@ -102,15 +104,10 @@ def _check_groups(study: Study, anatomy: Anatomy) -> None:
     places += [(f"probe.{i}.on", probe.on) for i, probe in enumerate(study.probe) if probe.on is not None]
     for key, where in places:
         if isinstance(where, str):
-            if where not in anatomy.groups:
-                known = ", ".join(sorted(anatomy.groups)) or "none"
-                raise InputError(f'{key} = "{where}": the mesh has no such facet group; it has: {known}')
+            check_group(where, anatomy.groups, key)
         else:
             _check_place(key, where, anatomy)
-    for name in study.material.regions:
-        if name not in anatomy.regions:
-            known = ", ".join(anatomy.regions) or "none"
-            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {known}")
+    check_regions(study.material.regions, anatomy.regions)
 
 
 def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
