@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from .errors import Exit, FracsimError, InputError
+from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -19,6 +21,7 @@ Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="over
 _NONE: list[str] = []
 _NO_PATHS: list[Path] = []
 INTERRUPTED = 130  # as typer and shells report SIGINT
+_CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ESTALE)
 
 
 @app.command()
@@ -202,43 +205,48 @@ def main() -> NoReturn:
 
 
 def _guarded(work: Callable[[], Any]) -> int:
-    import click
-
     try:
         code = work()
-        if code == INTERRUPTED:
-            _say("interrupted before the first step; nothing was written")
+        if code == INTERRUPTED and _is_root():
+            print("fracsim: interrupted before the first step; nothing was written", file=sys.stderr, flush=True)
         return code if isinstance(code, int) else Exit.DONE
-    except FracsimError as error:
-        _say(str(error))
-        return int(error.exit_code)
-    except click.ClickException as error:
-        _say(f"{error.format_message().rstrip('.')}; see fracsim --help")
-        return int(Exit.BAD_INPUT)
-    except click.exceptions.Exit as error:
-        return error.exit_code
-    except Exception:
-        _abort()
-        raise
+    except (SystemExit, Exception) as error:
+        code, message = _verdict(error)
+        # what ends a run by rule may come late from rank 0, which first writes a summary and draws the last frame
+        _end_others(message, code, late=isinstance(error, NotConverged | Stopped))
+    if message and _is_root():
+        print(message, file=sys.stderr, flush=True)
+    return code
 
 
-def _say(message: str) -> None:
-    if _is_root():
-        print(f"fracsim: {message}", file=sys.stderr, flush=True)
+def _verdict(error: BaseException) -> tuple[int, str]:
+    """Exit code and message: one sentence of what a user can mend, a traceback of a fault of the program."""
+    import click
+
+    if isinstance(error, FracsimError):
+        return int(error.exit_code), f"fracsim: {error}"
+    if isinstance(error, click.ClickException):
+        return int(Exit.BAD_INPUT), f"fracsim: {error.format_message().rstrip('.')}; see fracsim --help"
+    if isinstance(error, click.exceptions.Exit):
+        return error.exit_code, ""
+    if isinstance(error, SystemExit):
+        return (error.code or 0, "") if isinstance(error.code, int | None) else (1, str(error.code))
+    if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
+        where = f" {error.filename}" if error.filename else ""
+        return int(Exit.NOT_WRITTEN), f"fracsim: cannot write{where}: {error.strerror}; make room or give another --out"
+    return 1, "".join(traceback.format_exception(error)).rstrip()
 
 
-def _abort() -> None:
-    """A fault of the program on one rank: show it and end all ranks, which would otherwise wait for it for ever."""
+def _end_others(message: str, code: int, *, late: bool) -> None:
+    """Return where every rank has failed; where some have not, they wait for this one and are ended with it."""
     if "mpi4py.MPI" not in sys.modules:
         return
     from mpi4py import MPI
 
     if MPI.COMM_WORLD.size > 1:
-        import traceback
+        from .mesh.ranks import end_unless_all_failed
 
-        traceback.print_exc()
-        sys.stderr.flush()
-        MPI.COMM_WORLD.Abort(1)
+        end_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
 
 
 __all__ = ["app", "find_study", "main"]

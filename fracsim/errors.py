@@ -12,6 +12,7 @@ class Exit(IntEnum):
     BAD_INPUT = 2
     NOT_CONVERGED = 3
     STOPPED = 4
+    NOT_WRITTEN = 5
 
 
 class FracsimError(Exception):

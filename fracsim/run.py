@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from .errors import NotConverged, Stopped
 from .mesh.bodies import bodies_of
-from .mesh.ranks import on_root, total
+from .mesh.ranks import end_unless_all_failed, on_root, total
 from .output.checkpoint import read_checkpoint, write_checkpoint
 from .output.energy_gain import Gained
 from .output.fields import Frames
@@ -139,6 +139,7 @@ class Run:
             with self._interrupt, progress:
                 self._loop(progress)
         except (NotConverged, Stopped) as error:
+            end_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
             saved = self._saved()
             self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
             raise type(error)(f"{error}. {saved}") from None

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from .components import components
 from .data import Indices, MeshData, MeshError, Points
 from .topology import Floats, Mask, distinct_rows, edges_of, facets_of, oriented, signed_measures
+from .words import middle_of
 
 SHOWN = 5  # examples in a message
 
@@ -113,7 +113,7 @@ def _check_flat(mesh: MeshData) -> None:
         measure = "volume" if mesh.dim == 3 else "area"
         raise MeshError(
             f"{len(flat)} cells have no {measure}: cell {_some(flat)}, the first near "
-            f"{_place(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
+            f"{middle_of(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
         )
 
 
@@ -142,7 +142,7 @@ def _check_cells_once(mesh: MeshData) -> None:
     if len(twice):
         raise MeshError(
             f"{len(twice)} cells have the same nodes as another cell: cell {_some(twice)}, the first near "
-            f"{_place(mesh.points, mesh.cells[twice[0]])}; remove the copies."
+            f"{middle_of(mesh.points, mesh.cells[twice[0]])}; remove the copies."
         )
 
 
@@ -167,7 +167,7 @@ def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
         distinct = distinct_rows(np.sort(facets, axis=1))[0]
         raise MeshError(
             f"{len(distinct)} facets {what}, the first with nodes {distinct[0].tolist()} near "
-            f"{_place(mesh.points, distinct[0])}; mend the mesh there."
+            f"{middle_of(mesh.points, distinct[0])}; mend the mesh there."
         )
 
 
@@ -185,7 +185,7 @@ def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> N
     if len(lost):
         raise MeshError(
             f"{len(lost)} of the {len(facets)} facets of group '{name}' are not facets of any cell, the first with "
-            f"nodes {facets[lost[0]].tolist()} near {_place(mesh.points, facets[lost[0]])}; the group and the body "
+            f"nodes {facets[lost[0]].tolist()} near {middle_of(mesh.points, facets[lost[0]])}; the group and the body "
             "were meshed apart."
         )
 
@@ -240,8 +240,8 @@ def _coincident(mesh: MeshData) -> Iterator[str]:
 
 
 def _bodies(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
-    by_nodes = _components(edges_of(mesh.cells), len(mesh.points))
-    by_facets = _components(table.pairs(mesh.dim + 1), len(mesh.cells))
+    by_nodes = components(edges_of(mesh.cells), len(mesh.points))[0]
+    by_facets = components(table.pairs(mesh.dim + 1), len(mesh.cells))[0]
     if by_nodes > 1:
         yield f"The mesh has {by_nodes} bodies that share no node; each needs its own supports."
     if by_facets > by_nodes:
@@ -250,11 +250,6 @@ def _bodies(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
             f"{by_facets - by_nodes} parts of the mesh touch the rest in {how} only, not through a facet, and turn "
             "there as on a hinge."
         )
-
-
-def _components(pairs: Indices, count: int) -> int:
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return int(connected_components(graph, directed=False, return_labels=False))
 
 
 def _regions(mesh: MeshData) -> Iterator[str]:
@@ -272,11 +267,6 @@ def _some(numbers: Iterable[int]) -> str:
     """The first few numbers, and dots where there are more."""
     listed = list(numbers)
     return ", ".join(str(int(n)) for n in listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "")
-
-
-def _place(points: Points, nodes: Indices) -> str:
-    """The middle of the nodes, as text."""
-    return "(" + ", ".join(f"{x:.4g}" for x in points[nodes].mean(axis=0)) + ") m"
 
 
 def _longest_edges(points: Points, cells: Indices) -> Floats:

@@ -61,12 +61,12 @@ def require(condition: bool, message: str) -> None:
         raise MeshError(message)
 
 
-def affordable(builder: str, h: float, cells: float) -> None:
-    """Raise MeshError where the mesh would be too large to hold."""
+def affordable(builder: str, h: float, cells: float, hint: str = "Lengths are in metres.") -> None:
+    """Raise MeshError where the mesh would be too large to hold; `hint` ends the message."""
     if cells > MOST_CELLS:
         raise MeshError(
-            f"{builder}: h = {h!r} m would make about {cells:.1e} cells, more than {MOST_CELLS:.0e}; take a larger h "
-            "(lengths are in metres)."
+            f"{builder}: h = {h!r} m would make about {cells:.1e} cells, more than {MOST_CELLS:.0e}; take a larger h. "
+            f"{hint}"
         )
 
 

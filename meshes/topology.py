@@ -13,7 +13,7 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 
-def signed_measures(points: Points, cells: Indices) -> Floats:
+def signed_measures(points: Points, cells: npt.NDArray[np.integer]) -> Floats:
     """Signed area [m^2] or volume [m^3] of each cell, positive where its nodes are positively ordered: (m,).
 
     det(x_1 - x_0, ..., x_d - x_0) / d!
@@ -87,14 +87,6 @@ def facets_except(facets: Indices, *others: Indices) -> Indices:
     rows = np.sort(np.concatenate([facets, *others]), axis=1)
     _, _, inverse = distinct_rows(rows)
     return facets[~np.isin(inverse[: len(facets)], inverse[len(facets) :])]
-
-
-def facet_measures(points: Points, facets: Indices) -> Floats:
-    """Length [m] of each edge (d = 2) or area [m^2] of each triangle (d = 3): (k,)."""
-    corners = points[facets]
-    spans = corners[:, 1:] - corners[:, :1]
-    gram = np.einsum("kid,kjd->kij", spans, spans)
-    return np.sqrt(np.linalg.det(gram)) / factorial(points.shape[1] - 1)
 
 
 def plane_groups(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:

@@ -11,10 +11,13 @@ import meshio
 import pytest
 
 import fracsim as package
-from cases import BAR, STRIP, fracsim, mpirun, study, write_study
+from cases import BAR, STRIP, changed, fracsim, mpirun, study, write_study
 from fracsim import cli
 from fracsim.errors import Exit
+from fracsim.meshes.topology import boundary_facets
 from fracsim.study.check import check_study
+from fracsim.study.file import validate
+from fracsim.study.mesh_source import build_mesh
 
 HEAVY = ("dolfinx", "gmsh", "petsc4py", "mpi4py", "pyvista", "meshio", "ufl", "basix", "h5py", "matplotlib")
 
@@ -52,6 +55,27 @@ def test_check_tells_what_is_built_and_what_is_not() -> None:
     assert "damping     off" in lines
     assert "time        generalized-alpha, 3 steps of 0.01 s, halved where a step fails" in lines
     assert "probes      grip (reaction)" in lines
+
+
+def test_check_tells_the_size_of_a_builders_body() -> None:
+    """No volume: builders are not built."""
+    lines = check_study(study(BAR, mesh={"size": [0.4, 0.2, 0.1], "origin": [1.0, 0.0, 0.0]}))
+    assert lines[1] == "size        0.4 x 0.2 x 0.1 m, from (1, 0, 0) to (1.4, 0.2, 0.1)"
+
+
+@pytest.mark.parametrize("source", ["file", "surface"])
+def test_check_tells_the_size_of_a_file_in_its_own_unit(tmp_path: Path, source: str) -> None:
+    """A bar of 400 x 200 x 100 mm: sides and places in metres, for its boundary as well; a surface is not filled."""
+    points = build_mesh(study(BAR, mesh={"size": [400.0, 200.0, 100.0], "h": 50.0}).mesh)
+    cells = [("tetra", points.cells)] if source == "file" else [("triangle", boundary_facets(points.cells))]
+    path = tmp_path / "bar.vtu"
+    meshio.Mesh(points.points, cells).write(path)
+    held = [{"on": {"box": [[0.0, 0.0, 0.0], [0.0, 0.2, 0.1]]}, "fix": "xyz"}]
+    mesh = {source: str(path), "scale": 1e-3} | ({"h": 0.05} if source == "surface" else {})
+    lines = check_study(validate(changed(BAR, boundary=held, probe=[]) | {"mesh": mesh}, "test.toml"))
+    assert lines[1] == "size        0.4 x 0.2 x 0.1 m, from (0, 0, 0) to (0.4, 0.2, 0.1); volume 0.008 m^3"
+    count = f"{len(points.cells):,} cells" if source == "file" else "about 696 cells"  # 0.008 / (0.092 * 0.05^3)
+    assert count in lines[0]
 
 
 def test_check_tells_of_fracture() -> None:

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
+from fracsim.meshes.components import components
 from support.scenes import make_scene
 
 DIMS = (2, 3)
@@ -117,3 +118,13 @@ def test_keys_name_edges(graph: EdgeGraph) -> None:
     assert keys is not None
     assert np.array_equal(graph.flags_of_keys(keys), graph.broken)
     assert np.all(keys[:, 0] < keys[:, 1])
+
+
+def test_components_are_numbered_by_their_lowest_node() -> None:
+    """Pieces keep their numbers by this; single nodes are parts as well."""
+    links = np.random.default_rng(3).integers(0, 400, (300, 2))
+    count, part = components(links, 400)
+    first = np.unique(part, return_index=True)[1]
+    assert count == len(first) > 100
+    assert np.all(np.diff(first) > 0)
+    assert np.array_equal(part[links[:, 0]], part[links[:, 1]])

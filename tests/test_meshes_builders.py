@@ -8,15 +8,17 @@ from subprocess import run
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.builders.figure import BLEND, RoundCone
 from fracsim.meshes.builders.vase import CONTROL
 from fracsim.meshes.check import check_mesh
+from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.surfaces.level_set import level_surface
-from fracsim.meshes.topology import boundary_facets, distinct_rows, facet_measures, facets_of, signed_measures
+from fracsim.meshes.topology import boundary_facets, distinct_rows, facets_of, signed_measures
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("box", {"size": (1.0, 2.0), "h": 0.2}),
@@ -54,6 +56,15 @@ def built(request: pytest.FixtureRequest) -> tuple[Any, MeshData]:
     name, parameters = request.param
     builder: Any = BUILDERS[name](**parameters)
     return builder, builder.build()
+
+
+def facet_measures(points: Points, facets: Indices) -> npt.NDArray[np.float64]:
+    """Lengths of edges (2D), or areas of triangles by Heron's formula."""
+    sides = np.linalg.norm(points[facets] - points[np.roll(facets, 1, axis=1)], axis=2)
+    if facets.shape[1] == 2:
+        return sides[:, 0]
+    half = sides.sum(axis=1) / 2
+    return np.sqrt(half * np.prod(half[:, None] - sides, axis=1))
 
 
 def volume(mesh: MeshData) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from math import pi
 from pathlib import Path
 
@@ -12,8 +14,9 @@ import pytest
 from fracsim.meshes import BUILDERS, MeshError
 from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.surfaces.closed import closed_surface
-from fracsim.meshes.surfaces.fill import fill_surface
+from fracsim.meshes.surfaces.closed import closed_surface, read_surface
+from fracsim.meshes.surfaces.fill import expected_cells, fill_closed, fill_surface
+from fracsim.meshes.timed import within
 from fracsim.meshes.topology import boundary_facets, signed_measures
 
 Shell = tuple[Points, Indices]
@@ -201,6 +204,59 @@ def test_surface_that_cuts_itself_is_refused(tmp_path: Path) -> None:
 def test_bodies_that_cut_each_other_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"cross.stl' has parts that cut each other, near"):
         fill_surface(save(tmp_path / "cross.stl", cube(), cube(at=0.4)), h=0.3)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+@pytest.mark.parametrize(("name", "shell", "h"), [("cube", cube(), 0.2), ("torus", torus(), 0.1)])
+def test_the_unit_of_length_does_not_matter(tmp_path: Path, name: str, shell: Shell, h: float, unit: float) -> None:
+    """A body and its h in another unit: the same cells, the same nodes to the last digits."""
+    expected = fill_surface(save(tmp_path / f"{name}.vtk", shell), h)
+    mesh = fill_surface(save(tmp_path / f"{name}-large.vtk", (shell[0] * unit, shell[1])), h * unit)
+    assert np.array_equal(mesh.cells, expected.cells)
+    np.testing.assert_allclose(mesh.points, expected.points * unit, rtol=0, atol=1e-11 * unit)
+
+
+def test_size_above_a_metre(tmp_path: Path) -> None:
+    mesh = fill_surface(save(tmp_path / "cube.stl", cube(20.0)), 4.0)
+    assert mesh_quality(mesh)["edge_median"] == pytest.approx(4.0, rel=0.1)
+
+
+def test_scale_of_the_file(tmp_path: Path) -> None:
+    millimetres = save(tmp_path / "cube.vtk", cube(20.0))
+    mesh = fill_surface(millimetres, 0.005, scale=1e-3)
+    assert np.ptp(mesh.points, axis=0) == pytest.approx([0.02] * 3, rel=1e-12)
+    with pytest.raises(MeshError, match=r"h = 0.005 m would make about .* measures 20 x 20 x 20 m: .* scale = 1e-3"):
+        fill_surface(millimetres, 0.005)
+    with pytest.raises(MeshError, match=r"h = 0.5 m is larger than the whole body. The body measures 0.02 x 0.02"):
+        fill_surface(millimetres, 0.5, scale=1e-3)
+
+
+def test_gmsh_is_stopped_where_it_takes_too_long(tmp_path: Path) -> None:
+    """A million cells and more in a second: gmsh is at work within its library when its time is up."""
+    began = time.monotonic()
+    with pytest.raises(MeshError, match=r"gmsh had not filled it within 1 s \(about 1,.* cells of h = 0.02 m in"):
+        fill_surface(save(tmp_path / "cube.stl", cube()), 0.02, time_limit=1)
+    assert time.monotonic() - began < 30
+
+
+@pytest.mark.parametrize(
+    ("shell", "h"), [(cube(), 0.1), (torus(), 0.05), (skin("vase", h=0.008, wall=0.004), 0.008)], ids=str
+)
+def test_cells_are_expected_within_a_factor(tmp_path: Path, shell: Shell, h: float) -> None:
+    """Solid bodies and a shell whose wall has room for one cell."""
+    surface = read_surface(save(tmp_path / "body.stl", shell))
+    assert expected_cells(surface, h) == pytest.approx(len(fill_closed(surface, h, "S").cells), rel=0.5)
+
+
+def test_work_in_a_process_of_its_own() -> None:
+    """Results and exceptions come back; what takes too long or dies is told."""
+    assert within(20, divmod, 7, 2) == (3, 1)
+    with pytest.raises(ZeroDivisionError):
+        within(20, divmod, 7, 0)
+    with pytest.raises(TimeoutError):
+        within(0.5, time.sleep, 60)
+    with pytest.raises(MeshError, match="signal 6"):
+        within(20, os.abort)
 
 
 def test_size_must_be_sensible(tmp_path: Path) -> None:

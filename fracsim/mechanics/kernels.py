@@ -19,6 +19,7 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from ..mesh.domain import Domain
+from ..mesh.ranks import raise_together
 
 _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
@@ -47,7 +48,7 @@ PATIENCE = 60  # s that a process waits for a kernel that another one compiles; 
 
 def compile_form(form: ufl.Form) -> fem.Form:
     """Compile a UFL form (collective)."""
-    return persistently(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
+    return compile_together(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
 
 
 class CellForm(fem.Form):
@@ -84,18 +85,26 @@ def cells_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) ->
     return ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, every)])(1)
 
 
-def persistently[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
+def compile_together[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
     """Compile; where an earlier process was killed while it compiled the same kernel, clear that away and do it again.
 
-    FFCx takes what such a process left for a compilation that is still under way (collective).
+    FFCx takes what such a process left for a compilation that is still under way. A failure on one rank is raised on
+    all (collective).
     """
+    kernel, failure = _attempt(compile_kernel)
+    timed_out = comm.allreduce("JIT compilation timed out" in str(failure), op=MPI.LOR)
+    if timed_out and comm.allreduce(_clear_abandoned(), op=MPI.LOR):
+        kernel, failure = _attempt(compile_kernel)
+    raise_together(comm, failure)
+    assert kernel is not None
+    return kernel
+
+
+def _attempt[Kernel](compile_kernel: Callable[[], Kernel]) -> tuple[Kernel | None, Exception | None]:
     try:
-        return compile_kernel()
-    except (RuntimeError, TimeoutError) as error:
-        mended = comm.bcast("JIT compilation timed out" in str(error) and _clear_abandoned())
-        if not mended:
-            raise
-        return compile_kernel()
+        return compile_kernel(), None
+    except Exception as error:  # the compiler's, the linker's, the file system's
+        return None, error
 
 
 def _clear_abandoned() -> bool:
@@ -117,7 +126,7 @@ class CellExpression:
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
-        self._compiled = persistently(
+        self._compiled = compile_together(
             comm,
             lambda: fem.Expression(expression, _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()),
         )

@@ -64,14 +64,14 @@ class DeadLoads(Term):
         domain, d = assembler.domain, assembler.domain.dim
         self._assembler, self._moving = assembler, _Moving(domain)
         w, dx = ufl.TestFunction(domain.space), ufl.dx(domain=domain.mesh)
-        of_volume = []
+        facets, of_volume = [each for each, _ in tractions], []
         if gravity is not None:
             of_volume.append(gravity[0] * self._moving.constant(gravity[1], d))
         if body_force is not None:
             of_volume.append(self._moving.constant(body_force, d))
         parts = [
             traction_work(self._moving.constant(traction, d), w, ds)
-            for (_, traction), ds in zip(tractions, surface_measures(domain, tractions), strict=True)
+            for (_, traction), ds in zip(tractions, surface_measures(domain, facets), strict=True)
         ]
         if of_volume:
             parts.append(ufl.inner(sum(of_volume[1:], of_volume[0]), w) * dx)
@@ -105,14 +105,16 @@ class Pressure(Term):
         domain = assembler.domain
         self._assembler, self._u, self.symmetric = assembler, u, linear
         self._moving = _Moving(domain)
-        normal = ufl.FacetNormal(domain.mesh)
-        w = ufl.TestFunction(domain.space)
         works = [
             (self._moving.constant(function, 1), ds)
-            for (_, function), ds in zip(parts, surface_measures(domain, parts), strict=True)
+            for (_, function), ds in zip(parts, surface_measures(domain, [each for each, _ in parts]), strict=True)
         ]
-        self._work = lambda w: -sum(pressure_work(p, u, w, normal, ds, linear=linear) for p, ds in works)
-        self._form = compile_form(self._work(w))
+        self._works, self._normal = works, ufl.FacetNormal(domain.mesh)
+        self._form = compile_form(self._work(ufl.TestFunction(domain.space)))
+
+    def _work(self, w: Any) -> ufl.Form:
+        linear = self.symmetric
+        return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
 
     def begin(self, level: Level) -> None:
         """The pressures at the time of the balance."""
@@ -131,12 +133,12 @@ class Pressure(Term):
         return -self._assembler(self._form)
 
 
-def surface_measures(domain: Domain, parts: Sequence[OnFacets]) -> list[ufl.Measure]:
-    """A surface measure for the exterior facets of each part; parts may overlap."""
+def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:
+    """A surface measure for each set of local exterior facets; they may overlap."""
     kind, topology = fem.IntegralType.exterior_facet, domain.mesh.topology
     entities = [
         (number, fem.compute_integration_domains(kind, topology, facets, domain.dim - 1))
-        for number, (facets, _) in enumerate(parts)
+        for number, facets in enumerate(parts)
     ]
     ds = ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
     return [ds(number) for number in range(len(parts))]

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from ..errors import InputError
 from ..forms.energies import ENERGIES, Energy, lame, plane_stress_lambda
 from ..mesh.domain import Domain
+from ..mesh.names import check_regions
 from ..study import Material, Region
 
 PerCell = npt.NDArray[np.float64] | float
@@ -31,7 +31,7 @@ class MaterialFields:
 
 def material_fields(domain: Domain, material: Material) -> MaterialFields:
     """Coefficients of [material] with its regions. InputError where a region does not exist in the mesh."""
-    check_regions(material, domain.region_names)
+    check_regions(material.regions, domain.region_names)
     young, poisson, density = (per_cell(domain, material, key) for key in ("young", "poisson", "density"))
     mu, lmbda = lame(young, poisson)  # type: ignore[arg-type]
     options = {}
@@ -40,14 +40,6 @@ def material_fields(domain: Domain, material: Material) -> MaterialFields:
         options = {"reduced": True}
     energy = ENERGIES[material.energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
     return MaterialFields(energy, density, young, mu, lmbda)
-
-
-def check_regions(material: Material, known: list[str]) -> None:
-    """InputError for a [material.NAME] that the mesh does not have."""
-    for name in material.regions:
-        if name not in known:
-            regions = ", ".join(known) or "none"
-            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {regions}")
 
 
 def per_cell(domain: Domain, source: Any, key: str, regions: dict[str, Region] | None = None) -> PerCell:

@@ -47,7 +47,7 @@ class PrescribedMotion:
     def _condition(self) -> fem.DirichletBC:
         # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
         pair: list[Ints] = [self.dofs, self.dofs]
-        return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type, type-var]
+        return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type]
 
     def at(self, t: float) -> Values:
         """Displacement in m of each of `dofs` at time t."""

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..mesh.domain import Domain
 from ..mesh.small_matrices import polar_rotation
 from .kernels import CellExpression
-
-Tensors = npt.NDArray[np.float64]
 
 
 class RotationField:

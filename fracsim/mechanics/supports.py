@@ -10,8 +10,8 @@ from ..mesh.bodies import bodies_of, free_motion, not_held
 from ..mesh.domain import Domain
 from ..mesh.ranks import on_root
 from ..meshes.data import MeshData
+from ..meshes.words import middle_of
 from .prescribed_motion import PrescribedMotion
-from .time_functions import format_point
 
 
 def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
@@ -29,9 +29,6 @@ def _check(mesh: MeshData | None, held: npt.NDArray[np.bool_] | None) -> None:
         nodes = body == number
         free = free_motion(mesh.points[nodes], held[nodes])
         if free:
-            where = f"the body around {format_point(mesh.points[nodes].mean(axis=0))} m"
+            where = f"the body around {middle_of(mesh.points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"
             raise InputError(not_held(which, free))
-
-
-__all__ = ["bodies_of", "check_supports", "free_motion"]

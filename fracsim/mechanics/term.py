@@ -18,7 +18,7 @@ import ufl
 from petsc4py import PETSc
 
 Values = npt.NDArray[np.float64]
-Form = ufl.Form | int  # 0: none
+type Form = ufl.Form | int  # 0: none
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
+from ..meshes.words import AXES
 from ..study import Boundary, TimeTable
 
 Values = npt.NDArray[np.float64]
 TimeFunction = Callable[[float], Values]
-AXES = "xyz"
 
 
 def in_time(value: Any, key: str, size: int) -> TimeFunction:
@@ -31,11 +31,6 @@ def of_size(values: list[Any], size: int, key: str) -> Values:
     if len(values) != size:
         raise InputError(f"{key} = {values}: this mesh needs {size} number{'s'[: size != 1]}")
     return np.array([np.nan if value == "free" else float(value) for value in values])
-
-
-def format_point(point: Iterable[float]) -> str:
-    """A point for a message: "(0, 0.5, 1)"."""
-    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def integral_in_time(value: Any, key: str, size: int) -> TimeFunction:

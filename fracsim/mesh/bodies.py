@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
-from ..mechanics.time_functions import AXES
+from ..meshes.components import components
 from ..meshes.data import MeshData
+from ..meshes.words import AXES
 
 Values = npt.NDArray[np.float64]
 
@@ -16,9 +15,7 @@ Values = npt.NDArray[np.float64]
 def bodies_of(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
     """How many bodies share no node, and the body of each node."""
     first = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
-    links = (np.ones(len(first), np.int8), (first, mesh.cells[:, 1:].reshape(-1)))
-    count, label = connected_components(csr_matrix(links, shape=(len(mesh.points),) * 2), directed=False)
-    return int(count), label.astype(np.int64)
+    return components(np.stack([first, mesh.cells[:, 1:].reshape(-1)], axis=1), len(mesh.points))
 
 
 def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:

@@ -15,7 +15,10 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..meshes.data import MeshData
+from ..meshes.topology import signed_measures
+from ..meshes.words import format_point
 from ..study import Box, Plane
+from .names import check_group
 from .ranks import Gather, total
 
 Ints = npt.NDArray[np.int32]
@@ -124,9 +127,7 @@ class Domain:
     @cached_property
     def volumes(self) -> npt.NDArray[np.float64]:
         """Volume (area in 2D) of each owned cell in the reference configuration, m^d."""
-        corner = self.nodes[self.cell_nodes]
-        edges = corner[:, 1:] - corner[:, :1]
-        return np.abs(np.linalg.det(edges)) / (2.0 if self.dim == 2 else 6.0)
+        return np.abs(signed_measures(self.nodes, self.cell_nodes))
 
     @cached_property
     def mean_edge(self) -> float:
@@ -153,9 +154,7 @@ class Domain:
 
     def group(self, name: str, key: str) -> Ints:
         """Facets of a named group; InputError lists the groups that exist."""
-        if name not in self.facets:
-            known = ", ".join(sorted(self.facets)) or "none"
-            raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {known}')
+        check_group(name, self.facets, key)
         return self.facets[name]
 
     def _group_nodes(self, name: str, key: str) -> Ints:
@@ -215,10 +214,6 @@ def describe(where: str | Box | Plane) -> str:
     if isinstance(where, Box):
         return f"box {where.box[0]} to {where.box[1]}"
     return f"plane through {where.point} with normal {where.normal}"
-
-
-def format_point(point: npt.NDArray[np.float64]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:

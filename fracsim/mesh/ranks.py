@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -9,34 +12,82 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..errors import FracsimError
+PATIENCE = 5.0  # s that a rank which failed waits for the others to say that they failed as well
+_FAILED = 7919  # tag of that message
 
 
 def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
-    """Run `work` on rank 0 and return its result there, None elsewhere; a FracsimError is raised on every rank."""
+    """Run `work` on rank 0 and return its result there, None elsewhere; what it raises is raised on every rank."""
     result, failure = None, None
     if comm.rank == 0:
         try:
             result = work()
-        except FracsimError as error:
+        except (SystemExit, Exception) as error:
             failure = error
-    failure = comm.bcast(failure)
+    told = comm.bcast(_sendable(failure))
     if failure is not None:
         raise failure
+    if told is not None:
+        raise told
     return result
 
 
 def from_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T:
-    """Run `work` on rank 0 and give its result to every rank; a FracsimError is raised on every rank."""
+    """Run `work` on rank 0 and give its result to every rank; what it raises is raised on every rank."""
     result: T = comm.bcast(on_root(comm, work))
     return result
 
 
-def agree(comm: MPI.Comm, problem: FracsimError | None) -> None:
-    """Raise the problem of the lowest rank that has one, on every rank."""
-    found = [each for each in comm.allgather(problem) if each is not None]
-    if found:
-        raise found[0]
+def _sendable(failure: BaseException | None) -> BaseException | None:
+    """The exception, or where it cannot be pickled one that says the same."""
+    try:
+        pickle.loads(pickle.dumps(failure))
+    except Exception:
+        return RuntimeError(f"{type(failure).__name__}: {failure}")
+    return failure
+
+
+def raise_together(comm: MPI.Comm, failure: Exception | None) -> None:
+    """Raise on every rank where one has failed: its own exception, or that of the lowest rank (collective)."""
+    failures = [each for each in comm.allgather(_sendable(failure)) if each is not None]
+    if failure is not None:
+        raise failure
+    if failures:
+        raise failures[0]
+
+
+def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
+    """The ranks that have failed within `patience` seconds, this one among them: each calls this.
+
+    Called where something was raised, perhaps here alone: all others may be waiting in a collective operation, so that
+    none can be used, but messages from rank to rank pass beside it.
+    """
+    others = [rank for rank in range(comm.size) if rank != comm.rank]
+    sent = [comm.isend(None, rank, _FAILED) for rank in others]
+    failed, deadline = {comm.rank}, time.monotonic() + patience
+    while len(failed) < comm.size and time.monotonic() < deadline:
+        for rank in others:
+            if rank not in failed and comm.iprobe(rank, _FAILED):
+                comm.recv(source=rank, tag=_FAILED)
+                failed.add(rank)
+        time.sleep(0.005)
+    if len(failed) == comm.size:
+        MPI.Request.waitall(sent)
+    return failed
+
+
+def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late: bool = False) -> None:
+    """Return where every rank has failed; otherwise print the message once and end all ranks with the exit code.
+
+    `late`: what rank 0 does before it fails may take a while, such as drawing a picture.
+    """
+    failed = who_failed(comm, 12 * PATIENCE if late else PATIENCE)
+    if len(failed) == comm.size:
+        return
+    if comm.rank > min(failed):
+        time.sleep(PATIENCE)  # a lower rank says why, and ends this one
+    print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
+    comm.Abort(code or 1)
 
 
 def total(comm: MPI.Comm, values: Any) -> npt.NDArray[Any]:

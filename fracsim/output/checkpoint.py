@@ -111,7 +111,8 @@ def read_checkpoint(
         stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
         plastic.recall(scattered(domain.gather_cells, "plastic"))
-    return replace(state, **{name: clock[name] for name in _CLOCK}, **nodal)
+    read: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
+    return replace(state, **read)
 
 
 def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:

@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
-from ..mechanics.time_functions import AXES, of_size
+from ..mechanics.time_functions import of_size
 from ..mesh.domain import Domain, Ints
 from ..mesh.ranks import total
+from ..meshes.words import AXES
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
 from ..study import Probe

@@ -133,7 +133,7 @@ def _read_history(path: Path) -> dict[str, Values]:
 
 def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
     """How far the groups are driven whose reaction is recorded, m: against it a reaction is usually plotted."""
-    from ..mechanics.time_functions import motion_law
+    from ..mechanics.time_functions import motion_function
     from ..study.file import load_study
 
     motions: dict[str, Values] = {}
@@ -145,7 +145,7 @@ def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
         axes = [axis for axis in "xyz" if f"reaction_{probe.name}_{axis}" in history]
         for i, entry in enumerate(study.boundary):
             if axes and entry.on == probe.on and entry.kind in ("displacement", "velocity"):
-                law, held = motion_law(entry, len(axes), f"boundary.{i}")
+                law, held = motion_function(entry, len(axes), f"boundary.{i}")
                 path = np.array([law(t) for t in history["time"]]).reshape(-1, len(axes))
                 chosen = [k for k in range(len(axes)) if held[k] and np.any(path[:, k])]
                 motions |= {f"motion_{probe.name}_{axes[k]}": path[:, k] for k in chosen}

@@ -8,15 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.time_functions import AXES, format_point, in_time, motion_function, of_size
+from ..mechanics.time_functions import in_time, motion_function, of_size
 from ..mesh.bodies import bodies_of, not_held
+from ..mesh.names import check_group, check_regions
 from ..meshes.data import MeshData
+from ..meshes.topology import signed_measures
+from ..meshes.words import AXES, format_point
 from . import MOTIONS, Box, Brittle, Plane, Study
-from .mesh_source import build_mesh, find_builder
+from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
+
+if TYPE_CHECKING:
+    from ..meshes.surfaces.closed import ClosedSurface
 
 
 @dataclass(frozen=True)
@@ -29,37 +36,40 @@ class Anatomy:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     size: str  # how many cells, in words
+    volume: float | None = None  # m^d, where it is known
     notes: tuple[str, ...] = ()  # what was mended while reading
 
 
 def check_study(study: Study) -> list[str]:
     """Lines that tell what the scene will build. InputError where the study cannot run."""
-    anatomy = _words_of(study) or anatomy_of(build_mesh(study.mesh))
+    anatomy = _words_of(study, open_surface(study.mesh)) or anatomy_of(build_mesh(study.mesh))
     _check(study, anatomy)
     return list(_description(study, anatomy))
 
 
 def checked_mesh(study: Study) -> MeshData:
-    """The mesh of a study that fits it. InputError; from a builder's own words before anything is built."""
-    words = _words_of(study)
+    """The mesh of a study that fits it. InputError; from what is known beforehand before anything is built."""
+    surface = open_surface(study.mesh)
+    words = _words_of(study, surface)
     if words is not None:
         _check(study, words)
-    mesh = build_mesh(study.mesh)
+    mesh = build_mesh(study.mesh, surface)
     if study.mesh.builder is None:
         _check(study, anatomy_of(mesh))
     return mesh
 
 
-def _words_of(study: Study) -> Anatomy | None:
-    """What a builder says of itself; a surface is left to the run. None where the mesh has to be read."""
+def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
+    """What a builder says of itself, or a surface that is not filled yet. None where the mesh has to be read."""
     builder = find_builder(study.mesh)
     if builder is not None:
         lower, upper = builder.bounds()
         size = f"about {builder.cells_estimate():,} cells"
         return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size)
-    if study.mesh.surface is not None:
-        infinite = (np.inf,) * 3
-        return Anatomy(3, ("surface",), (), tuple(-x for x in infinite), infinite, "cells counted when it is filled")
+    if surface is not None:
+        size = f"about {cells_inside(study.mesh, surface):,} cells in {len(surface.triangles):,} triangles"
+        lower, upper = (tuple(corner.tolist()) for corner in (surface.points.min(axis=0), surface.points.max(axis=0)))
+        return Anatomy(3, ("surface",), (), lower, upper, size, surface.volume, surface.notes)
     return None
 
 
@@ -68,7 +78,8 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     count = bodies_of(mesh)[0]
     size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
-    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), lower, upper, size, mesh.notes)
+    volume = float(signed_measures(mesh.points, mesh.cells).sum())
+    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), lower, upper, size, volume, mesh.notes)
 
 
 def _check(study: Study, anatomy: Anatomy) -> None:
@@ -93,15 +104,10 @@ def _check_groups(study: Study, anatomy: Anatomy) -> None:
     places += [(f"probe.{i}.on", probe.on) for i, probe in enumerate(study.probe) if probe.on is not None]
     for key, where in places:
         if isinstance(where, str):
-            if where not in anatomy.groups:
-                known = ", ".join(sorted(anatomy.groups)) or "none"
-                raise InputError(f'{key} = "{where}": the mesh has no such facet group; it has: {known}')
+            check_group(where, anatomy.groups, key)
         else:
             _check_place(key, where, anatomy)
-    for name in study.material.regions:
-        if name not in anatomy.regions:
-            known = ", ".join(anatomy.regions) or "none"
-            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {known}")
+    check_regions(study.material.regions, anatomy.regions)
 
 
 def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
@@ -158,6 +164,7 @@ def _extent(anatomy: Anatomy) -> str:
 def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     source = study.mesh.builder or study.mesh.file or study.mesh.surface
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
+    yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
         yield f"            note: {note}"
     plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
@@ -177,6 +184,14 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _size(anatomy: Anatomy) -> str:
+    """The body's sides, where it lies, and its volume or area."""
+    sides = " x ".join(f"{side:.4g}" for side in np.subtract(anatomy.upper, anatomy.lower))
+    names = {2: "area", 3: "volume"}
+    measure = f"; {names[anatomy.dim]} {anatomy.volume:.4g} m^{anatomy.dim}" if anatomy.volume is not None else ""
+    return f"{sides} m, from {_extent(anatomy)}{measure}"
 
 
 def _fracture(study: Study) -> str:

@@ -5,16 +5,22 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from ..errors import InputError
 from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
+from ..meshes.parameters import is_number
 from . import Mesh
 from .explain import explain, unknown_key
+
+if TYPE_CHECKING:
+    from ..meshes.surfaces.closed import ClosedSurface
 
 
 def find_builder(mesh: Mesh) -> Any:
@@ -41,39 +47,86 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
         raise InputError(explain(error.errors(), "mesh")) from None
 
 
+# keys beside the source, and what each of them is
+BESIDE = {
+    "file": {"scale": "metres for each unit of length of the file, a number > 0"},
+    "surface": {
+        "h": "a surface is filled with cells of size h > 0 (m)",
+        "scale": "metres for each unit of length of the file, a number > 0",
+        "time_limit": "seconds that gmsh may take, a number > 0",
+    },
+}
+
+
 def _check_source(mesh: Mesh) -> None:
-    path, allowed = (mesh.file, ()) if mesh.file is not None else (mesh.surface, ("h",))
-    assert path is not None
     key = "file" if mesh.file is not None else "surface"
     for name in mesh.parameters:
-        if name not in allowed:
-            known = ", ".join(("file",) if key == "file" else ("surface", "h"))
+        if name not in BESIDE[key]:
+            known = ", ".join((key, *BESIDE[key]))
             raise InputError(f"mesh.{name} is not a known key beside mesh.{key}; known here: {known}")
-    if not Path(path).is_file():
-        raise InputError(f'mesh.{key} = "{path}": there is no such file')
-    h = mesh.parameters.get("h")
-    if key == "surface" and (not isinstance(h, int | float) or isinstance(h, bool) or h <= 0):
-        raise InputError(f"mesh.h = {h}: a surface is filled with cells of size h > 0 (m)")
+    if not Path(getattr(mesh, key)).is_file():
+        raise InputError(f'mesh.{key} = "{getattr(mesh, key)}": there is no such file')
+    for name, meaning in BESIDE[key].items():
+        value: Any = mesh.parameters.get(name)
+        if (name in mesh.parameters or name == "h") and not (is_number(value) and value > 0):
+            raise InputError(f"mesh.{name} = {value}: {meaning}")
 
 
-def build_mesh(mesh: Mesh) -> MeshData:
-    """Build or read, then check (rank 0). InputError with what is wrong."""
+def open_surface(mesh: Mesh) -> ClosedSurface | None:
+    """The closed surface of a [mesh] table in metres, checked but not filled; None where it names none. InputError."""
+    if mesh.surface is None:
+        return None
+    from ..meshes.surfaces.closed import read_surface
+
+    _check_source(mesh)
+    with _told():
+        return read_surface(mesh.surface, float(mesh.parameters.get("scale", 1.0)))
+
+
+def cells_inside(mesh: Mesh, surface: ClosedSurface) -> int:
+    """About how many cells will fill the surface. InputError where they are too many, or larger than it."""
+    from ..meshes.surfaces.fill import expected_cells
+
+    with _told():
+        return expected_cells(surface, float(mesh.parameters["h"]))
+
+
+def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
+    """Build, read or fill, then check (rank 0); `surface`: that of the table, where it is open. InputError."""
     from ..meshes.check import check_mesh
+    from ..meshes.read import read_mesh
 
     builder = find_builder(mesh)
-    try:
+    surface = surface or open_surface(mesh)
+    with _told():
         if builder is not None:
             data = builder.build()
-        elif mesh.file is not None:
-            from ..meshes.read import read_mesh
-
-            data = read_mesh(mesh.file)
+        elif surface is not None:
+            data = _filled(mesh, surface)
         else:
-            from ..meshes.surfaces.fill import fill_surface
+            assert mesh.file is not None
+            data = read_mesh(mesh.file)
+        return _scaled(check_mesh(data), mesh)
 
-            assert mesh.surface is not None
-            data = fill_surface(mesh.surface, float(mesh.parameters["h"]))
-        return check_mesh(data)
+
+def _scaled(data: MeshData, mesh: Mesh) -> MeshData:
+    """A mesh from file in metres: after its check, which tells coordinates of single precision by their bits."""
+    scale = float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
+    return data if scale == 1 else dataclasses.replace(data, points=data.points * scale)
+
+
+def _filled(mesh: Mesh, surface: ClosedSurface) -> MeshData:
+    from ..meshes.surfaces.fill import fill_closed
+
+    given = mesh.parameters
+    return fill_closed(surface, float(given["h"]), f"Surface file '{mesh.surface}'", given.get("time_limit"))
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """What is wrong with a mesh is the user's to mend."""
+    try:
+        yield
     except MeshError as error:
         raise InputError(f"mesh: {error}") from None
 

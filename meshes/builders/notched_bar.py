@@ -9,15 +9,15 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ..data import Indices, MeshData, Points
+from ..data import Indices, Points
 from ..parameters import affordable, is_number, not_negative, one_of, positive, require
-from ..sizing import Sizing, cells_for
+from ..sizing import Sizing
 from ..topology import facets_where
-from .profile import Point, Profile, mesh_profile, rectangle_bounds, rectangle_groups
+from .profile import CutRectangle, Point, Profile
 
 
 @dataclass(frozen=True)
-class NotchedBar:
+class NotchedBar(CutRectangle):
     """A straight bar along x with a notch in the middle of its lower side; as it stands, the Charpy V specimen.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. One corner is at the origin.
@@ -47,6 +47,7 @@ class NotchedBar:
 
     name: ClassVar[str] = "notched-bar"
     regions: ClassVar[tuple[str, ...]] = ()
+    cut: ClassVar[str] = "notch"
 
     length: float = 0.055
     height: float = 0.010
@@ -73,31 +74,13 @@ class NotchedBar:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        depth = ("front", "back") if self.thickness else ()
-        supports = ("support-left", "support-right", "load") if self.span else ()
-        return ("left", "right", "bottom", "top", *depth, "notch", *supports)
-
-    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return rectangle_bounds(self._size)
-
-    def cells_estimate(self) -> int:
-        high = (self.length, self.height, self.thickness) if self.thickness else (self.length, self.height)
-        return cells_for(self._sizing, (0.0,) * len(high), high)
-
-    def build(self) -> MeshData:
-        points, cells = mesh_profile(self._profile(), self.thickness, self._sizing)
-        groups = rectangle_groups(points, cells, self._size, "notch")
-        return MeshData(points, cells, groups | self._supports(points, groups))
+        return (*super().groups, *(("support-left", "support-right", "load") if self.span else ()))
 
     def mouth(self) -> float:
         """Width of the notch where it meets the lower side [m]."""
         return 2 * (self._flank[0][0] - self.length / 2)
 
     # --- what the parameters mean ---------------------------------------------------------------------------------
-
-    @property
-    def _size(self) -> tuple[float, float, float]:
-        return self.length, self.height, self.thickness
 
     @property
     def _fine(self) -> float:
@@ -176,12 +159,13 @@ class NotchedBar:
         centre = (middle, self.notch_depth - self._root_radius)
         return Profile(corners, {root - 1: centre, root: centre})
 
-    def _supports(self, points: Points, groups: dict[str, Indices]) -> dict[str, Indices]:
+    def _groups(self, points: Points, cells: Indices) -> dict[str, Indices]:
+        groups = super()._groups(points, cells)
         if not self.span:
-            return {}
+            return groups
         middle, side, reach = self.length / 2, self.span / 2, self.patch / 2 + 1e-9 * self.length
         places = {"support-left": ("bottom", -side), "support-right": ("bottom", side), "load": ("top", 0.0)}
-        return {
+        return groups | {
             name: facets_where(groups[face], np.abs(points[:, 0] - (middle + at)) <= reach)
             for name, (face, at) in places.items()
         }

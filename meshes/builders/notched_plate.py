@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..data import MeshData
 from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing, cells_for
-from .profile import Profile, mesh_profile, rectangle_bounds, rectangle_groups
+from ..sizing import Sizing
+from .profile import CutRectangle, Profile
 
 
 @dataclass(frozen=True)
-class NotchedPlate:
+class NotchedPlate(CutRectangle):
     """A plate with a straight slit from its left edge towards +x; as it stands, the crack branching plate.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. One corner is at the origin.
@@ -37,6 +36,7 @@ class NotchedPlate:
 
     name: ClassVar[str] = "notched-plate"
     regions: ClassVar[tuple[str, ...]] = ()
+    cut: ClassVar[str] = "notch"
 
     length: float = 0.100
     height: float = 0.040
@@ -64,25 +64,6 @@ class NotchedPlate:
             f"not lie within height = {self.height!r}.",
         )
         affordable("notched-plate", min(self.h, self._fine), self.cells_estimate())
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        return ("left", "right", "bottom", "top", *(("front", "back") if self.thickness else ()), "notch")
-
-    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return rectangle_bounds(self._size)
-
-    def cells_estimate(self) -> int:
-        high = (self.length, self.height, self.thickness) if self.thickness else (self.length, self.height)
-        return cells_for(self._sizing, (0.0,) * len(high), high)
-
-    def build(self) -> MeshData:
-        points, cells = mesh_profile(self._profile(), self.thickness, self._sizing)
-        return MeshData(points, cells, rectangle_groups(points, cells, self._size, "notch"))
-
-    @property
-    def _size(self) -> tuple[float, float, float]:
-        return self.length, self.height, self.thickness
 
     @property
     def _fine(self) -> float:

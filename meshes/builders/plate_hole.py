@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
 
-from ..data import MeshData
 from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing, cells_for
-from .profile import Profile, mesh_profile, rectangle_bounds, rectangle_groups
+from ..sizing import Sizing
+from .profile import CutRectangle, Profile
 
 
 @dataclass(frozen=True)
-class PlateHole:
+class PlateHole(CutRectangle):
     """The quarter x > 0, height > 0 of a plate of twice this length and height with a hole around the origin.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. Holding x on "left" and the
@@ -35,6 +34,7 @@ class PlateHole:
 
     name: ClassVar[str] = "plate-hole"
     regions: ClassVar[tuple[str, ...]] = ()
+    cut: ClassVar[str] = "hole"
 
     length: float = 0.05
     height: float = 0.05
@@ -53,30 +53,13 @@ class PlateHole:
         )
         affordable("plate-hole", min(self.h, self._fine), self.cells_estimate())
 
-    @property
-    def groups(self) -> tuple[str, ...]:
-        return ("left", "right", "bottom", "top", *(("front", "back") if self.thickness else ()), "hole")
-
-    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return rectangle_bounds(self._size)
-
     def cells_estimate(self) -> int:
         """The hole is taken for filled with the cells beside it, less its own share of them."""
-        fine, full = self._sizing, (self.length, self.height)
-        high = (*full, self.thickness) if self.thickness else full
-        inside = (self.radius, self.radius, *high[2:])
-        whole, hole = (cells_for(fine, (0.0,) * len(high), corner) for corner in (high, inside))
-        return max(1, round(whole - pi / 4 * hole))
+        return max(1, round(super().cells_estimate() - pi / 4 * self._cells_within(self.radius, self.radius)))
 
-    def build(self) -> MeshData:
+    def _profile(self) -> Profile:
         r, length, height = self.radius, self.length, self.height
-        outline = Profile([(r, 0.0), (length, 0.0), (length, height), (0.0, height), (0.0, r)], {4: (0.0, 0.0)})
-        points, cells = mesh_profile(outline, self.thickness, self._sizing)
-        return MeshData(points, cells, rectangle_groups(points, cells, self._size, "hole"))
-
-    @property
-    def _size(self) -> tuple[float, float, float]:
-        return self.length, self.height, self.thickness
+        return Profile([(r, 0.0), (length, 0.0), (length, height), (0.0, height), (0.0, r)], {4: (0.0, 0.0)})
 
     @property
     def _fine(self) -> float:

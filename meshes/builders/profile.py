@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ..data import Indices, Points
+from ..data import Indices, MeshData, Points
 from ..gmsh_session import meshed
-from ..sizing import Sizing
+from ..sizing import Sizing, cells_for
 from ..topology import boundary_facets, facets_except, oriented, plane_groups
 
 Point = tuple[float, float]
@@ -53,23 +54,52 @@ def mesh_profile(profile: Profile, thickness: float, sizing: Sizing) -> tuple[Po
     return points, cells
 
 
-def rectangle_groups(points: Points, cells: Indices, size: tuple[float, float, float], rest: str) -> dict[str, Indices]:
-    """Groups of a body cut from the rectangle or box of `size` (length, height, thickness) [m] at the origin.
+class CutRectangle(ABC):
+    """A rectangle (2D) or box with one corner at the origin, out of which something is cut: what its builders share.
 
-    Left, right (x), bottom, top (the last axis), in 3D front, back (y), and every other boundary facet under `rest`.
+    2D: x is the length, y the height. 3D: x the length, y the thickness, z the height.
     """
-    length, height, thickness = size
-    up = points.shape[1] - 1
-    planes = {"left": (0, 0.0), "right": (0, length), "bottom": (up, 0.0), "top": (up, height)}
-    if up == 2:
-        planes |= {"front": (1, 0.0), "back": (1, thickness)}
-    boundary = boundary_facets(cells)
-    groups = plane_groups(points, boundary, planes)
-    return groups | {rest: facets_except(boundary, *groups.values())}
 
+    cut: ClassVar[str]  # the group of what is no side
+    length: float
+    height: float
+    thickness: float  # 0: 2D
 
-def rectangle_bounds(size: tuple[float, float, float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Bounds of the same body: 2D where the thickness is zero."""
-    length, height, thickness = size
-    high = (length, thickness, height) if thickness > 0 else (length, height)
-    return (0.0,) * len(high), high
+    @property
+    @abstractmethod
+    def _sizing(self) -> Sizing:
+        """The size of cells from place to place."""
+
+    @abstractmethod
+    def _profile(self) -> Profile:
+        """What is left of the rectangle of length and height."""
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return ("left", "right", "bottom", "top", *(("front", "back") if self.thickness else ()), self.cut)
+
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        high = (self.length, self.thickness, self.height) if self.thickness else (self.length, self.height)
+        return (0.0,) * len(high), high
+
+    def cells_estimate(self) -> int:
+        return self._cells_within(self.length, self.height)
+
+    def _cells_within(self, x: float, y: float) -> int:
+        """About how many cells fill the rectangle from the origin to (x, y), over all the thickness."""
+        high = (x, y, self.thickness) if self.thickness else (x, y)
+        return cells_for(self._sizing, (0.0,) * len(high), high)
+
+    def build(self) -> MeshData:
+        points, cells = mesh_profile(self._profile(), self.thickness, self._sizing)
+        return MeshData(points, cells, self._groups(points, cells))
+
+    def _groups(self, points: Points, cells: Indices) -> dict[str, Indices]:
+        """Left, right (x), bottom, top (the last axis), in 3D front, back (y), and the rest of the boundary."""
+        up = points.shape[1] - 1
+        planes = {"left": (0, 0.0), "right": (0, self.length), "bottom": (up, 0.0), "top": (up, self.height)}
+        if up == 2:
+            planes |= {"front": (1, 0.0), "back": (1, self.thickness)}
+        boundary = boundary_facets(cells)
+        groups = plane_groups(points, boundary, planes)
+        return groups | {self.cut: facets_except(boundary, *groups.values())}

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ..components import components
 from ..contents import Block
 from ..data import Indices, MeshError, Points
 from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
+from ..words import middle_of
 
 JOINED = 1e-6  # points nearer than this share of the body's size are one
 PROBES = 300  # points of a part that are looked up in another part
@@ -42,6 +42,21 @@ class ClosedSurface:
         """Volume of the material [m^3]."""
         return float(enclosed_volumes(self.points, self.triangles).sum())
 
+    @property
+    def area(self) -> float:
+        """Area of the whole boundary [m^2]."""
+        return float(_areas(self.points, self.triangles).sum())
+
+    @property
+    def sides(self) -> tuple[float, ...]:
+        """Sides of the bounding box [m]: (3,)."""
+        return tuple(np.ptp(self.points, axis=0).tolist())
+
+    @property
+    def extent(self) -> str:
+        """The sides in words."""
+        return " x ".join(f"{side:.4g}" for side in self.sides) + " m"
+
     def part(self, shell: int) -> tuple[Points, Indices]:
         """Points and triangles of one shell."""
         used, triangles = np.unique(self.triangles[self.shell == shell], return_inverse=True)
@@ -54,8 +69,8 @@ def enclosed_volumes(points: Points, triangles: Indices) -> Floats:
     return np.einsum("ki,ki->k", a, np.cross(b, c)) / 6
 
 
-def read_surface(path: str | Path) -> ClosedSurface:
-    """A closed surface from STL, OBJ, PLY or another format with triangles or quads.
+def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
+    """A closed surface from STL, OBJ, PLY or another format with triangles or quads; `scale`: metres per unit of it.
 
     Raises:
         MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, has
@@ -66,7 +81,7 @@ def read_surface(path: str | Path) -> ClosedSurface:
     triangles = np.concatenate([np.zeros((0, 3), np.int64), *map(_triangles, contents.blocks)])
     if len(triangles) == 0 or contents.points.shape[1] != 3:
         raise MeshError(f"Surface file '{path}' holds no triangles in space.")
-    return closed_surface(contents.points, triangles, f"Surface file '{path}'")
+    return closed_surface(scale * contents.points, triangles, f"Surface file '{path}'")
 
 
 def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
@@ -128,7 +143,7 @@ def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
     points, number = np.unique(points, axis=0, return_inverse=True)
     reach = JOINED * float(np.ptp(points, axis=0).max())
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
-    _, cluster = _components(pairs, len(points))
+    _, cluster = components(pairs, len(points))
     first = np.unique(cluster, return_index=True)[1]
     triangles = cluster[number.ravel()[triangles]]
     whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
@@ -138,16 +153,20 @@ def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
 def _check_areas(points: Points, triangles: Indices, source: str) -> None:
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
-    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
-    areas = np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
+    areas = _areas(points, triangles)
     longest = np.linalg.norm(points[triangles] - points[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
     # Coordinates of single precision move a corner by up to 6e-8 of the body's size.
     flat = np.flatnonzero(areas <= 1e-7 * float(np.ptp(points, axis=0).max()) * longest / 2)
     if len(flat):
         raise MeshError(
-            f"{source} has {len(flat)} triangles without an area, the first at {_place(points, triangles[flat[0]])}; "
-            "remesh the surface there."
+            f"{source} has {len(flat)} triangles without an area, the first at "
+            f"{middle_of(points, triangles[flat[0]])}; remesh the surface there."
         )
+
+
+def _areas(points: Points, triangles: Indices) -> Floats:
+    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    return np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
 
 
 def _check_closed(points: Points, triangles: Indices, source: str) -> None:
@@ -158,7 +177,8 @@ def _check_closed(points: Points, triangles: Indices, source: str) -> None:
     ):
         if len(wrong):
             raise MeshError(
-                f"{source} {what.format(len(wrong))}, the first at {_place(points, wrong[0])}; close or mend it there."
+                f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
+                "close or mend it there."
             )
 
 
@@ -181,7 +201,7 @@ def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]
     disagree = directed[first, 0] == directed[second, 0]
     a, b = first // 3, second // 3
     links = np.concatenate([np.stack([a, b + count * disagree], 1), np.stack([a + count, b + count * ~disagree], 1)])
-    _, state = _components(links, 2 * count)
+    _, state = components(links, 2 * count)
     as_given, turned = state[:count], state[count:]
     if (as_given == turned).any():
         raise MeshError(f"{source} has one side only, like a Moebius strip; it encloses no body.")
@@ -222,8 +242,8 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
         within = np.array([abs(_winding(p, corners[j])) > 0.5 for p in probes[:: 1 + len(probes) // PROBES]])
         if within.any() and not within.all():
             raise MeshError(
-                f"{source} has parts that cut each other, near {_place(points, triangles[shell == i].ravel())}; join "
-                "them into one surface, or move them apart."
+                f"{source} has parts that cut each other, near {middle_of(points, triangles[shell == i].ravel())}; "
+                "join them into one surface, or move them apart."
             )
         inside[i, j] = within.all()
     return inside
@@ -247,13 +267,3 @@ def _winding(point: Floats, corners: Floats) -> float:
     dots = [np.einsum("ki,ki->k", v, w) for v, w in ((a, b), (b, c), (c, a))]
     below = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
     return float(np.arctan2(np.einsum("ki,ki->k", a, np.cross(b, c)), below).sum() / (2 * np.pi))
-
-
-def _components(pairs: Indices, count: int) -> tuple[int, Indices]:
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    parts, labels = connected_components(graph, directed=False)
-    return int(parts), labels.astype(np.int64)
-
-
-def _place(points: Points, nodes: Indices) -> str:
-    return "(" + ", ".join(f"{x:.4g}" for x in points[nodes].mean(axis=0)) + ") m"

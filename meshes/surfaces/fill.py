@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -12,41 +12,82 @@ import numpy as np
 from ..check import check_mesh, flat_cells
 from ..data import Indices, MeshData, MeshError, Points
 from ..gmsh_session import TRIANGLE, cells_in, fill_volumes, session
-from ..parameters import affordable, positive
-from ..sizing import SHARE, Sizing
-from ..topology import boundary_facets, distinct_rows, facets_of, signed_measures
+from ..parameters import affordable, positive, require
+from ..sizing import Sizing, cells_for_body
+from ..timed import within
+from ..topology import Floats, boundary_facets, distinct_rows, facets_of, signed_measures
 from .closed import ClosedSurface, enclosed_volumes, read_surface
 
 SHARP = 40 * pi / 180  # edges where the normal turns by more than this are kept
 REMESHED = 0.10  # a remeshed surface may enclose this much more or less of its volume, or its own triangles are taken
 FILLED = 1e-6  # share by which tetrahedra may miss the volume of the triangles that they fill
 SLIVER = 1e-4  # cells on the boundary thinner than this (volume over longest edge cubed) are left out
+DIGITS = 12  # of coordinates handed to gmsh
 TOLD = 0.01  # share of the file's volume from which on a difference is told
 
 
-def fill_surface(path: str | Path, h: float) -> MeshData:
+Shell = tuple[Points, Indices]
+
+
+def fill_surface(path: str | Path, h: float, *, scale: float = 1.0, time_limit: float | None = None) -> MeshData:
     """Tetrahedra of size h [m] inside a closed surface (STL, OBJ, PLY, ...), checked.
 
     The surface is meshed anew at size h, edges of more than 40 degrees kept; where that fails its own triangles are
     taken. Closed parts inside another are cavities. Facet group: surface, the whole boundary.
 
+    Args:
+        path: the file.
+        h: size of the cells [m].
+        scale: metres per unit of length of the file.
+        time_limit: seconds that gmsh may take; None: a minute and a millisecond for each cell expected.
+
     Raises:
-        MeshError: h is out of range; the surface is not closed or is damaged (see read_surface); gmsh fails; the
-            volume of the cells is not that of the surface.
+        MeshError: h is out of range; the surface is not closed or is damaged (see read_surface); gmsh fails or takes
+            too long; the volume of the cells is not that of the surface.
     """
-    positive("surface", h=h)
-    surface = read_surface(path)
-    affordable("surface", h, surface.volume / (SHARE[3] * h**3))
-    shells, notes = _remeshed_shells(surface, h)
-    points, cells, volume = fill_shells(shells, surface.bodies, h, f"Surface file '{path}'")
-    notes += _volume_note(surface.volume, volume)
-    mesh = MeshData(points, cells, {"surface": boundary_facets(cells)}, notes=surface.notes + notes)
-    checked = check_mesh(mesh)
+    return fill_closed(read_surface(path, scale), h, f"Surface file '{path}'", time_limit)
+
+
+def fill_closed(surface: ClosedSurface, h: float, source: str, time_limit: float | None = None) -> MeshData:
+    """Tetrahedra inside a surface that has been read; `source` begins the message of an error (see fill_surface)."""
+    expected = expected_cells(surface, h)
+    seconds = 60 + 1e-3 * (expected + len(surface.triangles)) if time_limit is None else time_limit
+    try:
+        made = within(seconds, _made, surface, h, source)
+    except TimeoutError:
+        raise MeshError(
+            f"{source}: gmsh had not filled it within {seconds:.0f} s (about {expected:,} cells of h = {h:g} m in a "
+            f"body of {surface.extent}). Take a larger h, mend or simplify the surface, or give gmsh more seconds with "
+            "[mesh] time_limit."
+        ) from None
+    checked = check_mesh(made)
     # The surface's own notes tell of separate bodies already.
     return replace(checked, notes=tuple(note for note in checked.notes if "share no node" not in note))
 
 
-Shell = tuple[Points, Indices]
+def expected_cells(surface: ClosedSurface, h: float) -> int:
+    """About how many cells of size h [m] will fill the surface.
+
+    Raises:
+        MeshError: more than can be held, or cells larger than the body.
+    """
+    positive("surface", h=h)
+    units = f"The body measures {surface.extent}: a file in millimetres needs [mesh] scale = 1e-3."
+    require(h <= max(surface.sides), f"surface: h = {h!r} m is larger than the whole body. {units}")
+    wall = 2 * surface.volume / surface.area  # of a shell; of a solid body some third of its thickness, which is more
+    expected = cells_for_body(surface.volume, wall, h)
+    affordable("surface", h, expected, units)
+    return expected
+
+
+def _made(surface: ClosedSurface, h: float, source: str) -> MeshData:
+    """What gmsh makes of the surface."""
+    shells, notes = _remeshed_shells(surface, h)
+    unit = _Unit.of([points for points, _ in shells])
+    small = [(unit.into(points), triangles) for points, triangles in shells]
+    points, cells, volume = fill_shells(small, surface.bodies, unit.length(h), source)
+    notes = surface.notes + notes + _volume_note(surface.volume, volume * unit.size**3)
+    return MeshData(unit.back(points), cells, {"surface": boundary_facets(cells)}, notes=notes)
 
 
 def fill_shells(shells: list[Shell], bodies: list[list[int]], h: float, source: str) -> tuple[Points, Indices, float]:
@@ -72,19 +113,19 @@ def _remeshed_shells(surface: ClosedSurface, h: float) -> tuple[list[Shell], tup
 
 def _remeshed(points: Points, triangles: Indices, h: float) -> Shell:
     """One shell meshed anew by gmsh, cut into patches at its sharp edges."""
+    unit = _Unit.of([points])
     with session() as gmsh:
-        _add_shell(gmsh, 1, points, triangles)
+        _add_shell(gmsh, 1, unit.into(points), triangles)
         gmsh.model.mesh.classifySurfaces(SHARP, True, True, pi)
         gmsh.model.mesh.createGeometry()
-        Sizing(h).apply(gmsh)
+        Sizing(unit.length(h)).apply(gmsh)
         gmsh.model.mesh.generate(2)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         _, nodes = gmsh.model.mesh.getElementsByType(TRIANGLE)
     place = np.zeros(int(tags.max()) + 1, np.int64)
     place[tags] = np.arange(len(tags))
     used, new = np.unique(place[nodes], return_inverse=True)
-    shell = coordinates.reshape(-1, 3)[used], new.reshape(-1, 3)
-    return _same_body(points, triangles, *shell)
+    return _same_body(points, triangles, unit.back(coordinates.reshape(-1, 3)[used]), new.reshape(-1, 3))
 
 
 def _same_body(points: Points, triangles: Indices, new_points: Points, new: Indices) -> Shell:
@@ -127,6 +168,32 @@ def _filled(shells: list[Shell], bodies: list[list[int]], h: float, source: str)
     return points, cells
 
 
+@dataclass(frozen=True)
+class _Unit:
+    """A body shrunk or blown up to the size of one for gmsh, whose bounds of a size and tolerances are absolute.
+
+    Discrete surfaces do not tell gmsh how large their model is: it goes on taking 1 for that, and no cell is larger
+    than the model. Twelve digits are kept, so that the last ones, which change with the unit of length, decide nothing.
+    """
+
+    low: Floats
+    size: float
+
+    @classmethod
+    def of(cls, shells: list[Points]) -> _Unit:
+        points = np.concatenate(shells)
+        return cls(points.min(axis=0), float(np.ptp(points, axis=0).max()))
+
+    def into(self, points: Points) -> Points:
+        return np.round((points - self.low) / self.size, DIGITS)
+
+    def length(self, h: float) -> float:
+        return float(f"{h / self.size:.{DIGITS}g}")
+
+    def back(self, points: Points) -> Points:
+        return points * self.size + self.low
+
+
 def _add_shell(gmsh: Any, tag: int, points: Points, triangles: Indices) -> None:
     """A discrete surface of gmsh's model with its own nodes."""
     first = int(gmsh.model.mesh.getMaxNodeTag()) + 1
@@ -157,8 +224,7 @@ def _check_filled(shells: list[Shell], bodies: list[list[int]], made: float, sou
     wanted = sum(volumes[shell] for body in bodies for shell in body)
     if abs(made - wanted) > FILLED * wanted:
         raise MeshError(
-            f"{source} encloses {wanted:.4g} m^3, but its tetrahedra fill {made:.4g} m^3: mend the "
-            "surface where it cuts itself."
+            f"{source}: tetrahedra fill {made / wanted:.4%} of the volume it encloses; mend it where it cuts itself."
         )
 
 

@@ -103,11 +103,12 @@ def pieces(label: str) -> Found:
     count = graph.break_edges(ends[:, 0] != ends[:, 1])
     bodies = find_pieces(graph)
     d = domain.dim
-    masses = bodies.totals(domain, scene.balance.mass.lumped[::d])
+    piece = domain.gather_nodes(bodies.of_node[: domain.node_count])
+    mass = domain.gather_nodes(scene.balance.mass.lumped[::d])
     return {
         f"pieces-{label}": np.array([bodies.count, count]),
-        f"piece-{label}": domain.gather_nodes(bodies.of_node[: domain.node_count]),
-        f"piece-mass-{label}": masses,
+        f"piece-{label}": piece,
+        f"piece-mass-{label}": None if piece is None or mass is None else np.bincount(piece, mass),
     }
 
 

@@ -9,32 +9,28 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from ...mesh.simplices import is_split, local_edges
+from ...mesh.topology import MeshTopology
 from ...meshes.data import MeshData
-from ...meshes.topology import distinct_rows, signed_measures
+from ...meshes.topology import signed_measures
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
 
-class Body:
-    """A mesh of N nodes and C cells, on the rank that has it.
+class Body(MeshTopology):
+    """A mesh as level sets cut it.
 
     Attributes:
-        points: (N, d) m.    cells: (C, d + 1); corners: its transpose.    centroids: (C, d) m.
-        edges: (E, 2) nodes, the lower first, ascending.    cell_edges: (C, k).
+        corners: (d + 1, C) nodes of the cells.    centroids: (C, d) m.
         tolerance: m; nodes as near as this to a surface lie on it.
     """
 
     def __init__(self, mesh: MeshData) -> None:
-        d = mesh.dim
-        self.dim, self.points, self.cells = d, mesh.points, mesh.cells
+        super().__init__(mesh)
         self.corners: Ints = np.ascontiguousarray(mesh.cells.T)
         self.centroids: Values = mesh.points[mesh.cells].mean(axis=1)
-        pairs = np.sort(mesh.cells[:, local_edges(d)], axis=2).reshape(-1, 2)
-        self.edges, _, inverse = distinct_rows(pairs)
-        self.cell_edges: Ints = inverse.reshape(len(mesh.cells), -1)
-        self.tolerance = 1e-7 * float(np.mean(self.volumes)) ** (1 / d)
+        self.tolerance = 1e-7 * float(np.mean(self.volumes)) ** (1 / mesh.dim)
 
     @cached_property
     def volumes(self) -> Values:
@@ -63,13 +59,6 @@ class Body:
         for column in self.corners[1:]:
             result |= nodes[column]
         return result
-
-    def flags_of(self, keys: Ints) -> Flags:
-        """(E,) flags of the edges named by pairs of nodes (n, 2)."""
-        factor = np.array([len(self.points), 1])
-        flags = np.zeros(len(self.edges), bool)
-        flags[np.searchsorted(self.edges @ factor, np.sort(keys, axis=1) @ factor)] = True
-        return flags
 
     def whole(self, cells: Ints, broken: Flags) -> Flags:
         """(n,) which of the cells have not come apart."""

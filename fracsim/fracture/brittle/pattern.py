@@ -151,7 +151,7 @@ class _State:
 
     def __init__(self, body: Body, broken_keys: Ints) -> None:
         self._body = body
-        self.broken = body.flags_of(broken_keys)
+        self.broken = body.edge_flags(broken_keys)
         self.cut: Values = np.full(len(self.broken), np.nan)
         self.whole = body.whole(np.arange(len(body.cells)), self.broken)
         self.touched = np.zeros(len(body.cells), bool)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ...mesh.simplices import local_edges
+from ...meshes.components import components
 from .body import Body, triangles
 
 Ints = npt.NDArray[np.int64]
@@ -65,8 +64,7 @@ class Crossing:
         inside = self.open[:, corner]
         through = np.count_nonzero(inside, axis=2) == 2
         links = number[:, corner][through][inside[through]].reshape(-1, 2)
-        graph = csr_matrix((np.ones(len(links), np.int8), links.T), shape=(len(every), len(every)))
-        label = connected_components(graph, directed=False)[1]
+        label = components(links, len(every))[1]
         return every[np.isin(label, label[np.isin(every, seeds)])]
 
     def touched(self, cut: Ints, edge_count: int) -> Ints:

@@ -6,25 +6,21 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
+from ...meshes.components import components
 from ...meshes.data import MeshData
 from ...meshes.topology import distinct_rows, facets_of
-from ..simplices import local_edges
+from ..topology import MeshTopology
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 CRACK, BODY = 0, 1  # origins of elements that are on no boundary facet
 
 
-class Skeleton:
-    """A mesh of N nodes and C cells with its edges and facets.
+class Skeleton(MeshTopology):
+    """A mesh with its facets as well.
 
     Attributes:
-        points: (N, d) reference coordinates X, m.
-        cells: (C, d + 1) nodes.
-        edges: (E, 2) nodes, the lower first, in ascending order; cell_edges: (C, k) in the order of graph.local_edges.
         facets: (F, d) nodes, ascending; cell_facets: (C, d + 1), facet i opposite node i.
         boundary: (B, 2) cell and local facet of each boundary facet, in the order of the cells.
         origins: names of the places that an element may come from; origin (B,) of each boundary facet.
@@ -32,12 +28,8 @@ class Skeleton:
     """
 
     def __init__(self, mesh: MeshData) -> None:
-        d = mesh.dim
-        self.dim, self.points, self.cells = d, mesh.points, mesh.cells
-        pairs = np.sort(mesh.cells[:, local_edges(d)], axis=2).reshape(-1, 2)
-        self.edges, _, inverse = distinct_rows(pairs)
-        self.cell_edges: Ints = inverse.reshape(len(mesh.cells), -1)
-        sorted_facets = np.sort(facets_of(mesh.cells).reshape(-1, d), axis=1)
+        super().__init__(mesh)
+        sorted_facets = np.sort(facets_of(mesh.cells).reshape(-1, mesh.dim), axis=1)
         self.facets, counts, inverse = distinct_rows(sorted_facets)
         self.cell_facets: Ints = inverse.reshape(len(mesh.cells), -1)
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
@@ -52,9 +44,8 @@ class Skeleton:
 
     def of_edges(self, keys: Ints, values: Values) -> Values:
         """(E,) values of edges named by pairs of nodes (n, 2), NaN for all others."""
-        factor = np.array([len(self.points), 1])
         result = np.full(len(self.edges), np.nan)
-        result[np.searchsorted(self.edges @ factor, np.sort(keys, axis=1) @ factor)] = values
+        result[self.find_edges(keys)] = values
         return result
 
     def broken_edges(self, pattern: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
@@ -67,14 +58,7 @@ class Skeleton:
 
     def pieces(self, broken: npt.NDArray[np.bool_]) -> tuple[int, Ints]:
         """How many pieces the intact edges leave, and the piece of each node, numbered by their lowest node."""
-        links = self.edges[~broken]
-        size = len(self.points)
-        graph = csr_matrix((np.ones(len(links), np.int8), links.T), shape=(size, size))
-        count, label = connected_components(graph, directed=False)
-        lowest = np.unique(label, return_index=True)[1]
-        rank = np.empty(count, np.int64)
-        rank[np.argsort(lowest)] = np.arange(count)
-        return int(count), rank[label]
+        return components(self.edges[~broken], len(self.points))
 
 
 def _origins(mesh: MeshData, facets: Ints) -> tuple[list[str], Ints]:

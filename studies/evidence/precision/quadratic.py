@@ -26,7 +26,7 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
     from dolfinx import fem
     from mpi4py import MPI
 
-    from ....mechanics.loads import surface_measure
+    from ....mechanics.loads import surface_measures
     from ....mesh.domain import distribute
     from ....study.check import checked_mesh
     from ....study.file import validate
@@ -46,11 +46,11 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
         return 2 * mu * strain + lmbda * ufl.tr(strain) * ufl.Identity(d)
 
     loads = [entry for entry in checked.boundary if entry.kind == "traction"]
-    ds = surface_measure(domain, [domain.facets_of(entry.on, "boundary") for entry in loads])
+    measures = surface_measures(domain, [domain.facets_of(entry.on, "boundary") for entry in loads])
     zero: Any = fem.Constant(domain.mesh, np.zeros(d))
     force = ufl.inner(zero, w) * ufl.dx
-    for number, entry in enumerate(loads):
-        force += ufl.inner(ufl.as_vector(entry.traction), w) * ds(number)
+    for entry, ds in zip(loads, measures, strict=True):
+        force += ufl.inner(ufl.as_vector(entry.traction), w) * ds
     bcs = []
     for entry in checked.boundary:
         for axis in entry.fix or "":

@@ -1,0 +1,50 @@
+"""Cells and edges of the input mesh, numbered once, on the rank that has the mesh."""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+
+from ..meshes.data import Indices, MeshData
+from ..meshes.topology import distinct_rows
+from .simplices import local_edges
+
+_NUMBERED: WeakKeyDictionary[MeshData, tuple[Indices, Indices]] = WeakKeyDictionary()
+
+
+class MeshTopology:
+    """A mesh of N nodes and C cells with its E edges; all that are made of one mesh share their numbers.
+
+    Attributes:
+        dim: 2 or 3.
+        points: (N, d) reference coordinates X, m.
+        cells: (C, d + 1) nodes.
+        edges: (E, 2) nodes, the lower first, in ascending order.
+        cell_edges: (C, k) edges of each cell in the order of simplices.local_edges.
+    """
+
+    def __init__(self, mesh: MeshData) -> None:
+        self.dim, self.points, self.cells = mesh.dim, mesh.points, mesh.cells
+        if mesh not in _NUMBERED:
+            _NUMBERED[mesh] = _numbered(mesh)
+        self.edges, self.cell_edges = _NUMBERED[mesh]
+
+    def find_edges(self, keys: Indices) -> Indices:
+        """(n,) numbers of the edges named by pairs of nodes (n, 2) in either order; all of them exist."""
+        factor = np.array([len(self.points), 1])
+        return np.searchsorted(self.edges @ factor, np.sort(keys, axis=1) @ factor)
+
+    def edge_flags(self, keys: Indices) -> npt.NDArray[np.bool_]:
+        """(E,) flags of the edges named by pairs of nodes (n, 2)."""
+        flags = np.zeros(len(self.edges), bool)
+        flags[self.find_edges(keys)] = True
+        return flags
+
+
+def _numbered(mesh: MeshData) -> tuple[Indices, Indices]:
+    """Distinct edges, and those of each cell."""
+    pairs = np.sort(mesh.cells[:, local_edges(mesh.dim)], axis=2).reshape(-1, 2)
+    edges, _, inverse = distinct_rows(pairs)
+    return edges, inverse.reshape(len(mesh.cells), -1)

@@ -1,0 +1,61 @@
+"""Work with a time limit, in a process of its own: what runs inside gmsh's library nothing else can interrupt."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from math import ceil
+from typing import Any
+
+from .data import MeshError
+
+_PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
+
+
+def within[T](seconds: float, work: Callable[..., T], *arguments: Any) -> T:
+    """work(*arguments), a function of a module, done by another Python process; its exceptions are raised here.
+
+    Raises:
+        TimeoutError: it was not done after `seconds`.
+        MeshError: the process died of something else, such as a fault within gmsh or want of memory.
+    """
+    command = [sys.executable, "-P", "-m", __name__]  # -P: not a folder of the same name that lies here
+    task = pickle.dumps((max(1, ceil(seconds)), os.getpid(), work, arguments))
+    done = subprocess.run(command, input=task, capture_output=True, check=False)
+    if done.returncode == -signal.SIGALRM:
+        raise TimeoutError
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip()[-300:]
+        how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+        raise MeshError(f"gmsh died ({how}{': ' if said else ''}{said}); is there enough memory? Try a larger h.")
+    result, failure = pickle.loads(done.stdout)
+    if failure is not None:
+        raise failure
+    return result
+
+
+def _serve() -> None:
+    """Do the task on standard input. The kernel's alarm ends this process, also in the middle of compiled code."""
+    answer = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever is printed meanwhile is no part of the answer
+    seconds, parent, work, arguments = pickle.load(sys.stdin.buffer)
+    signal.alarm(seconds)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody waits for the answer any more
+    if os.getppid() != parent:
+        return
+    result, failure = None, None
+    try:
+        result = work(*arguments)
+    except Exception as error:
+        failure = error
+    with answer:
+        pickle.dump((result, failure), answer)
+
+
+if __name__ == "__main__":
+    _serve()

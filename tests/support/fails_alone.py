@@ -1,0 +1,37 @@
+"""`fracsim run` of which one rank fails in the middle of the second step: RANK KIND, and the arguments of run."""
+
+import sys
+from typing import Any
+
+from mpi4py import MPI
+
+from fracsim import cli
+from fracsim.errors import InputError, NotConverged
+from fracsim.mesh import ranks
+from fracsim.stepping import implicit
+
+FAILURES: dict[str, BaseException] = {
+    "input": InputError("only here"),
+    "not-converged": NotConverged("only here"),
+    "exit": SystemExit(7),
+    "disk": OSError(28, "No space left on device", "only-here.h5"),
+    "fault": ValueError("only here"),
+}
+
+rank, kind, *arguments = sys.argv[1:]
+ranks.PATIENCE = 1.0  # as long as the other rank would need to fail in the same place
+calls = 0
+advance = implicit.Stepper.advance
+
+
+def failing(stepper: implicit.Stepper, *given: Any) -> Any:
+    global calls
+    calls += 1
+    if calls == 2 and MPI.COMM_WORLD.rank == int(rank):
+        raise FAILURES[kind]
+    return advance(stepper, *given)
+
+
+implicit.Stepper.advance = failing  # type: ignore[method-assign]
+sys.argv = ["fracsim", "run", *arguments]
+cli.main()
