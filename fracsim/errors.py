@@ -12,6 +12,7 @@ class Exit(IntEnum):
     BAD_INPUT = 2
     NOT_CONVERGED = 3
     STOPPED = 4
+    CANNOT_WRITE = 5
 
 
 class FracsimError(Exception):
@@ -34,3 +35,9 @@ class Stopped(FracsimError):
     """A signal or the wall-time limit ended the run, with a checkpoint."""
 
     exit_code = Exit.STOPPED
+
+
+class CannotWrite(FracsimError):
+    """Output could not be written in the middle of a run (disk full, folder gone); the message has what, and why."""
+
+    exit_code = Exit.CANNOT_WRITE

@@ -184,8 +184,11 @@ def test_rows_and_frames_after_the_checkpoint_are_written_anew(tmp_path: Path, w
 
 
 def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:
+    """Once it is told to."""
     stopped_after(BAR, tmp_path / "out", 2)
-    run(BAR, tmp_path / "out")
+    with pytest.raises(InputError, match=r"left a checkpoint there \(checkpoint/state\.h5\); go on with --res"):
+        run(BAR, tmp_path / "out")
+    Run(build_scene(MPI.COMM_SELF, study(BAR)), tmp_path / "out", overwrite=True)()
     assert not (tmp_path / "out" / "checkpoint" / "state.h5").exists()
     with pytest.raises(InputError, match="--restart: there is no checkpoint"):
         run(BAR, tmp_path / "out", restart=True)
