@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable
@@ -198,6 +199,8 @@ class Run:
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
+        with contextlib.suppress(CannotWrite):
+            write_summary(self.comm, self.folder, self._summary("could not write"))
         try:
             if self.history.step == self.state.step:  # a step without its row would leave a gap
                 return self._saved()

@@ -113,7 +113,7 @@ class History:
             report.outcome.newton, report.outcome.krylov, report.seconds, *probes,
         ]  # fmt: skip
         row = dict(zip(self.columns, values, strict=True))
-        self.peaks = {name: max(peak, abs(row[name])) for name, peak in self.peaks.items()}
+        self.peaks = {name: max(peak, abs(float(row[name]))) for name, peak in self.peaks.items()}
         line = _line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in values])
         written(self.comm, self._path, lambda: self._write(line.encode()))
         self.step = state.step

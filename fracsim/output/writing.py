@@ -16,7 +16,7 @@ from ..errors import CannotWrite
 from ..mesh.ranks import on_root
 from .own_files import NEW
 
-ROOM = 1 << 14  # bytes that HDF5 may need beside the values of one array
+ROOM = 6 << 10  # bytes that HDF5 may need beside the values of one array, most of it for an attribute that is text
 
 
 @contextlib.contextmanager
