@@ -1,4 +1,4 @@
-"""Output that cannot be written in the middle of a run: exit code 5, one message, no hang, and nothing lost before it."""
+"""Output that cannot be written in the middle of a run: exit code 5, one message, no hang, nothing lost before it."""
 
 from __future__ import annotations
 

@@ -331,31 +331,46 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# what is called while a restart opens its output, in that order
-@pytest.mark.parametrize("where", ["run.make_folder", "run.History", "run.Frames", "run.FieldsFile",
-                                   "output.surface.output.SurfaceFiles", "output.surface.output.Surface", "run.OutputClock"])  # fmt: skip
-@pytest.mark.parametrize("late", [False, True])
+OPENING = ("run.make_folder", "run.History", "run.Frames", "run.FieldsFile", "output.surface.output.SurfaceFiles",
+           "output.surface.output.Surface", "run.OutputClock", "output.writing.os.replace")  # fmt: skip
+
+
+def contents(folder: Path) -> frozenset[tuple[Path, bytes]]:
+    return frozenset((path.relative_to(folder), path.read_bytes()) for path in folder.rglob("*") if path.is_file())
+
+
 def test_a_restart_killed_in_its_first_moments_loses_nothing(
-    tmp_path: Path, stopped: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, where: str, late: bool
+    tmp_path: Path, stopped: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed before or after each part of its set-up; rows and frames that are later than the checkpoint are there."""
-    out = shutil.copytree(whole, tmp_path / "out")
+    """What is on the disk before and after each part of its set-up is what a kill leaves: each goes on to the same end.
+
+    There are rows and frames that are later than the checkpoint, so that all files are written anew.
+    """
+    out, states = shutil.copytree(whole, tmp_path / "out"), []
     shutil.copytree(stopped / "checkpoint", out / "checkpoint")
+
+    def watched(work: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            states.append(shutil.copytree(out, tmp_path / f"state-{len(states)}"))
+            result = work(*arguments, **options)
+            states.append(shutil.copytree(out, tmp_path / f"state-{len(states)}"))
+            return result
+
+        return call
+
     with monkeypatch.context() as patch:
-        real = getattr(importlib.import_module("fracsim." + where.rpartition(".")[0]), where.rpartition(".")[2])
-
-        def killed(*arguments: Any, **options: Any) -> None:
-            if late:
-                real(*arguments, **options)
-            raise SystemExit
-
-        patch.setattr(f"fracsim.{where}", killed)
-        with pytest.raises(SystemExit):
-            run(TEARING, out, restart=True)
-    assert history(out)["step"][:4].tolist() == [1, 2, 3, 4]
-    run(TEARING, out, restart=True)
-    assert_same_run(out, whole)
-    assert not list(out.rglob("*.new"))
+        for where in OPENING:
+            owner, _, name = f"fracsim.{where}".rpartition(".")
+            owned = os if owner.endswith(".os") else importlib.import_module(owner)
+            patch.setattr(owned, name, watched(getattr(owned, name)))
+        Run(build_scene(MPI.COMM_SELF, study(TEARING)), out, restart=True)
+    assert all(history(state)["step"][:4].tolist() == [1, 2, 3, 4] for state in states)
+    different = {contents(state): state for state in states}
+    assert len(states) > 20 and len(different) > 6
+    for state in different.values():
+        run(TEARING, state, restart=True)
+        assert_same_run(state, whole)
+        assert not list(state.rglob("*.new"))
 
 
 @pytest.mark.parametrize("restart", [False, True])
