@@ -105,7 +105,7 @@ def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain, not
 def _size(arrays: dict[str, Any], notes: Notes) -> int:
     """Bytes, a little more than the file will have."""
     whole = sum(values.nbytes for values in arrays.values() if values is not None)
-    return whole + len(notes.study) + ROOM * (len(arrays) + len(_NOTES))
+    return whole + len(notes.study) + 2 * ROOM + (1 << 10) * (len(arrays) + len(_NOTES))
 
 
 def read_checkpoint(
