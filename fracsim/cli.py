@@ -30,9 +30,14 @@ def run(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME)")] = None,
     set_: Set = _NONE,
     restart: Annotated[bool, typer.Option("--restart", help="go on from the checkpoint in the output folder")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="begin anew where a run that has not ended left a checkpoint")
+    ] = False,
     wall_limit: Annotated[float | None, typer.Option(min=0, help="seconds until it stops with a checkpoint")] = None,
 ) -> None:
     """Run a study. Works under mpirun."""
+    if restart and overwrite:
+        raise InputError("--restart goes on with the run in the output folder, --overwrite throws it away: give one")
     from mpi4py import MPI
 
     comm = MPI.COMM_WORLD
@@ -41,7 +46,8 @@ def run(
     loaded = _load(comm, path, set_, folder)
     from .run import run_study
 
-    summary = run_study(comm, loaded, folder, restart=restart, wall_limit=wall_limit)
+    how = {"restart": restart, "overwrite": overwrite}
+    summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
         print(
             f"{summary['title']}: {summary['steps']} steps to t = {summary['time']:g} s in {summary['wall']:.1f} s on "
@@ -132,12 +138,16 @@ def sweep(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="output folder (default out/NAME-sweep)")] = None,
     ranks: Annotated[int, typer.Option(min=1, help="MPI ranks of each run")] = 1,
     list_: Annotated[bool, typer.Option("--list", help="print one complete command a line for a job array")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="begin anew where a run of another study left a checkpoint")
+    ] = False,
 ) -> None:
     """Run a study once for each combination of values; goes on where it was left."""
     from .report.sweep import run_sweep
 
     path = find_study(study)
-    run_sweep(study, path, set_, out or Path("out") / f"{path.stem}-sweep", ranks=ranks, only_list=list_)
+    folder = out or Path("out") / f"{path.stem}-sweep"
+    run_sweep(study, path, set_, folder, ranks=ranks, only_list=list_, overwrite=overwrite)
 
 
 @app.command(name="list")
@@ -233,7 +243,9 @@ def _verdict(error: BaseException) -> tuple[int, str]:
         return (error.code or 0, "") if isinstance(error.code, int | None) else (1, str(error.code))
     if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
         where = f" {error.filename}" if error.filename else ""
-        return int(Exit.NOT_WRITTEN), f"fracsim: cannot write{where}: {error.strerror}; make room or give another --out"
+        return int(
+            Exit.CANNOT_WRITE
+        ), f"fracsim: cannot write{where}: {error.strerror}; make room or give another --out"
     return 1, "".join(traceback.format_exception(error)).rstrip()
 
 

@@ -12,7 +12,7 @@ class Exit(IntEnum):
     BAD_INPUT = 2
     NOT_CONVERGED = 3
     STOPPED = 4
-    NOT_WRITTEN = 5
+    CANNOT_WRITE = 5
 
 
 class FracsimError(Exception):
@@ -35,3 +35,9 @@ class Stopped(FracsimError):
     """A signal or the wall-time limit ended the run, with a checkpoint."""
 
     exit_code = Exit.STOPPED
+
+
+class CannotWrite(FracsimError):
+    """Output could not be written in the middle of a run (disk full, folder gone); the message has what, and why."""
+
+    exit_code = Exit.CANNOT_WRITE

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import resource
+import contextlib
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +14,20 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .errors import NotConverged, Stopped
+from .errors import CannotWrite, NotConverged, Stopped
 from .mesh.bodies import bodies_of
-from .mesh.ranks import end_unless_all_failed, on_root, total
-from .output.checkpoint import read_checkpoint, write_checkpoint
+from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
+from .output.checkpoint import Notes, checkpoint_path, read_checkpoint, read_notes, write_checkpoint
 from .output.energy_gain import Gained
 from .output.fields import Frames
-from .output.fields_file import FieldsFile
-from .output.folder import OutputClock, make_folder, versions
-from .output.history import History
+from .output.fields_file import Field, FieldsFile
+from .output.folder import OutputClock, check_folder, check_readable, make_folder, versions
+from .output.history import History, history_columns
 from .output.interrupt import Interrupt
 from .output.inverted_cells import Inverted
 from .output.progress import Progress
+from .output.summary import Meter, Monitors, say, write_summary
+from .output.writing import written
 from .scene import Scene, build_scene
 from .study import Study
 from .study.file import study_text
@@ -44,22 +47,40 @@ class Run:
         folder: Path,
         *,
         restart: bool = False,
+        overwrite: bool = False,
         wall_limit: float | None = None,
+        interrupt: Interrupt | None = None,
         began: float | None = None,
     ) -> None:
-        """Start or resume; makes the output folder. `began`: when the work on the scene began (perf_counter)."""
+        """Start or resume; makes the output folder, once nothing stands in the way any more.
+
+        `overwrite`: throw away a run there that could go on; `wall_limit`: s from now; `interrupt`: in its place, one
+        that listens already; `began`: when the work on the scene began (perf_counter). Raises InputError, and Stopped
+        where a signal came before anything was written.
+        """
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
-        self._interrupt = Interrupt(self.comm, wall_limit)
-        self.state = scene.start()
-        self.record = self._make_record()
-        if restart:
-            stress = scene.balance.stress
-            state = read_checkpoint(folder, scene.domain, self.state, stress, self.record, self._surfaces)
-            self.state = scene.stepper.resume(state)
-        self._prepare(restart)
+        self._interrupt = interrupt or Interrupt(self.comm, wall_limit)
+        self._text = study_text(scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
+        self._meter = Meter(self.comm, scene.stepper, began)
+        with self._interrupt:
+            on_root(self.comm, lambda: _check(folder, scene.study, self._text, restart=restart, overwrite=overwrite))
+            self.state = scene.start()
+            self.record = self._make_record()
+            notes = self._resume() if restart else None
+            if reason := self._interrupt.signalled():
+                raise Stopped(f"stopped by {reason} while the run was set up; nothing was written")
+            self._prepare(notes)
         self._damage = self._count_damage()
-        self.output_seconds = 0.0
-        self._began = time.perf_counter() if began is None else began
+
+    def _resume(self) -> Notes:
+        """Take up the state of the checkpoint, and what it says beside it."""
+        scene, notes = self.scene, from_root(self.comm, lambda: read_notes(self.folder))
+        stress = scene.balance.stress
+        state = read_checkpoint(self.folder, scene.domain, self.state, stress, self.record, self._surfaces)
+        self.state = scene.stepper.resume(state)
+        if notes.values()["time"]["step"] != scene.study.time.step:  # else the size of the last step goes on
+            self.state = replace(self.state, dt=scene.study.time.step)
+        return notes
 
     @property
     def _graph(self) -> Any:
@@ -71,21 +92,35 @@ class Run:
 
     # --- set-up ---
 
-    def _prepare(self, restart: bool) -> None:
-        study, step = self.scene.study, self.state.step if restart else None
-        on_root(self.comm, lambda: make_folder(self.folder, self._resolved(), restart))
-        root = self.comm.rank == 0
-        self.history = History(self.folder / "history.csv" if root else None, self.scene.probes.names, step)
-        names = study.output.fields if study.output.fields is not None else default_fields(study)
-        self.frames = Frames(self.scene.balance.stress, names, self.scene.fracture)
+    def _prepare(self, notes: Notes | None) -> None:
+        """Open the output, of a run that goes on where there are notes of it."""
+        study, restart, folder = self.scene.study, notes is not None, self.folder
+        step, t = (self.state.step, self.state.t) if restart else (None, None)
+        names, columns = self.scene.probes.names, history_columns(self.scene.probes.names)
+        if step is not None:
+            on_root(self.comm, lambda: check_readable(folder, columns, step))
+        self._interrupt.writing = True
+        on_root(self.comm, lambda: make_folder(folder, self._text, restart=restart))
+        self._saved_at = t  # s, of the last checkpoint
+        self.history = History(self.comm, folder / "history.csv", names, step)
+        fields = study.output.fields if study.output.fields is not None else default_fields(study)
+        self.frames = Frames(self.scene.balance.stress, fields, self.scene.fracture)
         self.inverted = Inverted(self.scene.balance.stress, self.scene.fracture)
-        self.gained = Gained(at_rest=study.initial is None and not restart)
+        self.gained = Gained(at_rest=study.initial is None)
+        self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter)
+        if notes is not None:
+            self.monitors.restore(notes.monitors)
         source = self.scene.domain.source
-        self.fields = FieldsFile(self.folder, source, self.state.t if restart else None) if source is not None else None
+        self.fields = self._written("fields.xdmf", lambda: FieldsFile(folder, source, t) if source else None)
         self._open_surface(restart)
         self._clock = OutputClock(study.output, study.time)
         self._clock.wrote(self.state)
         self._bodies = int(self.comm.bcast(bodies_of(source)[0] if source is not None else None))
+        # it tells how the run ended, which is open again
+        self._written("summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
+
+    def _written[T](self, name: str, work: Callable[[], T]) -> T | None:
+        return written(self.comm, self.folder / name, work)
 
     def _open_surface(self, restart: bool) -> None:
         """The split surface, where the study wants it: imported, built and kept only then."""
@@ -125,18 +160,28 @@ class Run:
         swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
         return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 
-    def _resolved(self) -> str:
-        return study_text(self.scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
-
     # --- the loop ---
 
     def __call__(self) -> dict[str, Any]:
-        """Run to the end; returns what summary.json says. Raises NotConverged or Stopped after a checkpoint."""
-        self._setup_seconds = time.perf_counter() - self._began
-        self._cpu_began = time.process_time()
+        """Run to the end; returns what summary.json says. Raises NotConverged, Stopped or CannotWrite, with where to go
+        on from."""
+        self._meter.begin_steps()
+        try:
+            with self._interrupt:
+                summary = self._run()
+        except CannotWrite as error:
+            raise CannotWrite(f"{error}. {self._rescued()}") from None
+        finally:
+            self.history.close()
+        if self.comm.rank == 0 and self.scene.study.output.picture:
+            _draw(self.folder)
+        return summary
+
+    def _run(self) -> dict[str, Any]:
+        """The loop, and a checkpoint where it does not end well."""
         progress = Progress(self.comm, self.scene.study)
         try:
-            with self._interrupt, progress:
+            with progress:
                 self._loop(progress)
         except (NotConverged, Stopped) as error:
             end_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
@@ -153,23 +198,33 @@ class Run:
             return "No checkpoint was written: the state is not finite"
         return f"Checkpoint: {self._checkpoint()}; go on with --restart"
 
+    def _rescued(self) -> str:
+        """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
+        with contextlib.suppress(CannotWrite):
+            write_summary(self.comm, self.folder, self._summary("could not write"))
+        try:
+            if self.history.step == self.state.step:  # a step without its row would leave a gap
+                return self._saved()
+        except CannotWrite:
+            pass
+        if self._saved_at is None:
+            return "There is no checkpoint"
+        path = checkpoint_path(self.folder)
+        return f"The last good checkpoint: {path} at t = {self._saved_at:g} s; go on with --restart"
+
     def _finish(self, outcome: str) -> dict[str, Any]:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
-        self.history.close()
-        if self.comm.rank == 0:
-            for note in (self.inverted.note(self.scene.study.material.energy), self.gained.note()):
-                if note:
-                    print(f"fracsim: note: {note}", file=sys.stderr)
-            (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-            if self.scene.study.output.picture:
-                _draw(self.folder)
+        write_summary(self.comm, self.folder, summary)
+        say(self.comm, self.monitors.notes(self.scene.study.material.energy))
         return summary
 
     def _loop(self, progress: Progress) -> None:
         state, end = self.state, self.scene.study.time.end
         if state.step == 0:
             self._write_frame()
+        if reason := self._interrupt.signalled():
+            raise Stopped(f"stopped by {reason} before the first step, at t = {state.t:g} s")
         last = time.monotonic()
         every = self.scene.study.output.checkpoint
         while state.t < end * (1 - 1e-12):
@@ -195,19 +250,24 @@ class Run:
         began = time.perf_counter()
         fields = self.frames(self.state, self._damage[2])
         self.inverted.look(self.state.t)
-        if self.fields is not None and self.state.t not in self.fields.times:
-            self.fields.write(self.state.t, fields)
+        self._written("fields.xdmf", lambda: self._write_fields(fields))
         if self.surface is not None:
             self.surface.write(self.state, fields)
         self._clock.wrote(self.state)
-        self.output_seconds += time.perf_counter() - began
+        self._meter.output += time.perf_counter() - began
+
+    def _write_fields(self, fields: list[Field]) -> None:
+        if self.fields is not None and self.state.t not in self.fields.times:
+            self.fields.write(self.state.t, fields)
 
     def _checkpoint(self) -> Path:
         began = time.perf_counter()
+        notes = Notes(self._text, self.monitors.saved())
         path = write_checkpoint(
-            self.folder, self.scene.domain, self.state, self.scene.balance.stress, self.record, self._surfaces
+            self.folder, self.scene.domain, self.state, self.scene.balance.stress, notes, self.record, self._surfaces
         )
-        self.output_seconds += time.perf_counter() - began
+        self._saved_at = self.state.t
+        self._meter.output += time.perf_counter() - began
         return path
 
     # --- figures ---
@@ -227,22 +287,14 @@ class Run:
         return broken, split, pieces.count if pieces is not None else self._bodies
 
     def _summary(self, outcome: str) -> dict[str, Any]:
-        state, stepper, domain = self.state, self.scene.stepper, self.scene.domain
+        state, domain = self.state, self.scene.domain
         broken, split, pieces = self._figures()
         sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
-        memory = total(self.comm, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)[0]
-        cpu = total(self.comm, time.process_time() - self._cpu_began)[0]  # of all ranks, s: hardly feels other work
-        seconds = {"setup": self._setup_seconds, **stepper.phases, "output": self.output_seconds}
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
-            "steps_failed": stepper.trouble.steps_failed, "nodes": int(sizes[0]), "cells": int(sizes[1]),
+            "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces,
-            "smallest_J": self.inverted.least, "inverted_cells": self.inverted.count,
-            "external_work": state.work, "dissipated": state.dissipated, "peak_reactions": self.history.peaks,
-            "seconds": {key: round(value, 4) for key, value in seconds.items()},
-            "wall": round(time.perf_counter() - self._began, 3), "cpu": round(float(cpu), 4),
-            "peak_memory_MiB": round(float(memory), 1),
-            "ranks": self.comm.size, "versions": versions(self.comm),
+            "external_work": state.work, "dissipated": state.dissipated, **self.monitors.summary(),
         }  # fmt: skip
 
 
@@ -257,18 +309,38 @@ def default_fields(study: Study) -> list[str]:
 
 
 def run_study(
-    comm: MPI.Comm, study: Study, folder: Path, *, restart: bool = False, wall_limit: float | None = None
+    comm: MPI.Comm,
+    study: Study,
+    folder: Path,
+    *,
+    restart: bool = False,
+    overwrite: bool = False,
+    wall_limit: float | None = None,
+    source: Path | None = None,
 ) -> dict[str, Any]:
-    """Build, run, draw the last frame; returns the summary (collective)."""
+    """Build, run, draw the last frame; returns the summary (collective).
+
+    `overwrite`: a run in the folder that could go on may be thrown away; `wall_limit`: s from now; `source`: the study
+    file, which must not be written over.
+    """
     began = time.perf_counter()
-    scene = build_scene(comm, study)
-    if scene.domain.source is not None:
-        for note in scene.domain.source.notes:
-            print(f"fracsim: note: {note}", file=sys.stderr)
-    try:
-        return Run(scene, folder, restart=restart, wall_limit=wall_limit, began=began)()
-    finally:
-        scene.destroy()
+    with Interrupt(comm, wall_limit) as interrupt:
+        # at once, not after a mesh of minutes
+        on_root(comm, lambda: _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite))
+        scene = build_scene(comm, study)
+        if scene.domain.source is not None:
+            say(comm, list(scene.domain.source.notes))
+        try:
+            return Run(scene, folder, restart=restart, overwrite=overwrite, interrupt=interrupt, began=began)()
+        finally:
+            scene.destroy()
+
+
+def _check(
+    folder: Path, study: Study, text: str, source: Path | None = None, *, restart: bool, overwrite: bool
+) -> None:
+    inputs = (source, study.mesh.file, study.mesh.surface)
+    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs)
 
 
 def _draw(folder: Path) -> None:

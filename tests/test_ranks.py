@@ -27,7 +27,7 @@ def test_what_one_rank_raises_every_rank_raises(tmp_path: Path) -> None:
         (1, "input", Exit.BAD_INPUT, "fracsim: only here"),
         (1, "not-converged", Exit.NOT_CONVERGED, "fracsim: only here"),
         (1, "exit", 7, "fracsim: rank 1 ended alone"),
-        (0, "disk", Exit.NOT_WRITTEN, "fracsim: cannot write only-here.h5: No space left on device; make room"),
+        (0, "disk", Exit.CANNOT_WRITE, "fracsim: cannot write only-here.h5: No space left on device; make room"),
         (1, "fault", 1, "ValueError: only here"),
     ],
 )

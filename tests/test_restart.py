@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
+import importlib
 import json
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,10 +21,12 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, study, write_study
+from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
-from fracsim.run import Run
+from fracsim.output.fields import Frames
+from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
+from fracsim.study.mesh_source import build_mesh, save_mesh
 
 Data = dict[str, Any]
 Values = npt.NDArray[Any]
@@ -185,8 +190,11 @@ def test_rows_and_frames_after_the_checkpoint_are_written_anew(tmp_path: Path, w
 
 
 def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:
+    """Once it is told to."""
     stopped_after(BAR, tmp_path / "out", 2)
-    run(BAR, tmp_path / "out")
+    with pytest.raises(InputError, match=r"left a checkpoint there \(checkpoint/state\.h5\); go on with --res"):
+        run(BAR, tmp_path / "out")
+    Run(build_scene(MPI.COMM_SELF, study(BAR)), tmp_path / "out", overwrite=True)()
     assert not (tmp_path / "out" / "checkpoint" / "state.h5").exists()
     with pytest.raises(InputError, match="--restart: there is no checkpoint"):
         run(BAR, tmp_path / "out", restart=True)
@@ -216,6 +224,262 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out" / "checkpoint" / "state.h5").write_bytes(b"junk")
     with pytest.raises(InputError, match=r"--restart: cannot read .*state\.h5"):
         run(BAR, tmp_path / "out", restart=True)
+
+
+# --- another study --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"material": {"young": 2e6}}, "material.young was 1000000.0, is 2000000.0"),
+        ({"material": {"energy": "stvk"}}, 'material.energy was "neo-hookean", is "stvk"'),
+        ({"fracture": {"radius": 0.1}}, "fracture.radius was 0.2, is 0.1"),
+        (
+            {"fracture": {"approach": "edge"}, "material": {"energy": "linear"}, "output": {"fields": []}},
+            'material.energy was "neo-hookean", is "linear"; fracture.approach was "chi", is "edge"',
+        ),
+        ({"time": {"scheme": "newmark"}}, 'time.scheme was "generalized-alpha", is "newmark"'),
+        ({"time": {"mass": "consistent"}}, 'time.mass was "lumped", is "consistent"'),
+        ({"damping": None}, "damping.mass was 1.0, is absent; damping.stiffness was 0.0001, is absent"),
+        ({"load": {"gravity": [0.0, -9.81]}}, "load.gravity was absent, is [0.0, -9.81]"),
+        ({"brittle": {"surfaces": 3}}, "brittle.surfaces was absent, is 3"),
+        ({"probe": []}, 'probe.0.name was "grip", is absent; probe.0.on was "right", is absent; probe.1.name was "'),
+        (
+            {"boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [2.0, 0.0]}]},
+            "boundary.1.velocity was [1.0, 0.0], is [2.0, 0.0]",
+        ),
+    ],
+)
+def test_a_restart_of_another_study_is_refused(tmp_path: Path, stopped: Path, tables: Data, message: str) -> None:
+    """With the keys, before anything is built, and nothing is written."""
+    out = shutil.copytree(stopped, tmp_path / "out")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(InputError) as refused:
+        run_study(MPI.COMM_SELF, study(changed(TEARING, **tables)), out, restart=True)
+    assert f"--restart: {out / 'checkpoint' / 'state.h5'} is of another study: {message}" in str(refused.value)
+    assert "Only time.step, time.end, time.adapt, time.smallest, [solver], [output] and the title" in str(refused.value)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_the_study_compared_is_that_of_the_checkpoint(tmp_path: Path, stopped: Path) -> None:
+    """Not study.toml beside it, which may be what the user changed and gives as the study."""
+    out = shutil.copytree(stopped, tmp_path / "out")
+    path = out / "study.toml"
+    path.write_text(path.read_text().replace("density = 1000.0", "density = 1500.0"))
+    result = fracsim("run", path, "-o", out, "--restart", ranks=2)
+    assert result.returncode == Exit.BAD_INPUT
+    assert result.stderr.count("is of another study: material.density was 1000.0, is 1500.0. Only") == 1
+    path.write_text(path.read_text().replace("density = 1500.0", "density = 1000.0"))
+    assert fracsim("run", path, "-o", out, "--restart").returncode == Exit.DONE
+
+
+def test_other_groups_on_the_same_mesh_are_another_mesh(tmp_path: Path) -> None:
+    """A mesh file whose facet groups changed: what was held on the left would be held on the right."""
+    path = tmp_path / "bar.msh"
+    data = build_mesh(study(BAR).mesh)
+    save_mesh(data, path)
+    bar = {**BAR, "mesh": {"file": str(path)}}
+    stopped_after(bar, tmp_path / "out", 2)
+    groups = {**data.facet_groups, "left": data.facet_groups["right"], "right": data.facet_groups["left"]}
+    save_mesh(dataclasses.replace(data, facet_groups=groups), path)
+    with pytest.raises(InputError, match="belongs to another mesh"):
+        run(bar, tmp_path / "out", restart=True)
+
+
+def test_what_may_change_changes(tmp_path: Path, stopped: Path) -> None:
+    """End, steps, solver, output and title; a shorter step is taken at once."""
+    out = shutil.copytree(stopped, tmp_path / "out")
+    other = changed(
+        TEARING, title="strip, on", time={"end": 0.03, "step": 0.001, "adapt": False, "smallest": 1e-6},
+        solver={"snes_rtol": 1e-8}, output={"fields": ["velocity"], "every": 2, "surface": False, "checkpoint": 100.0},
+    )  # fmt: skip
+    done = run(other, out, restart=True)
+    assert done["title"] == "strip, on" and done["time"] == pytest.approx(0.03)
+    assert np.allclose(history(out)["dt"], [0.005] * 4 + [0.001] * 10)
+
+
+@pytest.mark.parametrize("text", ["step,time\r\n1,0.005\r\n", "nothing of a history"])
+def test_a_history_with_other_columns_is_refused(tmp_path: Path, stopped: Path, text: str) -> None:
+    out = shutil.copytree(stopped, tmp_path / "out")
+    (out / "history.csv").write_text(text)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"history\.csv has other columns than this study \(.*move it away to go on"):
+        run(TEARING, out, restart=True)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_fields_that_cannot_be_read_are_refused(tmp_path: Path, stopped: Path) -> None:
+    """As a kill in the middle of a frame may leave them."""
+    out = shutil.copytree(stopped, tmp_path / "out")
+    (out / "fields.h5").write_bytes((out / "fields.h5").read_bytes()[:1000])
+    rows = (out / "history.csv").read_bytes()
+    with pytest.raises(InputError, match=r"cannot read .*fields\.h5 .*; move it away to go on without its frames"):
+        run(TEARING, out, restart=True)
+    assert (out / "history.csv").read_bytes() == rows
+    (out / "fields.h5").unlink()
+    assert run(TEARING, out, restart=True)["outcome"] == "done"
+
+
+# --- a set-up that does not come to its end -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tearing strip, stopped after 4 of 10 steps."""
+    folder = tmp_path_factory.mktemp("stopped") / "out"
+    stopped_after(TEARING, folder, 4)
+    return folder
+
+
+OPENING = ("run.make_folder", "run.History", "run.Frames", "run.FieldsFile", "output.surface.output.SurfaceFiles",
+           "output.surface.output.Surface", "run.OutputClock", "output.writing.os.replace")  # fmt: skip
+
+
+def contents(folder: Path) -> frozenset[tuple[Path, bytes]]:
+    return frozenset((path.relative_to(folder), path.read_bytes()) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_restart_killed_in_its_first_moments_loses_nothing(
+    tmp_path: Path, stopped: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is on the disk before and after each part of its set-up is what a kill leaves: each goes on to the same end.
+
+    There are rows and frames that are later than the checkpoint, so that all files are written anew.
+    """
+    out, states = shutil.copytree(whole, tmp_path / "out"), []
+    shutil.copytree(stopped / "checkpoint", out / "checkpoint")
+
+    def watched(work: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            states.append(shutil.copytree(out, tmp_path / f"state-{len(states)}"))
+            result = work(*arguments, **options)
+            states.append(shutil.copytree(out, tmp_path / f"state-{len(states)}"))
+            return result
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for where in OPENING:
+            owner, _, name = f"fracsim.{where}".rpartition(".")
+            owned = os if owner.endswith(".os") else importlib.import_module(owner)
+            patch.setattr(owned, name, watched(getattr(owned, name)))
+        Run(build_scene(MPI.COMM_SELF, study(TEARING)), out, restart=True)
+    assert all(history(state)["step"][:4].tolist() == [1, 2, 3, 4] for state in states)
+    different = {contents(state): state for state in states}
+    assert len(states) > 20 and len(different) > 6
+    for state in different.values():
+        run(TEARING, state, restart=True)
+        assert_same_run(state, whole)
+        assert not list(state.rglob("*.new"))
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_signal_during_the_set_up_is_neither_lost_nor_destroys(
+    tmp_path: Path, stopped: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, restart: bool
+) -> None:
+    """SIGUSR1 while the scene is built: nothing is written, and what was there is as it was."""
+    out = shutil.copytree(stopped if restart else whole, tmp_path / "out")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    def build(*arguments: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        return build_scene(*arguments)
+
+    monkeypatch.setattr("fracsim.run.build_scene", build)
+    with pytest.raises(Stopped, match=r"^stopped by signal SIGUSR1 while the run was set up; nothing was written$"):
+        run_study(MPI.COMM_SELF, study(TEARING), out, restart=restart)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_signal_while_the_output_is_opened_ends_before_the_first_step(
+    tmp_path: Path, stopped: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, restart: bool
+) -> None:
+    """With a checkpoint, from which the run goes on to the same end."""
+    out = shutil.copytree(stopped, tmp_path / "out") if restart else tmp_path / "out"
+    with monkeypatch.context() as patch:
+
+        def frames(*arguments: Any) -> Any:
+            os.kill(os.getpid(), signal.SIGTERM)
+            return Frames(*arguments)
+
+        patch.setattr("fracsim.run.Frames", frames)
+        with pytest.raises(
+            Stopped, match=r"signal SIGTERM before the first step, at t = .* s\. Checkpoint: .*state\.h5"
+        ):
+            run_study(MPI.COMM_SELF, study(TEARING), out, restart=restart)
+    run(TEARING, out, restart=True)
+    assert_same_run(out, whole)
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_a_signal_right_after_the_start(tmp_path: Path, ranks: int) -> None:
+    """As soon as the handlers are there, long before the first step: exit code 4, one message, no output."""
+    bar = write_study(tmp_path / "bar.toml", BAR)
+    slow = f"""
+import os, sys, time
+import fracsim.run
+build = fracsim.run.build_scene
+def slowly(*arguments):
+    open({str(tmp_path)!r} + f"/ready-{{os.getpid()}}", "w").close()
+    time.sleep(3.0)
+    return build(*arguments)
+fracsim.run.build_scene = slowly
+sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]
+from fracsim.cli import main
+main()
+"""
+    arguments = [*(mpirun(ranks) if ranks else []), sys.executable, "-c", slow]
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 30
+    while time.monotonic() < until and len(list(tmp_path.glob("ready-*"))) < max(ranks, 1):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGUSR1)
+    _, error = process.communicate(timeout=50)
+    assert process.returncode == Exit.STOPPED, error
+    assert error.count("fracsim: stopped by signal SIGUSR1 while the run was set up; nothing was written") == 1
+    assert not (tmp_path / "out").exists()
+
+
+# --- figures over all parts of a run --------------------------------------------------------------------------------
+
+# squeezed beyond nothing and let out again in the first half, which takes halved steps, and still in the second
+SQUEEZED: Data = changed(
+    BAR, material={"energy": "stvk"}, time={"scheme": "backward-euler", "end": 0.08}, solver={"snes_max_it": 6},
+    boundary=[
+        {"on": "left", "fix": "xyz"},
+        {"on": "right", "displacement": {"time": [0.0, 0.02, 0.04], "value": [[0, 0, 0], [-1.2, 0, 0], [0.01, 0, 0]]}},
+    ],
+)  # fmt: skip
+
+
+def test_monitors_go_on_with_a_restart(tmp_path: Path) -> None:
+    """What was seen before the checkpoint, and never again after it, is in the summary of the whole."""
+    part = run(changed(SQUEEZED, time={"end": 0.06}, output={"checkpoint": 1e-9}), tmp_path)
+    assert part["smallest_J"] < 0.2 and part["inverted_cells"] > 0 and part["steps_failed"] > 0
+    (tmp_path / "history.csv").unlink()  # peaks are not taken from its rows
+    found = run(SQUEEZED, tmp_path, restart=True)
+    assert found["time"] == pytest.approx(0.08)
+    for key in ("smallest_J", "inverted_cells", "steps_failed"):
+        assert found[key] == part[key], key
+    assert found["peak_reactions"]["reaction_grip_x"] == part["peak_reactions"]["reaction_grip_x"] > 0
+    for key in ("wall", "cpu"):
+        assert found[key] > part[key] > 0, key
+    for key in ("setup", "solve", "energies", "output"):
+        assert found["seconds"][key] > part["seconds"][key] > 0, key
+    assert found["peak_memory_MiB"] >= part["peak_memory_MiB"]
+
+
+def test_a_gain_of_energy_is_told_after_a_restart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Seen before the checkpoint alone."""
+    first = Run(build_scene(MPI.COMM_SELF, study(BAR)), tmp_path, wall_limit=0.0)
+    first.gained.rise, first.gained.scale = 3.0, 4.0
+    with pytest.raises(Stopped):
+        first()
+    capsys.readouterr()
+    run(BAR, tmp_path, restart=True)
+    assert "the body gained 3 J of energy from nowhere, 75% of all" in capsys.readouterr().err
 
 
 # --- ending early ---------------------------------------------------------------------------------------------------

@@ -6,9 +6,12 @@ clock are all there is; a finite-element checkpoint library would store spaces t
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import os
-from dataclasses import replace
+import json
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +25,8 @@ from ..mesh.domain import Domain
 from ..mesh.ranks import Gather, on_root
 from ..meshes.data import MeshData
 from ..stepping.state import State
+from .own_files import CHECKPOINT
+from .writing import ROOM, hdf5_file, replacing, written
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surfaces import BrittleSurfaces
@@ -30,10 +35,30 @@ if TYPE_CHECKING:
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
 _SOMETIMES = ("drag", "out_of_balance")
+_NOTES = ("study", "monitors")
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What a checkpoint says beside the state: the `study`, as in study.toml, and the `monitors` of the run so far."""
+
+    study: str
+    monitors: dict[str, Any]
+
+    def values(self) -> dict[str, Any]:
+        """The study's tables."""
+        return tomllib.loads(self.study)
 
 
 def checkpoint_path(folder: Path) -> Path:
-    return folder / "checkpoint" / "state.h5"
+    return folder / CHECKPOINT
+
+
+def read_notes(folder: Path) -> Notes:
+    """The notes of a checkpoint (rank 0). InputError where there is none that can be read."""
+    with _opened(folder) as file:
+        study, monitors = (file["notes"][name].asstr()[()] for name in _NOTES)
+        return Notes(study, json.loads(monitors))
 
 
 def write_checkpoint(
@@ -41,12 +66,14 @@ def write_checkpoint(
     domain: Domain,
     state: State,
     stress: Stress,
+    notes: Notes,
     record: EdgeRecord | None = None,
     surfaces: BrittleSurfaces | None = None,
 ) -> Path:
     """Write folder/checkpoint/state.h5, the old one in place until the new one is whole (collective).
 
     `record`: what is remembered of broken edges, in a study with fracture; `surfaces`: in one with brittle cracks.
+    Raises CannotWrite.
     """
     d = domain.dim
     arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
@@ -62,20 +89,25 @@ def write_checkpoint(
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)
-    on_root(domain.comm, lambda: _write(path, arrays, state, domain))
+    written(domain.comm, path, lambda: _write(path, arrays, state, domain, notes))
     return path
 
 
-def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(".new")
-    with h5py.File(new, "w") as file:
+def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain, notes: Notes) -> None:
+    path.parent.mkdir(exist_ok=True)  # not its parents: a folder that is gone is to be told of
+    with replacing(path) as new, hdf5_file(new, _size(arrays, notes), begin=True) as file:
         for name, values in arrays.items():
             file[name] = values
         for name in _CLOCK:
             file.attrs[name] = getattr(state, name)
         file.attrs["mesh"] = fingerprint(domain.source)
-    os.replace(new, path)
+        file["notes/study"], file["notes/monitors"] = notes.study, json.dumps(notes.monitors)
+
+
+def _size(arrays: dict[str, Any], notes: Notes) -> int:
+    """Bytes, a little more than the file will have."""
+    whole = sum(values.nbytes for values in arrays.values() if values is not None)
+    return whole + len(notes.study) + 2 * ROOM + (1 << 10) * (len(arrays) + len(_NOTES))
 
 
 def read_checkpoint(
@@ -90,9 +122,8 @@ def read_checkpoint(
 
     InputError where there is no checkpoint that fits.
     """
-    path, comm = checkpoint_path(folder), domain.comm
-    plastic = stress.material.plastic
-    arrays = on_root(comm, lambda: _read(path, domain.source, record is not None, plastic is not None))
+    comm, plastic = domain.comm, stress.material.plastic
+    arrays = on_root(comm, lambda: _read(folder, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
         head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks"), arrays.get("starts")
@@ -115,18 +146,27 @@ def read_checkpoint(
     return replace(state, **read)
 
 
-def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:
-    """The arrays and the clock; the study can go on with broken edges (`torn_too`), plastic strain (`bent_too`)."""
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[Any]:
+    """The checkpoint, to be read."""
+    path = checkpoint_path(folder)
     if not path.exists():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
     try:
         with h5py.File(path) as file:
-            arrays = {name: data[()] for name, data in file.items()}
-            clock, name = {key: file.attrs[key].item() for key in _CLOCK}, file.attrs["mesh"]
-    except (OSError, KeyError) as error:
+            yield file
+    except (OSError, KeyError, ValueError) as error:
         raise InputError(f"--restart: cannot read {path}: {error}; run without --restart") from None
+
+
+def _read(folder: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:
+    """The arrays and the clock; the study can go on with broken edges (`torn_too`), plastic strain (`bent_too`)."""
+    path = checkpoint_path(folder)
+    with _opened(folder) as file:
+        arrays = {name: data[()] for name, data in file.items() if name != "notes"}
+        clock, name = {key: file.attrs[key].item() for key in _CLOCK}, file.attrs["mesh"]
     if name != fingerprint(mesh):
-        raise InputError(f"--restart: {path} belongs to another mesh; run without --restart")
+        raise InputError(f"--restart: {path} belongs to another mesh; run without --restart in another folder")
     if len(arrays.get("broken", ())) and not torn_too:
         raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
     if "plastic" in arrays and arrays["plastic"][:, -1].any() and not bent_too:
@@ -135,8 +175,12 @@ def _read(path: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> 
 
 
 def fingerprint(mesh: MeshData | None) -> str:
-    """A short name of a mesh's nodes and cells (rank 0, where the mesh is)."""
+    """A short name of a mesh's nodes, cells, groups and regions (rank 0, where the mesh is)."""
     assert mesh is not None
-    digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
-    digest.update(np.ascontiguousarray(mesh.cells).tobytes())
+    digest = hashlib.sha256()
+    for values in (mesh.points, mesh.cells):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    for name, members in sorted([*mesh.facet_groups.items(), *mesh.regions.items()], key=lambda each: each[0]):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(members).tobytes())
     return digest.hexdigest()[:16]

@@ -31,6 +31,14 @@ class Gained:
         self.rise = max(self.rise, balance - self._least)
         self.scale = max(self.scale, held, abs(state.work))
 
+    def monitors(self) -> dict[str, float]:
+        """What a restart goes on from, for `restore`."""
+        return {"energy_rise": self.rise, "energy_scale": self.scale, "energy_least": self._least}
+
+    def restore(self, monitors: dict[str, float]) -> None:
+        """Go on from `monitors`."""
+        self.rise, self.scale, self._least = (monitors[f"energy_{name}"] for name in ("rise", "scale", "least"))
+
     def note(self) -> str:
         """A sentence where it is too much."""
         if self.rise <= SHARE * self.scale:

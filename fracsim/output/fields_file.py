@@ -14,7 +14,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from ..errors import InputError
 from ..meshes.data import MeshData
+from .writing import ROOM, append, hdf5_file, replace_text, replacing
 
 Values = npt.NDArray[np.float64]
 TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
@@ -39,58 +41,72 @@ class FieldsFile:
     """Appends frames; the XML is closed after each, so that the file can be opened while the run goes on."""
 
     def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
-        """`resume_at`: keep the frames up to this time (s)."""
+        """`resume_at`: keep the frames up to this time (s). InputError where they cannot be read."""
         self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
         self._mesh = mesh
         self.times: list[float] = []
+        grids = ""
         if resume_at is not None and self.h5.exists():
-            self._resume(resume_at)
+            grids = self._resume(resume_at)
         else:
             self._begin()
+        replace_text(self.xdmf, _HEAD + grids + _TAIL)
 
     def _begin(self) -> None:
-        with h5py.File(self.h5, "w") as file:
+        size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * ROOM
+        with replacing(self.h5) as new, hdf5_file(new, size, begin=True) as file:
             file["points"] = padded(self._mesh.points)
             file["cells"] = self._mesh.cells.astype(np.int32)
             file.create_group("frames")
-        self.xdmf.write_text(_HEAD + _TAIL)
 
-    def _resume(self, until: float) -> None:
-        self.xdmf.write_text(_HEAD + _TAIL)
-        with h5py.File(self.h5, "a") as file:
-            for name in sorted(file["frames"]):
-                frame = file["frames"][name]
-                if frame.attrs["time"] > until * (1 + 1e-12):
-                    del file["frames"][name]
-                    continue
-                fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
-                self._append_xml(name, float(frame.attrs["time"]), fields)
+    def _resume(self, until: float) -> str:
+        """The XML of the frames that stay; where some go, a file without them takes the place of the old one."""
+        times = read_times(self.h5)
+        kept = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
+        if len(kept) < len(times):
+            self._drop_others(kept)
+        with h5py.File(self.h5) as file:
+            return "".join(self._again(name, file["frames"][name]) for name in kept)
+
+    def _drop_others(self, kept: list[str]) -> None:
+        size = self.h5.stat().st_size
+        with replacing(self.h5) as new, h5py.File(self.h5) as old, hdf5_file(new, size, begin=True) as file:
+            for name in ("points", "cells"):
+                old.copy(name, file)
+            frames = file.create_group("frames")
+            for name in kept:
+                old.copy(old["frames"][name], frames, name)
+
+    def _again(self, name: str, frame: Any) -> str:
+        fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
+        return self._grid(name, float(frame.attrs["time"]), fields)
 
     def write(self, t: float, fields: list[Field]) -> None:
-        """Append the fields at time t (s). Vectors and symmetric tensors may have their 2D number of components."""
+        """Append the fields at time t (s). Vectors and symmetric tensors may have their 2D number of components.
+
+        Raises OSError where there is no room, with the frames before it as they were.
+        """
         fields = [Field(field.name, field.centre, padded(field.values)) for field in fields]
         name = f"{len(self.times):06d}"
-        with h5py.File(self.h5, "a") as file:
+        with hdf5_file(self.h5, ROOM + sum(field.values.nbytes + ROOM for field in fields)) as file:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
                 frame.create_dataset(field.name, data=field.values).attrs["centre"] = field.centre
-        self._append_xml(name, t, fields)
+        append(self.xdmf, (self._grid(name, t, fields) + _TAIL).encode(), over=len(_TAIL))
 
-    def _append_xml(self, name: str, t: float, fields: list[Field]) -> None:
+    def _grid(self, name: str, t: float, fields: list[Field]) -> str:
+        """The XML of one frame, which counts from now on."""
         self.times.append(t)
         attributes = "".join(self._attribute(name, field) for field in fields)
         kind = "Triangle" if self._mesh.dim == 2 else "Tetrahedron"
-        grid = (
+        return (
             f'      <Grid Name="body" GridType="Uniform">\n        <Time Value="{t:.12g}"/>\n'
             f'        <Topology TopologyType="{kind}" NumberOfElements="{len(self._mesh.cells)}">'
             f"{self._item('cells', self._mesh.cells.shape, 'Int')}</Topology>\n"
             f'        <Geometry GeometryType="XYZ">{self._item("points", (len(self._mesh.points), 3))}</Geometry>\n'
             f"{attributes}      </Grid>\n"
         )
-        with self.xdmf.open("r+b") as file:
-            file.seek(-len(_TAIL), 2)
-            file.write((grid + _TAIL).encode())
 
     def _attribute(self, frame: str, field: Field) -> str:
         shape = field.values.shape
@@ -107,6 +123,15 @@ class FieldsFile:
             f'<DataItem Dimensions="{dimensions}" NumberType="{number}" Precision="{precision}" Format="HDF">'
             f"{self.h5.name}:/{path}</DataItem>"
         )
+
+
+def read_times(h5: Path) -> dict[str, float]:
+    """Name -> time (s) of every frame of a fields.h5. InputError where it cannot be read."""
+    try:
+        with h5py.File(h5) as file:
+            return {name: float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])}
+    except (OSError, KeyError, RuntimeError) as error:
+        raise InputError(f"--restart: cannot read {h5} ({error}); move it away to go on without its frames") from None
 
 
 def padded(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:

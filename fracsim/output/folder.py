@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import platform
-import shutil
+import tomllib
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,28 +16,48 @@ from .. import __version__
 from ..errors import InputError
 from ..stepping.state import State
 from ..study import Output, Time
-from .checkpoint import checkpoint_path
+from .checkpoint import checkpoint_path, read_notes
+from .fields_file import read_times
+from .history import read_rows
+from .own_files import STUDY, check_not_resumable, check_owner, clear
+from .same_study import check_same_study
+from .writing import reason, replace_text
 
-OWN_FILES = (
-    "study.toml", "history.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json", "last.png",
-)  # fmt: skip
+
+def check_folder(folder: Path, study: str, *, restart: bool, overwrite: bool, inputs: Iterable[Path | None]) -> None:
+    """InputError where a run of this study may not write there, or cannot go on from there; changes nothing (rank 0).
+
+    `study`: as it would stand in study.toml; `overwrite`: a run that may go on may be thrown away; `inputs`: files
+    that the study is read from.
+    """
+    if restart:
+        check_same_study(checkpoint_path(folder), read_notes(folder).values(), tomllib.loads(study))
+        inputs = ()  # study.toml of the run itself is what one goes on with
+    check_owner(folder, inputs)
+    if not restart and not overwrite:
+        check_not_resumable(folder)
 
 
-def make_folder(folder: Path, study: str, restart: bool) -> None:
+def make_folder(folder: Path, study: str, *, restart: bool) -> None:
     """Make the output folder and write study.toml; an earlier run's files go, unless it is continued (rank 0)."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not restart:
-            for path in (*(folder / name for name in OWN_FILES), checkpoint_path(folder)):
-                path.unlink(missing_ok=True)
-            shutil.rmtree(folder / "surface", ignore_errors=True)
-        (folder / "study.toml").write_text(study)
+            clear(folder)
+        replace_text(folder / STUDY, study)
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot write there: {error.strerror}") from None
+        raise InputError(f"--out {folder}: cannot write there: {reason(error)}") from None
+
+
+def check_readable(folder: Path, columns: list[str], step: int) -> None:
+    """InputError where what a run has written so far cannot be continued; changes nothing (rank 0)."""
+    read_rows(folder / "history.csv", columns, step)
+    if (folder / "fields.h5").exists():
+        read_times(folder / "fields.h5")
 
 
 def versions(comm: MPI.Comm) -> dict[str, str]:
-    """What ran: programs, versions, ranks."""
+    """What ran: programs, versions, ranks; by the words of own_files.HEAD, which the head of study.toml has."""
     return {
         "fracsim": __version__,
         "dolfinx": version("fenics-dolfinx"),

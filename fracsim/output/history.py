@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from io import RawIOBase
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
@@ -18,6 +20,7 @@ from ..meshes.words import AXES
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
 from ..study import Probe
+from .writing import replace_text, write_all, written
 
 COLUMNS = (
     "step", "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
@@ -77,49 +80,72 @@ def nearest_node(domain: Domain, point: list[float], key: str) -> Ints:
     return np.array([best[2]] if best[:2] == winner else [], np.int32)
 
 
-class History:
-    """Appends rows on rank 0; every row is flushed, so that a run can be watched and survives being killed."""
+def history_columns(probe_names: list[str]) -> list[str]:
+    """The first line of history.csv."""
+    return [*COLUMNS, *probe_names]
 
-    def __init__(self, path: Path | None, probe_names: list[str], resume_at: int | None = None) -> None:
-        """`path` is None on ranks other than 0; `resume_at`: keep the rows up to this step."""
-        self.columns = [*COLUMNS, *probe_names]
+
+class History:
+    """Appends rows on rank 0, each whole or not at all, so that a run can be watched and survives being killed.
+
+    Attributes:
+        peaks: name -> greatest absolute value of each reaction so far, N.        step: of the last row.
+    """
+
+    def __init__(self, comm: MPI.Comm, path: Path, probe_names: list[str], resume_at: int | None = None) -> None:
+        """`resume_at`: keep the rows up to this step, in a file that takes the place of the old one (collective)."""
+        self.comm, self._path = comm, path
+        self.columns = history_columns(probe_names)
+        self.step = resume_at or 0
         self.peaks = dict.fromkeys((name for name in probe_names if name.startswith("reaction_")), 0.0)
-        self._file = None
-        if path is None:
-            return
-        kept = _rows_until(path, resume_at) if resume_at is not None else []
-        self._file = path.open("w", newline="")
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(self.columns)
-        for row in kept:
-            self._writer.writerow(row)
-            self._note_peaks(dict(zip(self.columns, map(float, row), strict=True)))
+        self._file: RawIOBase | None = written(comm, path, lambda: self._open(resume_at))
+
+    def _open(self, resume_at: int | None) -> RawIOBase:
+        kept = read_rows(self._path, self.columns, resume_at) if resume_at is not None else []
+        replace_text(self._path, "".join(map(_line, [self.columns, *kept])))
+        return self._path.open("ab", buffering=0)
 
     def append(
         self, state: State, report: StepReport, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
     ) -> None:
-        """One row; `damage` is (broken edges, split cells, pieces)."""
+        """One row; `damage` is (broken edges, split cells, pieces). Raises CannotWrite (collective)."""
         values = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
             report.solve.newton, report.solve.krylov, report.seconds, *probes,
         ]  # fmt: skip
-        self._note_peaks(dict(zip(self.columns, values, strict=True)))
-        if self._file is not None:
-            self._writer.writerow([value if isinstance(value, int) else f"{value:.12g}" for value in values])
-            self._file.flush()
+        row = dict(zip(self.columns, values, strict=True))
+        self.peaks = {name: max(peak, abs(float(row[name]))) for name, peak in self.peaks.items()}
+        line = _line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in values])
+        written(self.comm, self._path, lambda: self._write(line.encode()))
+        self.step = state.step
 
-    def _note_peaks(self, row: dict[str, float]) -> None:
-        for name, peak in self.peaks.items():
-            self.peaks[name] = max(peak, abs(row[name]))
+    def _write(self, line: bytes) -> None:
+        assert self._file is not None
+        at = self._file.tell()
+        try:
+            write_all(self._file, line)
+        except OSError:
+            self._file.truncate(at)
+            raise
 
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
 
 
-def _rows_until(path: Path, step: int) -> list[list[str]]:
+def read_rows(path: Path, columns: list[str], until: int) -> list[list[str]]:
+    """The whole rows up to a step. InputError where the file has other columns; none where there is no file."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        rows = list(csv.reader(file))[1:]
-    return [row for row in rows if row and int(row[0]) <= step]
+        head, *rows = [*csv.reader(file)] or [[]]
+    if head and head != columns:
+        raise InputError(
+            f"--restart: {path} has other columns than this study ({', '.join(sorted({*head} ^ {*columns}))}); "
+            "move it away to go on without its rows"
+        )
+    return [row for row in rows if len(row) == len(columns) and int(row[0]) <= until]
+
+
+def _line(values: list[str]) -> str:
+    return ",".join(values) + "\r\n"

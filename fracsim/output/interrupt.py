@@ -12,25 +12,43 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Interrupt:
-    """Catches signals while it is entered; `reason` agrees over the ranks."""
+    """Catches signals while it is entered, as often as one likes; `reason` agrees over the ranks.
+
+    Attributes:
+        writing: something has been written. Before that Ctrl-C ends the program at once, there is nothing to save.
+    """
 
     def __init__(self, comm: MPI.Comm, wall_limit: float | None) -> None:
+        """`wall_limit`: s from now."""
         self.comm = comm
+        self.writing = False
         self._deadline = None if wall_limit is None else time.monotonic() + wall_limit
         self._signal = 0
+        self._entered = 0
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Interrupt:
-        for number in SIGNALS:
-            self._before[number] = signal.signal(number, self._note)
+        self._entered += 1
+        if self._entered == 1:
+            for number in SIGNALS:
+                self._before[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._entered -= 1
+        if not self._entered:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)  # type: ignore[arg-type]
 
     def _note(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not self.writing:
+            raise KeyboardInterrupt
         self._signal = number
+
+    def signalled(self) -> str:
+        """The name of a signal that has come to any rank, empty where there is none (collective)."""
+        worst = self.comm.allreduce(self._signal, op=MPI.MAX)
+        return f"signal {signal.Signals(worst).name}" if worst else ""
 
     def reason(self) -> str:
         """Why to stop now, empty to go on (collective)."""

@@ -47,6 +47,15 @@ class Inverted:
             self.since = t
         self.count = max(self.count, turned)
 
+    def monitors(self) -> dict[str, float]:
+        """What a restart goes on from, for `restore`."""
+        return {"smallest_J": self.least, "inverted_cells": self.count, "inverted_since": self.since}
+
+    def restore(self, monitors: dict[str, Any]) -> None:
+        """Go on from `monitors`."""
+        self.least, self.count = monitors["smallest_J"], monitors["inverted_cells"]
+        self.since = monitors["inverted_since"]
+
     def note(self, energy: str) -> str:
         """A sentence where there were any; `energy` is that of the study."""
         if not self.count:

@@ -11,6 +11,7 @@ OUTCOMES: dict[int, str] = {
     Exit.BAD_INPUT: "refused",
     Exit.NOT_CONVERGED: "not converged",
     Exit.STOPPED: "stopped",
+    Exit.CANNOT_WRITE: "could not write",
 }
 SPEAKER = "fracsim: "  # before every message of the program's own
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Exit, InputError, NotConverged, Stopped
+from ..output.own_files import check_owner, resumable
 from ..study.check import check_study
 from ..study.file import load_study, study_text
 from .outcome import OUTCOMES, SPEAKER, last_words
@@ -38,15 +39,21 @@ class Case:
         return [f"{key}={value}" for key, value in self.values.items()]
 
 
-def run_sweep(study: str, path: Path, sets: list[str], out: Path, *, ranks: int, only_list: bool) -> None:
+def run_sweep(
+    study: str, path: Path, sets: list[str], out: Path, *, ranks: int, only_list: bool, overwrite: bool = False
+) -> None:
     """Run what has not ended well yet, one run after the other; or print the commands. Raises NotConverged at the end
-    where a run failed. `study` is what the user called it, `path` where it is."""
+    where a run failed. `study` is what the user called it, `path` where it is; `overwrite`: runs of another study that
+    have not ended may be thrown away."""
     _refuse_mpirun()
     cases = combinations(sets, out)
     studies = [_validated(path, case) for case in cases]
+    for case, text in zip(cases, studies, strict=True):
+        _check_folder(case, text, path, overwrite)
     if only_list:
         for case, text in zip(cases, studies, strict=True):
-            print(shlex.join(command(study, case, ranks, restart=_state(case, text) == "begun")))
+            how = "restart" if _state(case, text) == "begun" else "overwrite" if overwrite else ""
+            print(shlex.join(command(study, case, ranks, how)))
         return
     outcomes = {}
     for number, (case, text) in enumerate(zip(cases, studies, strict=True), 1):
@@ -138,6 +145,16 @@ def _validated(path: Path, case: Case) -> str:
     return study_text(study)
 
 
+def _check_folder(case: Case, study: str, path: Path, overwrite: bool) -> None:
+    """InputError where a run would meet, or its log replace, what a sweep of this study has not written."""
+    check_owner(case.folder, [path])
+    if _state(case, study) == "new" and resumable(case.folder) and not overwrite:
+        raise InputError(
+            f"--out {case.folder}: a run of another study that has not ended left a checkpoint there; throw it away "
+            "with --overwrite, or give another folder. Nothing was run"
+        )
+
+
 def _refuse_mpirun() -> None:
     if any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
         raise InputError("a sweep starts its runs itself: call it without mpirun and say how many ranks with --ranks")
@@ -146,12 +163,12 @@ def _refuse_mpirun() -> None:
 # --- one run --------------------------------------------------------------------------------------------------------
 
 
-def command(study: str, case: Case, ranks: int, *, restart: bool) -> list[str]:
-    """What runs one case."""
+def command(study: str, case: Case, ranks: int, how: str = "") -> list[str]:
+    """What runs one case; `how`: "restart", "overwrite" or ""."""
     work = ["fracsim", "run", study]
     for override in case.overrides:
         work += ["--set", override]
-    work += ["-o", str(case.folder), *(["--restart"] if restart else [])]
+    work += ["-o", str(case.folder), *([f"--{how}"] if how else [])]
     return work if ranks == 1 else ["mpirun", "-n", str(ranks), *work]
 
 
@@ -185,7 +202,8 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
         (case.folder / "summary.json").unlink(missing_ok=True)  # of an earlier run: it would be taken for this one's
     except OSError as error:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
-    log, work = case.folder / "log.txt", command(study, case, ranks, restart=state == "begun")
+    # what is there may be overwritten: _check_folder has looked
+    log, work = case.folder / "log.txt", command(study, case, ranks, "restart" if state == "begun" else "overwrite")
     with log.open("w") as file, _forwarding() as forward:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
         process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True)

@@ -104,7 +104,7 @@ def _command(trial: Trial, folder: Path) -> list[str]:
     """What is run, inside `folder`; also what a reader of the report runs again."""
     if trial.study is not None:
         (folder / "trial.toml").write_text(tomli_w.dumps(trial.study))
-        work = ["fracsim", "run", "trial.toml", "-o", "run"]
+        work = ["fracsim", "run", "trial.toml", "-o", "run", "--overwrite"]  # a trial cut short begins anew
     else:
         work = ["python3", "-m", *trial.script, "-o", "figures.json"]
     if trial.ranks == 1:

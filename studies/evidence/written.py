@@ -1,6 +1,7 @@
 """Runs on meshes that no builder makes: python -m fracsim.studies.evidence.written NAME -o figures.json.
 
-Writes mesh.msh and trial.toml into the folder it is started in, then does what `fracsim run trial.toml -o run` does.
+Writes mesh.msh and trial.toml into the folder it is started in, then does what
+`fracsim run trial.toml -o run --overwrite` does.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def run_written(make: Callable[[], tuple[Any, dict[str, Any]]]) -> None:
         write_mesh(mesh, Path(FILE["file"]))
         Path("trial.toml").write_text(tomli_w.dumps(study))
     MPI.COMM_WORLD.barrier()
-    sys.argv = ["fracsim", "run", "trial.toml", "-o", "run"]
+    sys.argv = ["fracsim", "run", "trial.toml", "-o", "run", "--overwrite"]
     cli.main()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fields_file import TENSOR, padded
+from ..own_files import FRAME
+from ..writing import append, replace_text
 from .fragments import Fragments
 from .frame import Frame
 
@@ -33,15 +35,14 @@ class SurfaceFiles:
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
         self._columns = columns(dim)
         self._entries = self._kept(resume_at) if resume_at is not None and self._pvd.exists() else []
-        rows = self._kept_rows(resume_at) if self._entries and resume_at is not None else []
+        rows = self._kept_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
         keep = {name for _, name in self._entries}
-        for path in (folder / "surface").glob("surface_*.vtu"):
-            if f"surface/{path.name}" not in keep:
-                path.unlink()
         self._write_pvd()
-        with self._csv.open("w", newline="") as file:
-            csv.writer(file).writerows([self._columns, *rows])
+        replace_text(self._csv, _csv_text([self._columns, *rows]))
+        for path in (folder / "surface").glob("surface_*.vtu"):
+            if FRAME.fullmatch(path.name) and f"surface/{path.name}" not in keep:
+                path.unlink()
 
     @property
     def times(self) -> list[float]:
@@ -51,33 +52,38 @@ class SurfaceFiles:
         """The VTU first, then the files that name it."""
         name = f"surface/surface_{len(self._entries):06d}.vtu"
         write_vtu(self._folder / name, frame)
-        with self._csv.open("a", newline="") as file:
-            csv.writer(file).writerows(_rows(frame.t, frame.pieces))
+        append(self._csv, _csv_text(_rows(frame.t, frame.pieces)).encode())
         self._entries.append((frame.t, name))
         self._write_pvd()
         return self._folder / name
 
     def _write_pvd(self) -> None:
         entries = (f'    <DataSet timestep="{t:.12g}" file="{name}"/>\n' for t, name in self._entries)
-        new = self._pvd.with_suffix(".new")
-        new.write_text(_HEAD + "".join(entries) + _TAIL)
-        os.replace(new, self._pvd)
+        replace_text(self._pvd, _HEAD + "".join(entries) + _TAIL)
 
     def _kept(self, until: float) -> list[tuple[float, str]]:
         entries = read_collection(self._pvd)
         return [(t, name) for t, name in entries if t <= until * (1 + 1e-9) and (self._folder / name).exists()]
 
-    def _kept_rows(self, until: float) -> list[list[str]]:
+    def _kept_rows(self) -> list[list[str]]:
+        """Whole rows of the frames that are kept."""
+        times = {f"{t:.12g}" for t in self.times}
         if not self._csv.exists():
             return []
         with self._csv.open(newline="") as file:
             rows = list(csv.reader(file))[1:]
-        return [row for row in rows if row and float(row[0]) <= until * (1 + 1e-9)]
+        return [row for row in rows if len(row) == len(self._columns) and row[0] in times]
 
 
 def read_collection(pvd: Path) -> list[tuple[float, str]]:
     """(time in s, file relative to the folder) of every frame of a surface.pvd."""
     return [(float(t), name) for t, name in _ENTRY.findall(pvd.read_text())]
+
+
+def _csv_text(rows: list[list[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    return text.getvalue()
 
 
 def columns(dim: int) -> list[str]:
@@ -97,16 +103,20 @@ def _rows(t: float, pieces: Fragments) -> list[list[str]]:
 
 
 def write_vtu(path: Path, frame: Frame) -> None:
-    """One unstructured grid of triangles and segments, data appended and compressed (VTK's own writer)."""
+    """One unstructured grid of triangles and segments, data appended and compressed (VTK's own writer).
+
+    Through memory: VTK on a full disk prints what it thinks of it and does not say why.
+    """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(path))
+    writer.WriteToOutputStringOn()
     writer.SetInputData(_grid(frame))
     writer.SetDataModeToAppended()
     writer.SetCompressionLevel(1)  # level 5 is half as fast and saves 4 %
     if not writer.Write():
-        raise OSError(f"{path} could not be written")
+        raise OSError("VTK cannot write it")
+    path.write_text(writer.GetOutputString())
 
 
 def _grid(frame: Frame) -> Any:

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from ...fracture.record import EdgeRecord
 from ...mechanics.material import PerCell
 from ...mesh.domain import Domain
-from ...mesh.ranks import on_root
 from ...stepping.state import State
 from ..fields_file import Field
+from ..writing import written
 from .files import SurfaceFiles
 from .frame import Surface
 
@@ -50,10 +50,11 @@ class SurfaceOutput:
                 surface.replay(surface.skeleton.of_edges(broken[0], broken[1][:, 0]), files.times)
             return surface, files
 
-        self.made = on_root(domain.comm, begin)
+        self._path = folder / "surface.pvd"
+        self.made = written(domain.comm, self._path, begin)
 
     def write(self, state: State, fields: list[Field]) -> None:
-        """A frame at the time of the state, with the gathered fields of fields.xdmf (collective)."""
+        """A frame at the time of the state, with the fields of fields.xdmf. Raises CannotWrite (collective)."""
         domain, d = self._domain, self._domain.dim
         gathered: list[Any] = [domain.gather_nodes(each.reshape(-1, d)) for each in (state.u, state.v)]
         pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
@@ -70,4 +71,4 @@ class SurfaceOutput:
                 surface.update(pattern, cut)
             files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields))
 
-        on_root(domain.comm, work)
+        written(domain.comm, self._path, work)

@@ -1,0 +1,112 @@
+"""summary.json: outcome, totals and timings of a run, over all of its restarts."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from ..mesh.ranks import total
+from ..stepping.stepper import Stepper
+from .energy_gain import Gained
+from .folder import versions
+from .history import History
+from .inverted_cells import Inverted
+from .writing import replace_text, written
+
+
+class Meter:
+    """What a run has used so far: seconds by phase, wall and processor time, memory, steps that failed.
+
+    Attributes:
+        setup, output: s of this part of the run.
+    """
+
+    def __init__(self, comm: MPI.Comm, stepper: Stepper, began: float | None) -> None:
+        """`began`: when the work on the scene began (perf_counter), now where it is None."""
+        self._comm, self._stepper = comm, stepper
+        self._began = time.perf_counter() if began is None else began
+        self._cpu_began = time.process_time()
+        self.setup, self.output = 0.0, 0.0
+        self._earlier: dict[str, Any] = {"steps_failed": 0, "wall": 0.0, "cpu": 0.0, "memory": 0.0, "seconds": {}}
+
+    def begin_steps(self) -> None:
+        """The set-up is over."""
+        self.setup = time.perf_counter() - self._began
+        self._cpu_began = time.process_time()
+
+    def read(self) -> dict[str, Any]:
+        """Of all parts of the run, for `restore` and for summary.json; s and MiB (collective)."""
+        earlier = self._earlier
+        # of all ranks: processor time hardly feels other work
+        cpu, memory = total(self._comm, [time.process_time() - self._cpu_began, _peak_memory()])
+        seconds = {"setup": self.setup, **self._stepper.phases, "output": self.output}
+        return {
+            "steps_failed": earlier["steps_failed"] + self._stepper.trouble.steps_failed,
+            "wall": earlier["wall"] + time.perf_counter() - self._began,
+            "cpu": earlier["cpu"] + float(cpu),
+            "memory": max(earlier["memory"], float(memory)),
+            "seconds": {
+                name: earlier["seconds"].get(name, 0.0) + seconds.get(name, 0.0)
+                for name in dict.fromkeys([*seconds, *earlier["seconds"]])
+            },
+        }
+
+    def restore(self, monitors: dict[str, Any]) -> None:
+        """Go on from what `read` gave."""
+        self._earlier = {name: monitors[name] for name in self._earlier}
+
+
+class Monitors:
+    """All that is watched from step to step and goes on with a restart."""
+
+    def __init__(self, history: History, inverted: Inverted, gained: Gained, meter: Meter) -> None:
+        self.history, self.inverted, self.gained, self.meter = history, inverted, gained, meter
+
+    def saved(self) -> dict[str, Any]:
+        """For a checkpoint (collective)."""
+        watched = self.inverted.monitors() | self.gained.monitors() | {"peak_reactions": self.history.peaks}
+        return watched | self.meter.read()
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from those of a checkpoint."""
+        for monitor in (self.inverted, self.gained, self.meter):
+            monitor.restore(saved)
+        self.history.peaks |= saved["peak_reactions"]
+
+    def summary(self) -> dict[str, Any]:
+        """Their part of summary.json (collective)."""
+        used = self.meter.read()
+        return {
+            "steps_failed": used["steps_failed"], "smallest_J": self.inverted.least,
+            "inverted_cells": self.inverted.count, "peak_reactions": self.history.peaks,
+            "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
+            "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
+            "ranks": self.history.comm.size, "versions": versions(self.history.comm),
+        }  # fmt: skip
+
+    def notes(self, energy: str) -> list[str]:
+        """Sentences on what makes the result doubtful; `energy` is that of the study."""
+        return [note for note in (self.inverted.note(energy), self.gained.note()) if note]
+
+
+def write_summary(comm: MPI.Comm, folder: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json in one go. Raises CannotWrite (collective)."""
+    path = folder / "summary.json"
+    written(comm, path, lambda: replace_text(path, json.dumps(summary, indent=2) + "\n"))
+
+
+def say(comm: MPI.Comm, notes: list[str]) -> None:
+    """Tell the user, once."""
+    for note in notes if comm.rank == 0 else ():
+        print(f"fracsim: note: {note}", file=sys.stderr)
+
+
+def _peak_memory() -> float:
+    """MiB of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
