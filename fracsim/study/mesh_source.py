@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from ..errors import InputError
 from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
+from ..meshes.parameters import is_number
 from . import Mesh
 from .explain import explain, unknown_key
 
@@ -39,6 +40,11 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
         return TypeAdapter(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
         raise InputError(explain(error.errors(), "mesh")) from None
+    except ArithmeticError:  # the count of its cells overflows, or there are none
+        given = ", ".join(f"{key} = {value}" for key, value in parameters.items())
+        raise InputError(
+            f"mesh: {kind.name} with {given}: numbers do not reach that far; take a larger h (lengths are in metres)"
+        ) from None
 
 
 def _check_source(mesh: Mesh) -> None:
@@ -52,7 +58,7 @@ def _check_source(mesh: Mesh) -> None:
     if not Path(path).is_file():
         raise InputError(f'mesh.{key} = "{path}": there is no such file')
     h = mesh.parameters.get("h")
-    if key == "surface" and (not isinstance(h, int | float) or isinstance(h, bool) or h <= 0):
+    if key == "surface" and not (h is not None and is_number(h) and h > 0):
         raise InputError(f"mesh.h = {h}: a surface is filled with cells of size h > 0 (m)")
 
 
