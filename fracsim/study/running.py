@@ -1,23 +1,23 @@
-"""[time], [[probe]], [output] and [solver]: how a study is run, and what is kept of it."""
+"""[time], [[probe]] and [output]: how a study is run, and what is kept of it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from .loading import Where
-from .values import Finite, Flag, Positive, Table, Vector
+from .values import Finite, Flag, Positive, Seconds, Table, Vector
 
 
 class Time(Table):
     """[time]: scheme and steps."""
 
     scheme: Literal["backward-euler", "newmark", "generalized-alpha", "explicit", "quasi-static"] = "generalized-alpha"
-    step: Positive  # s
-    end: Positive  # s
+    step: Seconds  # s
+    end: Seconds  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
-    smallest: Positive | None = None  # s; default step / 1024
+    smallest: Seconds | None = None  # s; default step / 1024
     mass: Literal["lumped", "consistent"] = "lumped"
     beta: Annotated[Finite, Field(gt=0, le=0.5)] = 0.25  # Newmark
     gamma: Annotated[Finite, Field(ge=0.5, le=1)] = 0.5  # Newmark
@@ -84,17 +84,15 @@ class Output(Table):
     picture: Flag = True  # a PNG of the last frame
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
 
+    @field_validator("fields")
+    @classmethod
+    def _each_once(cls, fields: list[str] | None) -> list[str] | None:
+        if twice := [name for name in fields or [] if (fields or []).count(name) > 1]:
+            raise ValueError(f'"{twice[0]}" is given twice; name each field once')
+        return fields
+
     @model_validator(mode="after")
     def _one_clock(self) -> Output:
         if self.every is not None and self.interval is not None:
             raise ValueError("give every (in steps) or interval (in s), not both")
         return self
-
-
-def _is_setting(value: Any) -> Any:
-    if not isinstance(value, bool | int | float | str):
-        raise ValueError(f"{value!r} is not a PETSc option, which is a number, a text, true or false")
-    return value
-
-
-Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
