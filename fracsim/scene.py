@@ -7,7 +7,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from .forms.schemes import BackwardEuler, CentralDifference, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
+from .forms.schemes import Scheme
 from .mechanics.balance import Equilibrium
 from .mechanics.material import material_fields
 from .mechanics.supports import check_supports
@@ -61,16 +61,7 @@ def build_scene(comm: MPI.Comm, study: Study) -> Scene:
 
 def make_scheme(timing: Time) -> Scheme:
     """The time scheme of a study."""
-    if timing.scheme == "newmark":
-        return Newmark(timing.beta, timing.gamma)
-    if timing.scheme == "generalized-alpha":
-        return GeneralizedAlpha(timing.rho)
-    others: dict[str, type[Scheme]] = {
-        "backward-euler": BackwardEuler,
-        "explicit": CentralDifference,
-        "quasi-static": QuasiStatic,
-    }
-    return others[timing.scheme]()
+    return timing.kind(**timing.parameters)
 
 
 def make_stepper(equations: Equilibrium, solver: Solver | None, timing: Time, fracture: Any) -> Stepper:

@@ -135,12 +135,12 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _explicit_steps_once(self) -> Study:
-        if self.time.scheme == "explicit" and self.fracture is not None and self.fracture.passes > 1:
+        if not self.time.kind.implicit and self.fracture is not None and self.fracture.passes > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 
     @model_validator(mode="after")
     def _rest_has_no_velocity(self) -> Study:
-        if self.time.scheme == "quasi-static" and self.initial is not None:
+        if not self.time.kind.inertia and self.initial is not None:
             raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
         return self
