@@ -142,6 +142,10 @@ REFUSED: list[tuple[Data, str]] = [
     (held_at("a\nb"), 'boundary.0.on = "a\\nb": the mesh has no such facet group'),
     (held_at("a" * 10**6), "aaa ... aaa"),
     (changed(BAR, output={"interval": 0.1}), "output: give every (in steps) or interval (in s), not both"),
+    (
+        changed(STRIP, fracture={"heterogeneity": {"modulus": 1e-300}}),
+        "fracture.heterogeneity.modulus = 1e-300: must be greater than or equal to 0.1",
+    ),
     # tables over time
     (moving([0, 1], [[0, 0, 0]]), "2 times but 1 values; give one value for each time"),
     (moving([1, 0], [[0, 0, 0]] * 2), "times must increase"),
