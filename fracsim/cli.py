@@ -166,12 +166,12 @@ def list_() -> None:
 def find_study(name: str) -> Path:
     """A path as it is, or the name of a study in the package."""
     path = Path(name)
-    if path.exists():
+    if os.path.exists(path):  # unlike Path.exists it does not mind a name that is too long
         return path
     from .studies import folder
 
     packaged = folder() / (name if name.endswith(".toml") else f"{name}.toml")
-    return packaged if packaged.exists() and path.parent == Path() else path
+    return packaged if os.path.exists(packaged) and path.parent == Path() else path
 
 
 def _load(comm: Any, path: Path, overrides: list[str], folder: Path) -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+LONGEST = 1000  # characters of a message
+
 
 class Exit(IntEnum):
     """Exit codes of every command."""
@@ -19,6 +21,11 @@ class FracsimError(Exception):
     """The message says what is wrong, where, what is allowed and what to do. Raised on all ranks alike."""
 
     exit_code = Exit.BAD_INPUT
+
+    def __init__(self, message: str) -> None:
+        """`message` becomes one line of bearable length: values of a file may hold line breaks, or a million digits."""
+        line = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in message)
+        super().__init__(line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}")
 
 
 class InputError(FracsimError):

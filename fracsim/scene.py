@@ -12,7 +12,7 @@ from typing import Any
 from dolfinx import fem
 from mpi4py import MPI
 
-from .forms.schemes import BackwardEuler, CentralDifference, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
+from .forms.schemes import Scheme
 from .mechanics.balance import Balance
 from .mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
 from .mechanics.loads import DeadLoads, Pressure
@@ -251,16 +251,7 @@ def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
 
 def make_scheme(timing: Time) -> Scheme:
     """The time scheme of a study."""
-    if timing.scheme == "newmark":
-        return Newmark(timing.beta, timing.gamma)
-    if timing.scheme == "generalized-alpha":
-        return GeneralizedAlpha(timing.rho)
-    others: dict[str, type[Scheme]] = {
-        "backward-euler": BackwardEuler,
-        "explicit": CentralDifference,
-        "quasi-static": QuasiStatic,
-    }
-    return others[timing.scheme]()
+    return timing.kind(**timing.parameters)
 
 
 def make_stepper(balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None) -> Stepper:

@@ -104,11 +104,15 @@ def write_study(path: Path, base: dict[str, Any], **tables: Any) -> Path:
 
 
 def fracsim(
-    *arguments: str | Path, ranks: int = 0, timeout: float = 60, env: dict[str, str] | None = None
+    *arguments: str | Path,
+    ranks: int = 0,
+    timeout: float = 60,
+    env: dict[str, str] | None = None,
+    cwd: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own, under mpirun where `ranks` are given."""
     return subprocess.run(
-        command(*arguments, ranks=ranks), capture_output=True, text=True, timeout=timeout, env=env, check=False
+        command(*arguments, ranks=ranks), capture_output=True, text=True, timeout=timeout, env=env, cwd=cwd, check=False
     )
 
 

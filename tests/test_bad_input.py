@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,18 @@ REFUSED: list[tuple[Data, str]] = [
     (changed(BAR, time={"smallest": 1.0}), "time: smallest = 1 s is longer than step = 0.01 s"),
     (changed(BAR, time={"scheme": "newmark", "beta": 0.1}), "raise beta"),
     (changed(BAR, output={"every": 0}), "output.every = 0: must be greater than or equal to 1"),
+    (changed(BAR, time={"step": 5e-324}), "time.step: 4.94066e-324 s is out of reach; allowed are 1e-30 to 1e30 s"),
+    (changed(BAR, time={"smallest": 5e-324}), "time.smallest: 4.94066e-324 s is out of reach"),
+    (changed(BAR, mesh={"h": 5e-324}), "take a larger h (lengths are in metres)"),
+    (changed(BAR, mesh={"size": [1e308] * 3}), "take a larger h (lengths are in metres)"),
+    (changed(BAR, output={"fields": ["stress", "stress"]}), 'output.fields: "stress" is given twice; name each field'),
+    (held_at("a\nb"), 'boundary.0.on = "a\\nb": the mesh has no such facet group'),
+    (held_at("a" * 10**6), "aaa ... aaa"),
     (changed(BAR, output={"interval": 0.1}), "output: give every (in steps) or interval (in s), not both"),
+    (
+        changed(STRIP, fracture={"heterogeneity": {"modulus": 1e-300}}),
+        "fracture.heterogeneity.modulus = 1e-300: must be greater than or equal to 0.1",
+    ),
     # tables over time
     (moving([0, 1], [[0, 0, 0]]), "2 times but 1 values; give one value for each time"),
     (moving([1, 0], [[0, 0, 0]] * 2), "times must increase"),
@@ -219,6 +231,8 @@ REFUSED: list[tuple[Data, str]] = [
         changed(BAR) | {"mesh": {"file": __file__, "h": 1.0}},
         "mesh.h is not a known key beside mesh.file; known here: file, scale",
     ),
+    (changed(BAR) | {"mesh": {"surface": __file__, "h": np.nan}}, "mesh.h = nan: a surface is filled with cells of"),
+    (changed(BAR) | {"mesh": {"surface": __file__, "h": np.inf}}, "mesh.h = inf: a surface is filled with cells of"),
     (changed(BAR) | {"mesh": {"surface": __file__}}, "mesh.h = None: a surface is filled with cells of size h > 0"),
     (changed(BAR) | {"mesh": {"surface": __file__, "h": 1.0, "scale": 0}}, "mesh.scale = 0: metres for each unit of"),
     (changed(BAR) | {"mesh": {"file": __file__, "scale": [1]}}, "mesh.scale = [1]: metres for each unit of length"),
@@ -233,6 +247,96 @@ def test_check_refuses(data: Data, message: str) -> None:
         check_study(validate(data, "test.toml"))
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+# --- [solver]: a study is data ----------------------------------------------------------------------------------------
+
+NO_CODE = "options of [solver] load no code"
+NO_FILE = "options of [solver] neither load code nor read or write files"
+NO_TARGET = "that name neither a file nor a viewer"
+NO_DATA: list[tuple[Data, str]] = [
+    # code: types at any prefix of an inner solver, in a list, and what names the class
+    ({"pc_type": "python"}, NO_CODE),
+    ({"ksp_type": "python"}, NO_CODE),
+    ({"snes_type": "python"}, NO_CODE),
+    ({"tao_type": "python"}, NO_CODE),
+    ({"snes_linesearch_type": "shell"}, NO_CODE),
+    ({"mg_levels_pc_type": "python"}, NO_CODE),
+    ({"fieldsplit_0_pc_type": "PYTHON"}, NO_CODE),
+    ({"pc_composite_pcs": "ilu,python"}, NO_CODE),
+    ({"pc_composite_pcs": "python,ilu"}, NO_CODE),
+    ({"pc_python_type": "module.Class"}, NO_FILE),
+    ({"mg_levels_1_pc_python_type": "evil"}, NO_FILE),
+    ({"mat_python_type": "a.b"}, NO_FILE),
+    ({"ksp_monitor_python": "evil.look"}, NO_FILE),
+    ({"dll_append": "evil"}, NO_FILE),
+    ({"library_preload": True}, NO_FILE),
+    # files
+    ({"options_file": "more"}, NO_FILE),
+    ({"pc_mg_dump_binary": True}, NO_FILE),
+    ({"pc_bddc_save": 0}, NO_FILE),
+    ({"mat_mumps_ooc_tmpdir": "here"}, NO_FILE),
+    ({"snes_mf_noise_file": "noise"}, NO_FILE),
+    ({"malloc_dump": True}, NO_FILE),
+    ({"log_view": ":log.txt"}, NO_TARGET),
+    ({"ksp_view": "ascii:study.toml"}, NO_TARGET),
+    ({"ksp_view_mat": "binary:F"}, NO_TARGET),
+    ({"ksp_view_mat": "binary"}, NO_TARGET),  # writes "binaryoutput"
+    ({"ksp_view_mat": "xbinary"}, NO_TARGET),  # PETSc compares the end only
+    ({"ksp_view_rhs": "ascii,hdf5"}, NO_TARGET),
+    ({"snes_view_solution": "hdf5:u.h5"}, NO_TARGET),
+    ({"snes_view_solution": "vtk"}, NO_TARGET),
+    ({"snes_monitor": ":F"}, NO_TARGET),
+    ({"snes_linesearch_monitor": "ascii:F"}, NO_TARGET),
+    ({"ksp_converged_reason": "::ascii_info:append"}, NO_TARGET),
+    ({"mg_levels_ksp_monitor": "socket"}, NO_TARGET),
+    ({"pc_hypre_type": "/tmp/evil.so"}, NO_TARGET),
+    ({"pc_hypre_type": "..\\evil"}, NO_TARGET),
+    ({"ksp_rtol": "1e-3 -pc_type lu"}, NO_TARGET),
+    ({"ksp_rtol": "1e-3\n-pc_type"}, NO_TARGET),
+    ({"ksp_rtol": "1e-3\n"}, NO_TARGET),
+    # keys that are no name of an option
+    ({"-ksp_rtol": 1e-3}, "no - before it"),
+    ({"ksp_rtol\n": 1e-3}, "a letter first"),
+    ({"ksp_rtol 1 -x_pc_type": "lu"}, "a letter first"),
+    ({"": 1}, "a letter first"),
+    ({"k" * 600: 1}, "a letter first"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), NO_DATA, ids=[ascii(each)[:50] for each, _ in NO_DATA])
+def test_options_that_are_no_data_are_refused(options: Data, message: str) -> None:
+    """By `validate` alone, which every command goes through, with PETSc or without."""
+    with pytest.raises(InputError) as refusal:
+        study(BAR, solver={"ksp_rtol": 1e-6, **options})
+    assert message in str(refusal.value)
+    key = next(iter(options)).replace("\n", "\\n")
+    assert f"solver.{key[:57]}" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_refused_option_runs_no_file(tmp_path: Path) -> None:
+    """What used to: a class of Python beside the study, named by the study."""
+    evil = tmp_path / "evil.py"
+    evil.write_text("open('was-here', 'w').close()\nclass PC: pass\n")
+    path = write_study(tmp_path / "bar.toml", BAR)
+    for command in ("check", "run"):
+        options = ["--set", "solver.pc_type=python", "--set", "solver.pc_python_type=evil.PC"]
+        result = fracsim(command, path, *options, env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path)
+        assert result.returncode == 2
+        assert result.stderr.count("fracsim: ") == 1 and 'solver.pc_type = "python"' in result.stderr
+    assert sorted(each.name for each in tmp_path.iterdir() if each.name != "__pycache__") == ["bar.toml", "evil.py"]
+
+
+def test_monitors_print(tmp_path: Path) -> None:
+    """To the terminal: true, or an empty text; false is as if it were not there."""
+    options = {"ksp_monitor": True, "snes_monitor": "", "ksp_view": "ascii", "ksp_converged_reason": False}
+    assert study(BAR, solver=options).solver == {"ksp_monitor": "", "snes_monitor": "", "ksp_view": "ascii"}
+    path = write_study(tmp_path / "bar.toml", BAR, time={"end": 0.01}, solver=options)
+    result = fracsim("run", path, "-o", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    assert "KSP Residual norm" in result.stdout and "SNES Function norm" in result.stdout
+    assert "KSP Object" in result.stdout and "converged due to" not in result.stdout
 
 
 # --- what only the mesh tells ---------------------------------------------------------------------------------------
@@ -344,6 +448,34 @@ def test_a_study_that_is_not_text(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="cannot read the study file"):
         load_study(path)
+
+
+DEEP = {
+    "study": ('title = "x"\nmesh = ' + "[" * 5000, []),
+    "--set": ("", ["--set", "mesh.size=" + "[" * 5000]),
+    "digits": ("title = " + "1" * 5000, []),
+    "bits": ("", ["--set", "time.end=0x1" + "0" * 5000]),
+    "an index of digits": ("", ["--set", f"boundary.{'9' * 5000}.fix=x"]),
+    "an index that is none": ("", ["--set", "boundary.\u00b2.fix=x"]),
+    "into a number": ("", ["--set", "boundary.1.velocity.0.x=1"]),
+    "a path": ("", ["--set", 'mesh={file="\\u0000"}']),
+    "a step": ("", ["--set", "time.step=5e-324"]),
+    "a size": ("", ["--set", "mesh.h=5e-324"]),
+    "a field": ("", ["--set", 'output.fields=["stress", "stress"]']),
+    "a missing study": (None, []),
+}
+
+
+@pytest.mark.parametrize("case", DEEP)
+def test_no_traceback(tmp_path: Path, case: str) -> None:
+    text, options = DEEP[case]
+    path = write_study(tmp_path / "bar.toml", BAR)
+    if text:
+        path.write_text(text)
+    result = fracsim("check", path if text is not None else "x" * 5000, *options)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr and result.stderr.startswith("fracsim: ")
+    assert result.stderr.count("\n") == 1 and len(result.stderr) < 1100
 
 
 def test_a_missing_study() -> None:

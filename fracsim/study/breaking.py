@@ -12,7 +12,7 @@ from .values import Finite, Flag, NonNegative, Positive, Strength, Table, Vector
 class Heterogeneity(Table):
     """Scatter of the strength from edge to edge, Weibull-distributed with mean 1; the same at any number of ranks."""
 
-    modulus: Positive  # Weibull's m: 5 scatters like stone, 50 hardly at all
+    modulus: Annotated[Finite, Field(ge=0.1)]  # Weibull's m: 5 scatters like stone, 50 hardly at all
     seed: Annotated[int, Field(ge=0)] = 0
 
 

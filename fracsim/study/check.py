@@ -85,7 +85,7 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
 def _check(study: Study, anatomy: Anatomy) -> None:
     _check_groups(study, anatomy)
     _check_dimensions(study, anatomy)
-    if study.time.scheme == "quasi-static":
+    if not study.time.kind.inertia:
         _check_held(study, anatomy.dim)
 
 

@@ -15,6 +15,8 @@ from . import Study
 from .explain import explain
 from .mesh_source import find_builder
 
+_TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or so"
+
 
 def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
     """Read, override (`key.path=value`) and validate. Raises InputError with one message."""
@@ -23,6 +25,7 @@ def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
     for override in overrides:
         _apply(data, override)
     _anchor(data, Path())
+    _check_whole_numbers(data)
     return validate(data, str(path))
 
 
@@ -59,8 +62,21 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(f"cannot read the study file {path}: {error}") from None
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also of a number with thousands of digits
         raise InputError(f"{path} is not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: {_TOO_DEEP}") from None
+
+
+def _check_whole_numbers(value: Any, key: str = "") -> None:
+    """InputError for one beyond TOML's 64 bits: in hexadecimal they may have more digits than Python prints."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for part, each in inner:
+        _check_whole_numbers(each, f"{key}.{part}" if key else str(part))
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise InputError(
+            f"{key} is a whole number of {value.bit_length()} bits; TOML has 64: write 1e30 for 10 to the 30"
+        )
 
 
 def _anchor(data: dict[str, Any], folder: Path) -> None:
@@ -68,6 +84,8 @@ def _anchor(data: dict[str, Any], folder: Path) -> None:
     mesh = data.get("mesh")
     for key in ("file", "surface"):
         if isinstance(mesh, dict) and isinstance(mesh.get(key), str):
+            if not mesh[key].isprintable():
+                raise InputError(f"mesh.{key} = {mesh[key]!a}: a path has no control characters")
             mesh[key] = str((folder / mesh[key]).resolve())
 
 
@@ -77,8 +95,10 @@ def _apply(data: dict[str, Any], override: str) -> None:
         raise InputError(f"--set {override}: write key.path=value, for example --set time.step=1e-3")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         value = text
+    except RecursionError:
+        raise InputError(f"--set {key.strip()}: {_TOO_DEEP}") from None
     *path, last = key.strip().split(".")
     place: Any = data
     for part in path:
@@ -90,15 +110,13 @@ def _apply(data: dict[str, Any], override: str) -> None:
 
 
 def _descend(place: Any, part: str, override: str) -> Any:
-    if isinstance(place, list):
-        return place[_index(place, part, override)]
-    inner = place.setdefault(part, {})
+    inner = place[_index(place, part, override)] if isinstance(place, list) else place.setdefault(part, {})
     if not isinstance(inner, dict | list):
         raise InputError(f"--set {override}: {part} is a value, not a table")
     return inner
 
 
 def _index(place: list[Any], part: str, override: str) -> int:
-    if not part.isdigit() or int(part) >= len(place):
+    if part not in map(str, range(len(place))):
         raise InputError(f"--set {override}: {part} is not an entry; there are {len(place)}, counted from 0")
     return int(part)

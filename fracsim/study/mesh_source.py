@@ -45,6 +45,11 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
         return TypeAdapter(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
         raise InputError(explain(error.errors(), "mesh")) from None
+    except ArithmeticError:  # the count of its cells overflows, or there are none
+        given = ", ".join(f"{key} = {value}" for key, value in parameters.items())
+        raise InputError(
+            f"mesh: {kind.name} with {given}: numbers do not reach that far; take a larger h (lengths are in metres)"
+        ) from None
 
 
 # keys beside the source, and what each of them is

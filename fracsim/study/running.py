@@ -1,39 +1,71 @@
-"""[time], [[probe]], [output] and [solver]: how a study is run, and what is kept of it."""
+"""[time], [[probe]] and [output]: how a study is run, and what is kept of it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from dataclasses import MISSING, fields
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
+from ..forms.schemes import SCHEMES, Scheme
 from .loading import Where
-from .values import Finite, Flag, Positive, Table, Vector
+from .values import Finite, Flag, Positive, Seconds, Table, Vector
 
 
-class Time(Table):
-    """[time]: scheme and steps."""
+class Timing(Table):
+    """[time]: scheme and steps, without the parameters of the schemes."""
 
-    scheme: Literal["backward-euler", "newmark", "generalized-alpha", "explicit", "quasi-static"] = "generalized-alpha"
-    step: Positive  # s
-    end: Positive  # s
+    scheme: str = "generalized-alpha"
+    step: Seconds  # s
+    end: Seconds  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
-    smallest: Positive | None = None  # s; default step / 1024
+    smallest: Seconds | None = None  # s; default step / 1024
     mass: Literal["lumped", "consistent"] = "lumped"
-    beta: Annotated[Finite, Field(gt=0, le=0.5)] = 0.25  # Newmark
-    gamma: Annotated[Finite, Field(ge=0.5, le=1)] = 0.5  # Newmark
-    rho: Annotated[Finite, Field(ge=0, le=1)] = 0.8  # generalized-alpha: what is left of the fastest modes after a step
+
+    @property
+    def kind(self) -> type[Scheme]:
+        """The class of the scheme."""
+        return SCHEMES[self.scheme]
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What the scheme takes: the table has the parameters of all schemes, whichever it is."""
+        return {each.name: getattr(self, each.name) for each in fields(self.kind)}
 
     @model_validator(mode="after")
-    def _order(self) -> Time:
+    def _order(self) -> Timing:
         if self.step > self.end:
             raise ValueError(f"step = {self.step:g} s is longer than the run: end = {self.end:g} s")
         if self.smallest is not None and self.smallest > self.step:
             raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.step:g} s")
-        if self.scheme == "newmark" and 4 * self.beta < self.gamma + 0.5 - 1e-12:
-            raise ValueError("newmark is stable for every step where beta >= (gamma + 1/2) / 4; raise beta")
-        if self.scheme == "explicit" and self.mass == "consistent":
+        self.kind(**self.parameters).check()
+        if not self.kind.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
+
+
+def _keys_of_schemes() -> dict[str, Any]:
+    """Key -> (type with its limits, default) of the parameters of all schemes. TypeError where two disagree."""
+    keys: dict[str, Any] = {}
+    limits: dict[str, Any] = dict.fromkeys(Timing.model_fields)
+    for kind in SCHEMES.values():
+        for each in fields(kind):
+            own = each.default, each.metadata
+            if each.default is MISSING:
+                raise TypeError(f"{kind.__name__}.{each.name} needs a default: [time] has it whichever the scheme is")
+            if limits.setdefault(each.name, own) != own:
+                raise TypeError(f"{kind.__name__}.{each.name}: [time] has this key already, with other limits")
+            keys[each.name] = Annotated[Finite, Field(**each.metadata)], each.default
+    return keys
+
+
+if TYPE_CHECKING:
+    Time = Timing
+else:
+    Time = create_model(
+        "Time", __base__=Timing, __module__=__name__, __doc__="[time]: scheme and steps.",
+        scheme=(Literal[tuple(SCHEMES)], Timing.model_fields["scheme"].default), **_keys_of_schemes(),
+    )  # fmt: skip
 
 
 class Probe(Table):
@@ -84,17 +116,15 @@ class Output(Table):
     picture: Flag = True  # a PNG of the last frame
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
 
+    @field_validator("fields")
+    @classmethod
+    def _each_once(cls, fields: list[str] | None) -> list[str] | None:
+        if twice := [name for name in fields or [] if (fields or []).count(name) > 1]:
+            raise ValueError(f'"{twice[0]}" is given twice; name each field once')
+        return fields
+
     @model_validator(mode="after")
     def _one_clock(self) -> Output:
         if self.every is not None and self.interval is not None:
             raise ValueError("give every (in steps) or interval (in s), not both")
         return self
-
-
-def _is_setting(value: Any) -> Any:
-    if not isinstance(value, bool | int | float | str):
-        raise ValueError(f"{value!r} is not a PETSc option, which is a number, a text, true or false")
-    return value
-
-
-Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]

@@ -4,16 +4,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from annotated_types import Ge, Gt, Len, Lt
+from pydantic import AfterValidator, AllowInfNan, BaseModel, ConfigDict, Discriminator, Strict, Tag, model_validator
 
 # Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Positive = Annotated[Finite, Field(gt=0)]
-NonNegative = Annotated[Finite, Field(ge=0)]
-Strength = Annotated[float, Field(gt=0, strict=True)]  # Pa; inf never breaks
-Poisson = Annotated[Finite, Field(gt=-1, lt=0.5)]
-Flag = Annotated[bool, Field(strict=True)]
-Vector = Annotated[list[Finite], Field(min_length=2, max_length=3)]
+# No Field() in here: it is shared by all keys of the type, and the default of one would become that of the others.
+Finite = Annotated[float, Strict(), AllowInfNan(False)]
+Positive = Annotated[Finite, Gt(0)]
+NonNegative = Annotated[Finite, Ge(0)]
+Strength = Annotated[float, Strict(), Gt(0)]  # Pa; inf never breaks
+Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
+Flag = Annotated[bool, Strict()]
+Vector = Annotated[list[Finite], Len(2, 3)]
+
+
+def _within_reach(time: float) -> float:
+    """What is divided by its square in double precision."""
+    if not 1e-30 <= time <= 1e30:
+        raise ValueError(f"{time:g} s is out of reach; allowed are 1e-30 to 1e30 s")
+    return time
+
+
+Seconds = Annotated[Positive, AfterValidator(_within_reach)]
 
 
 def _kind(value: Any) -> str:
@@ -24,7 +36,7 @@ def _kind(value: Any) -> str:
 Component = Annotated[
     Annotated[Finite, Tag("<number>")] | Annotated[Literal["free"], Tag("<word>")], Discriminator(_kind)
 ]
-Motion = Annotated[list[Component], Field(min_length=2, max_length=3)]
+Motion = Annotated[list[Component], Len(2, 3)]
 
 
 class Table(BaseModel):
@@ -36,7 +48,7 @@ class Table(BaseModel):
 class TimeTable[Value](Table):
     """Values at times in s, linear in between and constant outside."""
 
-    time: Annotated[list[Finite], Field(min_length=1)]
+    time: Annotated[list[Finite], Len(1)]
     value: list[Value]
 
     @model_validator(mode="after")

@@ -7,7 +7,8 @@ from pydantic import Field, field_validator, model_validator
 from .body import Damping, Material, Mesh
 from .breaking import Brittle, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
-from .running import FRACTURE_FIELDS, Output, Probe, Setting, Time
+from .running import FRACTURE_FIELDS, Output, Probe, Time
+from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
 from .values import Table
 
 
@@ -32,7 +33,7 @@ class Study(Table):
     boundary: list[Boundary] = Field(default_factory=list)
     load: Load | None = None
     initial: Initial | None = None
-    solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options, given as they are
+    solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
     probe: list[Probe] = Field(default_factory=list)
     output: Output = Output()
 
@@ -43,6 +44,16 @@ class Study(Table):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two probes have the name {twice[0]}")
         return probes
+
+    @field_validator("solver")
+    @classmethod
+    def _printing_is_a_bare_option(cls, options: Options) -> Options:
+        return spoken(options)
+
+    @model_validator(mode="after")
+    def _options_are_data(self) -> Study:
+        refuse_what_is_no_data(self.solver)
+        return self
 
     @model_validator(mode="after")
     def _fields_exist(self) -> Study:
@@ -124,12 +135,12 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _explicit_steps_once(self) -> Study:
-        if self.time.scheme == "explicit" and self.fracture is not None and (self.fracture.passes or 1) > 1:
+        if not self.time.kind.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 
     @model_validator(mode="after")
     def _rest_has_no_velocity(self) -> Study:
-        if self.time.scheme == "quasi-static" and self.initial is not None:
+        if not self.time.kind.inertia and self.initial is not None:
             raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
         return self
