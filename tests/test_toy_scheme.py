@@ -29,7 +29,7 @@ class Theta(AtTheEnd):
     theta: float = field(default=0.5, metadata={"gt": 0, "le": 1})
     summary: ClassVar[str] = "a toy"
     inertia: ClassVar[bool] = True
-    remembers: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
 
     def rates(self, dt: float) -> tuple[float, float]:
         return 1 / (self.theta * dt) ** 2, 1 / (self.theta * dt)

@@ -23,7 +23,7 @@ class CentralDifference(AtTheEnd):
     summary: ClassVar[str] = "central differences, no system to solve; the step is cut to what the fastest cell allows"
     inertia: ClassVar[bool] = True
     implicit: ClassVar[bool] = False
-    remembers: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
 
     def rates(self, dt: float) -> tuple[float, float]:
         """(0, 1/dt): inertia is not part of the assembled forces."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from .newmark import Newmark
-from .scheme import Array
+from .scheme import Array, driven
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,7 @@ class GeneralizedAlpha:
     rho: float = field(default=0.8, metadata={"ge": 0, "le": 1})
     summary: ClassVar[str] = "second order; rho sets how much of the fastest modes is left after a step"
     inertia: ClassVar[bool] = True
-    rings: ClassVar[bool] = True
-    remembers: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
     implicit: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -63,6 +62,10 @@ class GeneralizedAlpha:
     def finish(self, dt: float, x: Array, u: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         """u_{n+1} = (x - af u_n) / (1 - af), with Newmark's v and a."""
         return self.newmark.finish(dt, (x - self.alpha_f * u) / (1 - self.alpha_f), u, v, a)
+
+    def prescribed(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """By their own law."""
+        return driven(dt, u, start, v)
 
     def _level(self, end: Array, start: Array) -> Array:
         return (1 - self.alpha_f) * end + self.alpha_f * start

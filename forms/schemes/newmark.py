@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from .scheme import Array, AtTheEnd
+from .scheme import Array, AtTheEnd, driven
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,7 @@ class Newmark(AtTheEnd):
     gamma: float = field(default=0.5, metadata={"ge": 0.5, "le": 1})
     summary: ClassVar[str] = "second order; the trapezoidal rule unless beta and gamma say otherwise"
     inertia: ClassVar[bool] = True
-    rings: ClassVar[bool] = True
-    remembers: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
 
     def check(self) -> None:
         """ValueError where only short steps are stable."""
@@ -39,3 +38,7 @@ class Newmark(AtTheEnd):
         """u_a = u_n + dt v_n + dt^2 (1/2 - beta) a_n;  u_v = u_a - beta dt / gamma (v_n + dt (1 - gamma) a_n)."""
         u_a = u + dt * v + (0.5 - self.beta) * dt**2 * a
         return u_a, u_a - (self.beta * dt / self.gamma) * (v + (1 - self.gamma) * dt * a)
+
+    def prescribed(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """By their own law."""
+        return driven(dt, u, start, v)

@@ -27,8 +27,7 @@ class Scheme(Protocol):
     summary: ClassVar[str]  # one line for `fracsim list`
     inertia: ClassVar[bool]
     implicit: ClassVar[bool]
-    rings: ClassVar[bool]  # a jump of a velocity that is prescribed by displacements does not die out
-    remembers: ClassVar[bool]  # a step goes on from the acceleration at its start
+    carries_acceleration: ClassVar[bool]  # a step goes on from the acceleration at its start
 
     @property
     def alpha_f(self) -> float: ...
@@ -45,13 +44,25 @@ class Scheme(Protocol):
     def finish(self, dt: float, x: Array, u: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         """(u, v, a) at the end of the step from the solved x and the state at its start."""
 
+    def prescribed(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """(velocity, acceleration) over a step of dofs whose displacement is prescribed: `start` and u (m) at its ends,
+        v before. None: those of `finish`."""
+
+
+def driven(dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array]:
+    """(velocity, acceleration) of prescribed dofs that move by their own law over a step.
+
+    For schemes in which a jump of a prescribed velocity would not die out: they would swing about it for ever.
+    """
+    rate = (u - start) / dt
+    return rate, (rate - v) / dt
+
 
 class AtTheEnd:
     """Schemes that balance forces at the end of the step: x is u_{n+1} itself."""
 
     implicit: ClassVar[bool] = True
-    rings: ClassVar[bool] = False
-    remembers: ClassVar[bool] = False
+    carries_acceleration: ClassVar[bool] = False
     alpha_f: ClassVar[float] = 0.0
 
     def check(self) -> None:
@@ -61,3 +72,7 @@ class AtTheEnd:
         """(x, c_v (x - u_v), c_a (x - u_a))."""
         (c_a, c_v), (u_a, u_v) = self.rates(dt), self.references(dt, u, v, a)
         return x, c_v * (x - u_v), c_a * (x - u_a)
+
+    def prescribed(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """As all other dofs."""
+        return None

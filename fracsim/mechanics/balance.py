@@ -98,10 +98,9 @@ class Balance:
         self.c_a, self.c_v = scheme.rates(dt)
         where = (1 - late) * motion.at(t) + late * motion.at(t - dt)
         u_a, u_v = scheme.references(dt, u, v, a)
-        if scheme.rings and not late:
-            own, to = motion.owned, where[: len(motion.owned)]
-            rate, change = driven(dt, to, u[own], v[own])
-            u_a[own], u_v[own] = to - change / self.c_a, to - rate / self.c_v
+        own, to = motion.owned, where[: len(motion.owned)]
+        if not late and (led := scheme.prescribed(dt, to, u[own], v[own])) is not None:
+            u_a[own], u_v[own] = to - led[1] / self.c_a, to - led[0] / self.c_v
         self._tell(Level(t - late * dt, dt, u, v, self.c_a, self.c_v, u_a, u_v, 1 - late), where)
 
     def look_at(self, t: float, u: Values, v: Values, a: Values | None = None, *, dt: float | None = None) -> None:
@@ -271,12 +270,3 @@ def _sum(forms: list[Form]) -> Form:
     """The sum of those that are not 0, in their order."""
     present = [form for form in forms if form != 0]
     return sum(present[1:], present[0])
-
-
-def driven(dt: float, u: Values, start: Values, v: Values) -> tuple[Values, Values]:
-    """(velocity, acceleration) of prescribed dofs over a step, from u at its ends and the velocity before.
-
-    They move by their own law: Newmark's formulae would swing about a velocity that jumps for ever.
-    """
-    rate = np.asarray((u - start) / dt, np.float64)
-    return rate, np.asarray((rate - v) / dt, np.float64)

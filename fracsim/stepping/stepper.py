@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from ..mechanics.balance import Balance, driven
+from ..mechanics.balance import Balance
 from ..mesh.ranks import total
 from .after_step import Breaking, Flow, PassResult
 from .energy_book import acting, work_done
@@ -121,7 +121,7 @@ class BalanceStepper:
         unbalanced = balance.stress.force() - applied
         if drag is not None:
             unbalanced = unbalanced + drag
-        if balance.scheme.remembers:
+        if balance.scheme.carries_acceleration:
             a = balance.mass.solve(-unbalanced, free)
         forces = applied + np.where(free, 0.0, unbalanced)
         return replace(state, a=a, forces=forces, drag=drag, memory=self._memory())
@@ -243,8 +243,8 @@ class BalanceStepper:
         balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned
         x = balance.u.x.array[: balance.owned].copy()
         u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
-        if scheme.rings:
-            v[own], a[own] = driven(dt, *(each[own] for each in (u, state.u, state.v)))
+        if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:
+            v[own], a[own] = led
         if scheme.alpha_f:
             self.flow.begin(dt)
             balance.look_at(state.t + dt, u, v, a)

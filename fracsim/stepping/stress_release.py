@@ -37,7 +37,7 @@ def released_state(
     own, forces = balance.motion.owned, end.forces.copy()
     reactions = balance.reactions[own]
     balance.update_reactions()
-    if not balance.scheme.remembers:
+    if not balance.scheme.carries_acceleration:
         forces[own] += balance.reactions[own] - reactions
         return replace(end, forces=forces)
     balance.displace(solved)
