@@ -19,7 +19,7 @@ from .stepper import SolveResult
 DEFAULTS: Options = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
-    "snes_max_it": 25,
+    "snes_max_it": 50,  # near a limit it would be the last digits that decide whether a step is halved
     "snes_rtol": 1e-6,  # 1e-4 takes the first guess for the answer where cells are slivers
     "snes_stol": 0.0,
     "snes_lag_preconditioner": -2,  # made at the first tangent, then kept
@@ -117,26 +117,25 @@ class Solver:
         """
         if self._with_factors:
             self._with_factors -= 1
-            result = self._attempt_directly(guess)
-            if not self._linear_failure(result):
-                return result
+            return self._attempt_directly(guess)
         result = self._attempt_iteratively(guess)
-        if not self._linear_failure(result):
+        if not self._misled(result):
             self._spell = FIRST_SPELL
         elif self._may_factorise():
             result = self._attempt_directly(guess)
-            self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+            if result.converged:
+                self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
         return result
 
     def _attempt_iteratively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         result = self._attempt(guess)
-        if self._linear_failure(result):
+        if self._misled(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
             self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
             result = self._attempt(guess)
             self._preconditioner.keep = self._iterative
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
-        if self._linear_failure(result) and self.snes.ksp.getType() == "cg" and not stalled:
+        if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             self.snes.ksp.setGMRESRestart(RESTART)
@@ -171,8 +170,15 @@ class Solver:
         ksp.setType(kind)
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
 
-    def _linear_failure(self, result: SolveResult) -> bool:
-        return not result.converged and self.snes.ksp.reason < 0
+    def _misled(self, result: SolveResult) -> bool:
+        """Whether it was the linear solves that failed: outright, or by what they found.
+
+        A solution of K d = -r lowers |r| for short steps along it, so a line search that fails was given none: CG may
+        stop on a tangent that is not positive before it notices. Whether it does is a matter of the last digits, and
+        so would be a step that is halved for it.
+        """
+        line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
+        return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
 
     def _attempt(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         self._shrink()
