@@ -197,20 +197,25 @@ class Solver:
     def linear_response(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m.
 
-        0 where the linear solve fails, which is counted: near incompressibility tangents may be indefinite.
+        Near incompressibility tangents may be indefinite: factors where iterations fail. 0 where nothing helps, which
+        is counted.
         """
         self._shrink()
-        with self._factors() if self._with_factors else nullcontext():
+        ways = [nullcontext, self._factors] if self._may_factorise() else [nullcontext]
+        for way in ways[1:] if self._with_factors else ways:
             self.balance.vector.array_w[:] = force
-            if not self._solve_linear():
-                return np.zeros_like(force)
-        result: npt.NDArray[np.float64] = self._correction.array_r.copy()
-        return result
+            with way():
+                solved = self._solve_linear()
+            if solved:
+                return np.asarray(self._correction.array_r.copy())
+        self.linear_failures += 1
+        return np.zeros_like(force)
 
     def _extend(self) -> int:
         """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
         self.balance.extension_residual(self._x, self.balance.vector)
-        self._solve_linear()
+        if not self._solve_linear():
+            self.linear_failures += 1
         self._x.axpy(-1.0, self._correction)
         return int(self.snes.ksp.its)
 
@@ -220,7 +225,6 @@ class Solver:
         self._assemble_tangent(tangent)
         ksp.setOperators(tangent)
         ksp.solve(self.balance.vector, self._correction)
-        self.linear_failures += ksp.reason <= 0
         return bool(ksp.reason > 0)
 
     def _assemble(self, tangent: PETSc.Mat) -> None:
