@@ -134,7 +134,7 @@ def test_equal_bars_exchange_their_velocities(approach: str, energy: str) -> Non
     x = scene.domain.nodes[: scene.domain.node_count, 0]
     left = x < 0.5
     scene.fracture.graph.broken[:] = False
-    scene.fracture.graph.pattern[:] = 0
+    scene.fracture.graph.set_integrity(np.ones(len(scene.fracture.graph.integrity)))
     if scene.balance.stress.chi is not None:
         scene.balance.stress.chi.x.array[:] = 1.0
     cut(scene, 0.5)

@@ -92,20 +92,23 @@ class Breaking:
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
         stress, psi = self.evaluate()
-        broken = self._weaken(*self.criterion(stress))
+        broken, weakened = self._weaken(*self.criterion(stress))
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
         before = [each.x.array.copy() for each in self.stress.fields] if broken else []
-        lost = self.degradation(broken > 0, stress, psi)
-        if broken or lost.loss:
+        lost = self.degradation(weakened > 0, stress, psi)
+        if weakened or lost.loss:
             self.changed()
         return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died, before)
 
-    def _weaken(self, edges: npt.NDArray[np.integer], load: Values) -> int:
-        """Give edges (n,) under a load (n,), in units of their strength, what the law leaves them; how many broke."""
+    def _weaken(self, edges: npt.NDArray[np.integer], load: Values) -> tuple[int, int]:
+        """Give edges (n,) under a load (n,), in units of their strength, what the law leaves them.
+
+        Returns how many broke, and how many lost anything (collective).
+        """
         left = np.ones(len(self.graph.broken))
         np.minimum.at(left, edges, self.law(load))
-        return self.graph.break_edges(left == 0) if self.law.all_or_nothing else self.graph.weaken(left)
+        return (self.graph.break_edges(left == 0),) * 2 if self.law.all_or_nothing else self.graph.weaken(left)
 
     # --- what it remembers ---
 

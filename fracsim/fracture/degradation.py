@@ -44,7 +44,7 @@ class Degradation(Protocol):
     idle: bool  # an edge whose cells have all come apart carries nothing
 
     def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
-        """After a pass that `broke` edges or did not.
+        """After a pass that weakened edges (`broke`) or did not.
 
         `stress` (cells, 3 or 6) in Pa and `psi` (cells,) in J/m^3 are those of the undamaged material.
         """

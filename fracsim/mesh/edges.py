@@ -27,6 +27,7 @@ class EdgeGraph:
             that has the edge.
         broken: (edges,) bool, integrity is 0.
         pattern: (cells,) uint8, bit k set where local edge k is broken.
+        damaged: (cells,) bool, whether any edge is less than whole.
     """
 
     def __init__(self, domain: Domain) -> None:
@@ -43,6 +44,7 @@ class EdgeGraph:
         self.integrity = np.ones(self.edge_count + self.index_map.num_ghosts)
         self.broken = np.zeros(len(self.integrity), bool)
         self.pattern = np.zeros(domain.cell_count, np.uint8)
+        self.damaged = np.zeros(domain.cell_count, bool)
         self._shared = la.vector(self.index_map, 1, np.int32)
 
     @cached_property
@@ -70,19 +72,26 @@ class EdgeGraph:
             self._note_broken(new)
         return count
 
-    def weaken(self, integrity: npt.NDArray[np.float64]) -> int:
-        """Lower integrity to the least (edges,) that any rank gives an edge; returns how many broke (collective)."""
+    def weaken(self, integrity: npt.NDArray[np.float64]) -> tuple[int, int]:
+        """Lower integrity to the least (edges,) that any rank gives an edge (collective).
+
+        Returns how many edges broke, and how many lost anything.
+        """
         least = np.minimum(self.integrity, self._least_of_ranks(integrity))
-        new = (least == 0) & ~self.broken
+        less, new = least < self.integrity, (least == 0) & ~self.broken
         self.integrity[:] = least
         self._note_broken(new)
-        return int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
+        self.damaged |= less[self.cell_edges].any(axis=1)
+        counts = [np.count_nonzero(flags[: self.edge_count]) for flags in (new, less)]
+        broken, weakened = total(self.domain.comm, np.array(counts))
+        return int(broken), int(weakened)
 
     def set_integrity(self, integrity: npt.NDArray[np.float64]) -> None:
         """Be as an earlier time left it: (edges,), owned and ghost."""
         self.integrity[:] = integrity
         self.broken[:], self.pattern[:] = False, 0
         self._note_broken(self.integrity == 0)
+        self.damaged[:] = (self.integrity[self.cell_edges] < 1).any(axis=1)
 
     def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
         """Edges (edges,) are broken from here on."""
@@ -90,6 +99,7 @@ class EdgeGraph:
         touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
         bits = 1 << np.arange(self.cell_edges.shape[1])
         self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
+        self.damaged[touched] = True
 
     def _least_of_ranks(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(edges,) the least value that any rank gives an edge (collective)."""
@@ -120,11 +130,6 @@ class EdgeGraph:
         return int(np.count_nonzero(self.broken[: self.edge_count]))
 
     @property
-    def damaged(self) -> npt.NDArray[np.bool_]:
-        """(cells,) whether any edge is broken."""
-        return self.pattern != 0
-
-    @property
     def split(self) -> npt.NDArray[np.bool_]:
         """(cells,) whether the cell has come apart."""
         return is_split(self.domain.dim)[self.pattern]
@@ -147,9 +152,23 @@ class EdgeGraph:
 
         None on the other ranks (collective).
         """
-        own = np.flatnonzero(self.broken[: self.edge_count])
-        columns = np.empty((len(own), 0)) if values is None else values[own]
-        parts = self.domain.comm.gather((self.edge_keys(own), columns))
+        return self._gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
+
+    def gather_weakened(self) -> Any:
+        """(n, 2) sorted keys of all edges that are not whole on rank 0, and their (n, 1) integrity; None on the other
+        ranks (collective)."""
+        return self._gather(self.integrity < 1, self.integrity[:, None])
+
+    def restore(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
+        """Be as `gather_weakened` said, given on every rank."""
+        values = np.ones(len(self.integrity))
+        local, place = self.find_keys(keys)
+        values[local] = integrity[place, 0]
+        self.set_integrity(values)
+
+    def _gather(self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]) -> Any:
+        own = np.flatnonzero(flags[: self.edge_count])
+        parts = self.domain.comm.gather((self.edge_keys(own), values[own]))
         if parts is None:
             return None
         keys, rows = (np.concatenate(each) for each in zip(*parts, strict=True))

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
 _SOMETIMES = ("drag", "out_of_balance")
+_ON_EVERY_RANK = ("weakened", "integrity", "broken", "breaks", "starts")
 _NOTES = ("study", "monitors")
 
 
@@ -85,6 +86,7 @@ def write_checkpoint(
     if (plastic := stress.material.plastic) is not None:
         arrays["plastic"] = domain.gather_cells(plastic.memory())
     if record is not None:
+        arrays["weakened"], arrays["integrity"] = record.graph.gather_weakened() or (None, None)
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
@@ -126,18 +128,19 @@ def read_checkpoint(
     arrays = on_root(comm, lambda: _read(folder, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
-        head = arrays.pop("clock"), list(arrays), arrays.get("broken"), arrays.get("breaks"), arrays.get("starts")
-    clock, names, broken, breaks, starts = comm.bcast(head)
+        small: dict[str, Any] = {name: arrays.get(name) for name in _ON_EVERY_RANK}
+        head = arrays.pop("clock"), list(arrays), small
+    clock, names, small = comm.bcast(head)
 
     def scattered(gather: Gather, name: str) -> npt.NDArray[Any]:
         return gather.scatter(arrays[name] if arrays is not None else None)
 
     nodal = {name: scattered(domain.gather_nodes, name).reshape(-1) for name in (*_NODAL, *_SOMETIMES) if name in names}
-    if record is not None and broken is not None:
-        record.graph.break_edges(record.graph.flags_of_keys(broken))
-        record.restore(broken, breaks)
-    if surfaces is not None and starts is not None:
-        surfaces.starts = starts
+    if record is not None and small["weakened"] is not None:
+        record.graph.restore(small["weakened"], small["integrity"])
+        record.restore(small["broken"], small["breaks"])
+    if surfaces is not None and small["starts"] is not None:
+        surfaces.starts = small["starts"]
     if stress.chi is not None and "chi" in names:
         stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
@@ -167,7 +170,7 @@ def _read(folder: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -
         clock, name = {key: file.attrs[key].item() for key in _CLOCK}, file.attrs["mesh"]
     if name != fingerprint(mesh):
         raise InputError(f"--restart: {path} belongs to another mesh; run without --restart in another folder")
-    if len(arrays.get("broken", ())) and not torn_too:
+    if len(arrays.get("weakened", ())) and not torn_too:
         raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
     if "plastic" in arrays and arrays["plastic"][:, -1].any() and not bent_too:
         raise InputError(f"--restart: the body in {path} has flowed; the study needs its [plasticity] table")

@@ -201,10 +201,10 @@ class Solver:
         is counted.
         """
         self._shrink()
-        ways = [nullcontext, self._factors] if self._may_factorise() else [nullcontext]
-        for way in ways[1:] if self._with_factors else ways:
+        with_factors = [False, True] if self._may_factorise() else [False]
+        for factors in with_factors[1:] if self._with_factors else with_factors:
             self.balance.vector.array_w[:] = force
-            with way():
+            with self._factors() if factors else nullcontext():
                 solved = self._solve_linear()
             if solved:
                 return np.asarray(self._correction.array_r.copy())

@@ -1,0 +1,102 @@
+"""Integrity of edges is a number in [0, 1] that never rises: of laws that soften, over ranks, and in checkpoints."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from fracsim.fracture.breaking import Breaking
+from fracsim.fracture.edge_law import Brittle
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.run import Run
+from fracsim.scene import build_scene
+from support.ranks import run_on_ranks
+from support.scenes import Values, make_scene, make_study, march
+
+
+class Softening:
+    """1 at the strength, falling linearly to 0 at twice the strength."""
+
+    all_or_nothing = False
+
+    def __call__(self, load: Values) -> Values:
+        """(n,) integrity."""
+        return np.clip(2 - load, 0.0, 1.0)
+
+
+PULL = {
+    "mesh": {"builder": "box", "size": [1.0, 0.5], "h": 0.25},
+    "boundary": [
+        {"on": "left", "fix": "xy"},
+        {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, "free"], [1.0, "free"]]}},
+    ],
+    "fracture": {"strength": 0.05, "tie_break": 0.0, "passes": 1},
+    "time": {"scheme": "quasi-static", "step": 0.0125, "end": 0.2},
+}
+
+
+def test_brittle_is_all_or_nothing() -> None:
+    """Whole below the strength, gone at it."""
+    np.testing.assert_array_equal(Brittle()(np.array([0.0, 0.999, 1.0, 7.0])), [1, 1, 0, 0])
+
+
+def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
+    """A bar at s / strength = 1.25: edges along the load keep 3/4 of themselves and none is broken; chi of a triangle
+    is (3/4 + 1/2) / (1 + 1/2) = 5/6, as the diagonals carry half of the stress along the load (test_fracture)."""
+    scene, state = make_scene(**PULL)
+    part = scene.fracture
+    scene.stepper.breaking = Breaking(part.stress, part.graph, part.criterion, Softening(), passes=1)
+    march(scene, state, 5)
+    graph = part.graph
+    aligned = np.ptp(scene.domain.nodes[graph.edge_nodes][:, :, 1], axis=1) < 1e-9
+    np.testing.assert_allclose(graph.integrity[aligned], 0.75, atol=1e-9)
+    assert np.all(graph.integrity[~aligned] == 1) and not graph.broken.any()
+    np.testing.assert_allclose(scene.balance.stress.chi.x.array, 5 / 6, atol=1e-9)
+    march(scene, state, 8)
+    assert graph.broken[aligned].all() and np.all(graph.integrity[aligned] == 0)
+
+
+def weakened(comm: MPI.Comm) -> tuple[Values, int]:
+    """(n, 1) integrities after each rank has lowered what it sees of the edges, and how many broke (collective)."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"})
+    graph, domain = EdgeGraph(scene.domain), scene.domain
+    values = np.ones(len(graph.integrity))
+    np.minimum.at(values, graph.cell_edges, (domain.cell_input % 5 / 4)[:, None])  # each cell says its own number
+    count = graph.weaken(values)[0]
+    assert graph.weaken(np.ones(len(values))) == (0, 0)  # never rises
+    found = graph.gather_weakened()
+    return (np.column_stack(found) if found is not None else np.empty(0)), count
+
+
+@pytest.mark.parametrize("ranks", (2, 3))
+def test_the_least_of_all_ranks_counts(tmp_path: Path, ranks: int) -> None:
+    """What an edge keeps is the least that any cell says, on whichever rank it is."""
+    alone, count = weakened(MPI.COMM_SELF)
+    found = run_on_ranks("test_edge_law", ranks, tmp_path)
+    np.testing.assert_array_equal(found["integrity"], alone)
+    assert found["count"] == count > 0 and len(np.unique(alone[:, 2])) == 4
+
+
+def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
+    """Integrities between 0 and 1 are those of the run that goes on."""
+    tables = PULL | {"output": {"picture": False}}
+    going = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path)
+    graph = going.scene.fracture.graph
+    graph.weaken(np.random.default_rng(3).choice([0.0, 0.25, 0.5, 1.0], len(graph.integrity)))
+    going.scene.fracture.restored()
+    going.state = going.scene.stepper.remember(going.state)
+    going._checkpoint()
+    again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path, restart=True)
+    np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)
+    np.testing.assert_array_equal(again.scene.fracture.graph.pattern, graph.pattern)
+    assert again.state.memory["damage"].integrity.min() == 0
+
+
+if __name__ == "__main__":
+    integrity, broke = weakened(MPI.COMM_WORLD)
+    if MPI.COMM_WORLD.rank == 0:
+        np.savez(sys.argv[1], integrity=integrity, count=broke)
