@@ -9,7 +9,7 @@ from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
 from ..stepping.after_step import Flow, NoFlow
 from ..study import Brittle, Study
-from ..study.conditions import of_size
+from ..study.conditions import fibre_direction
 from .material import per_cell
 
 if TYPE_CHECKING:
@@ -59,16 +59,14 @@ def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
 
 
 def _strength(study: Study, domain: Domain, graph: Any) -> Strength:
-    """Strength of edges by region, with scatter and a fibre. InputError where the fibre has another dimension."""
+    """Strength of edges by region, with scatter and a fibre."""
     from ..fracture.strength import Fibre, Scatter, Strength
 
     table = study.fracture
     assert table is not None
     scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed)
-    fibre = None
-    if table.fibre is not None:
-        direction = of_size(table.fibre.direction, domain.dim, "fracture.fibre.direction")
-        fibre = Fibre(direction, table.fibre.ratio)
+    direction = fibre_direction(study, domain.dim)
+    fibre = Fibre(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
     of_cell = per_cell(study, domain, table, "strength")
     return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 

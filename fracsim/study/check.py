@@ -20,7 +20,7 @@ from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Study
-from .conditions import conditions, initial_motion, of_size, place_of, volume_loads
+from .conditions import conditions, fibre_direction, initial_motion, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)
+    fibre_direction(study, dim)
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, anatomy, f"probe.{i}.point")

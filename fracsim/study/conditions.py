@@ -1,7 +1,7 @@
 """What the tables of a study say of a body with d dimensions: places, and functions of time. No DOLFINx here.
 
-The one interpretation of [[boundary]], [load] and [initial]: `fracsim check` asks here whether they fit the mesh, the
-scene builds its terms from what comes out, reports plot it.
+The one interpretation of [[boundary]], [load], [initial] and a fibre: `fracsim check` asks here whether they fit the
+mesh, the scene builds its terms from what comes out, reports plot it.
 """
 
 from __future__ import annotations
@@ -103,6 +103,12 @@ def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None
     velocity = None if initial.velocity is None else of_size(initial.velocity, dim, "initial.velocity")
     spin = None if initial.spin is None else of_size(initial.spin, 1 if dim == 2 else 3, "initial.spin")
     return velocity, spin
+
+
+def fibre_direction(study: Study, dim: int) -> Values | None:
+    """(d,) of [fracture.fibre]; None without the table."""
+    fibre = study.fracture.fibre if study.fracture is not None else None
+    return None if fibre is None else of_size(fibre.direction, dim, "fracture.fibre.direction")
 
 
 def in_time(value: Any, key: str, size: int) -> Tabulated:
