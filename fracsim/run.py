@@ -18,13 +18,13 @@ from .errors import CannotWrite, NotConverged, Stopped
 from .mesh.bodies import bodies_of
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.checkpoint import Notes, checkpoint_path, read_checkpoint, read_notes, write_checkpoint
-from .output.energy_gain import Gained
+from .output.energy_gain import EnergyGain, worth_telling
 from .output.fields import Frames
 from .output.fields_file import Field, FieldsFile
 from .output.folder import OutputClock, check_folder, check_readable, make_folder, versions
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
-from .output.inverted_cells import Inverted
+from .output.inverted_cells import InvertedCells
 from .output.progress import Progress
 from .output.summary import Meter, Monitors, say, write_summary
 from .output.writing import written
@@ -107,8 +107,8 @@ class Run:
         self.history = History(self.comm, folder / "history.csv", names, step)
         fields = study.output.fields if study.output.fields is not None else default_fields(study)
         self.frames = Frames(self.scene.balance.stress, fields, self.scene.fracture)
-        self.inverted = Inverted(self.scene.balance.stress, self.scene.fracture)
-        self.gained = Gained(at_rest=study.initial is None)
+        self.inverted = InvertedCells(self.scene.balance.stress, self.scene.fracture)
+        self.gained = EnergyGain(at_rest=study.initial is None, floor=worth_telling(self.scene.balance.stress))
         self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter)
         if notes is not None:
             self.monitors.restore(notes.monitors)
@@ -218,7 +218,7 @@ class Run:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
-        say(self.comm, self.monitors.notes(self.scene.study.material.energy))
+        say(self.comm, self.monitors.notes(self.scene.study.material.energy, self.scene.study.time.scheme))
         return summary
 
     def _loop(self, progress: Progress) -> None:

@@ -242,8 +242,8 @@ def test_no_cell_is_faster_than_its_edges_let_it(dim: int) -> None:
         if not any(flags):
             continue
         acting = np.tile(flags, (len(cells), 1))
-        exact = projected_frequencies(scene.balance, chosen, acting)
-        bounds = spring_frequencies(scene.balance, chosen, acting)
+        exact = projected_frequencies(scene.balance.stress, chosen, acting)
+        bounds = spring_frequencies(scene.balance.stress, chosen, acting)
         for nodes, projected, bound in zip(cells, exact, bounds, strict=True):
             dyads, along = edge_strains(X[nodes], edges[list(flags)])
             eps = np.einsum("ea,eij->aij", along, dyads)

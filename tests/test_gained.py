@@ -5,14 +5,17 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from fracsim.output.energy_gain import Gained
+from fracsim.output.energy_gain import EnergyGain, worth_telling
+from fracsim.output.summary import trouble_in_words
+from support.scenes import deform, make_scene
 
 
-def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> Gained:
+def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> EnergyGain:
     """A watch that has seen rows of (kinetic, elastic, dissipated, work), J."""
-    watch = Gained(at_rest=at_rest)
+    watch = EnergyGain(at_rest=at_rest)
     for kinetic, elastic, dissipated, work in rows:
         report: Any = SimpleNamespace(kinetic=kinetic, elastic=elastic)
         state: Any = SimpleNamespace(dissipated=dissipated, work=work)
@@ -21,12 +24,72 @@ def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = Tr
 
 
 def test_losses_and_balance_are_not_told() -> None:
-    assert watched([(1.0, 1.0, 0.0, 2.0), (0.5, 1.0, 0.3, 2.0), (0.2, 0.2, 0.3, 2.0)]).note() == ""
-    assert watched([(3.0, 0.0, 0.0, 0.0), (2.9, 0.0, 0.1, 0.0)], at_rest=False).note() == ""
+    assert watched([(1.0, 1.0, 0.0, 2.0), (0.5, 1.0, 0.3, 2.0), (0.2, 0.2, 0.3, 2.0)]).note("newmark") == ""
+    assert watched([(3.0, 0.0, 0.0, 0.0), (2.9, 0.0, 0.1, 0.0)], at_rest=False).note("newmark") == ""
 
 
 def test_a_gain_is_told_with_its_share() -> None:
     """2 J of work, then 3 J held: 1 J from nowhere, a third of what is at play; even after a loss of 1 J before."""
     watch = watched([(1.0, 1.0, 0.0, 2.0), (1.0, 2.0, 0.0, 2.0)])
-    assert watch.note().startswith("the body gained 1 J of energy from nowhere, 33% of all")
+    assert watch.note("newmark").startswith("the body gained 1 J of energy from nowhere, 33% of all")
     assert watched([(1.0, 0.0, 0.0, 2.0), (2.0, 0.0, 0.0, 2.0)]).rise == pytest.approx(1.0)
+
+
+def test_a_note_does_not_advise_what_is_so_already() -> None:
+    """Backward Euler is named to those who do not use it, and only where there is inertia."""
+    watch = watched([(1.0, 1.0, 0.0, 2.0), (1.0, 2.0, 0.0, 2.0)])
+    assert 'try time.scheme = "backward-euler", or a shorter time.step' in watch.note("newmark")
+    for scheme in ("backward-euler", "quasi-static"):
+        assert watch.note(scheme).endswith("try a shorter time.step")
+
+
+def test_round_off_is_not_told() -> None:
+    """A steel block that lies there: 4e-14 J are of strains of 1e-12, and no gain."""
+    scene, _ = make_scene(material={"energy": "linear", "young": 2e11, "poisson": 0.3, "density": 7800.0})
+    watch = EnergyGain(at_rest=True, floor=worth_telling(scene.balance.stress))
+    assert watch.floor == pytest.approx(2e11 * 1.0 * 9e-16)
+    watch.look(SimpleNamespace(kinetic=4e-14, elastic=0.0), SimpleNamespace(dissipated=0.0, work=0.0))  # type: ignore[arg-type]
+    assert watch.rise == 4e-14 and watch.note("newmark") == ""
+
+
+def test_what_a_run_went_on_in_spite_of_is_one_sentence() -> None:
+    """Counts of what happened, none of what did not; a halved step that was taken in the end is no trouble."""
+    assert trouble_in_words({"steps_failed": 7, "linear_failures": 0}) == ""
+    words = trouble_in_words({"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5})
+    assert words.startswith("the run went on in spite of 2 steps that ended out of balance")
+    assert "; 5 cells crushed flat" in words and "linear" not in words
+
+
+def test_a_resolve_that_fails_after_a_break_is_counted() -> None:
+    """The weakened body has no solution: the last one stands, and the step is counted as out of balance."""
+    scene, walk = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.125},
+        boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.05, 0.0]}],
+        fracture={"strength": 0.02, "passes": 3},
+    )
+    stepper: Any = scene.stepper
+    solve = stepper.solver.solve
+    while not scene.fracture.graph.broken.any():
+        calls = [0]
+
+        def once(guess: Any, calls: list[int] = calls) -> Any:
+            calls[0] += 1
+            result = solve(guess)
+            return result if calls[0] == 1 else type(result)(False, result.newton, result.krylov, "no")
+
+        stepper.solver.solve = once
+        walk.advance()
+    assert stepper.troubles()["unbalanced_steps"] == 1 and stepper.troubles()["steps_failed"] == 0
+
+
+def test_stress_that_is_no_number_is_counted() -> None:
+    """A body crushed flat has J = 0 in all of its cells."""
+    scene, walk = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5},
+        material={"energy": "neo-hookean", "young": 1.0, "poisson": 0.3, "density": 1.0},
+        fracture={"strength": 1.0},
+    )
+    deform(scene, np.diag([1.0, 0.0]))
+    scene.fracture()
+    assert scene.stepper.troubles()["cells_not_finite"] == scene.domain.cell_count
+    assert walk.t == 0

@@ -102,7 +102,7 @@ def test_a_run_that_ended_may_be_run_again_and_what_lies_beside_it_stays(tmp_pat
     assert not (out / "surface.pvd").exists() and not (out / "pieces.csv").exists()
 
 
-@pytest.mark.parametrize("where", ["make_folder", "Frames", "FieldsFile", "Inverted", "OutputClock"])
+@pytest.mark.parametrize("where", ["make_folder", "Frames", "FieldsFile", "InvertedCells", "OutputClock"])
 def test_a_run_that_was_killed_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """At any moment of its set-up, in a new folder and in one of an earlier run."""
     for folder in (tmp_path / "new", tmp_path / "old"):

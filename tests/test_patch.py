@@ -58,7 +58,7 @@ def patch(dim: int, energy: str, scheme: str, steps: int, plane: str = "strain")
 
 def stress_of(scene: Scene, state: State) -> Values:
     """(cells, 6) Cauchy stress as it is written: xx, xy, xz, yy, yz, zz."""
-    return Frames(scene.balance, ["stress"])(state, None)[1].values
+    return Frames(scene.balance.stress, ["stress"])(state, None)[1].values
 
 
 def expected_stress(energy: str, dim: int, F: Values) -> Values:

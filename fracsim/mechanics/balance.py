@@ -67,6 +67,8 @@ class Balance:
         self._kept = assembler.vector()
         self.reactions: Values = np.zeros(self.owned)
         self._compile()
+        rest = np.zeros(self.owned)
+        self._tell(Level(0.0, 0.0, rest, rest, self.c_a, self.c_v, rest, rest), motion.at(0.0))
 
     def _compile(self) -> None:
         domain = self.domain

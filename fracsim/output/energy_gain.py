@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from ..mechanics.stress import Stress
+from ..mesh.ranks import total
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
 
+# Strain below which energies are round-off: Y V STRAIN^2 is not worth a word, as in a body that only lies there.
+STRAIN = 3e-8
 SHARE = 0.05  # of the energy at play: what steps that are long for the waves in them may gain without a word
 
 
-class Gained:
+class EnergyGain:
     """The largest rise of elastic + kinetic + dissipated - work above what it was before.
 
     Schemes may lose energy. One that gains it (projected strains at large strains; second-order schemes in tangents
     that are not positive, or where all breaks at once) leads to motion that nothing drives.
 
     Attributes:
-        rise: J.    scale: largest energy or work so far, J.
+        rise: J.    scale: largest energy or work so far, J.    floor: J, below which nothing is told.
     """
 
-    def __init__(self, *, at_rest: bool) -> None:
+    def __init__(self, *, at_rest: bool, floor: float = 0.0) -> None:
         """`at_rest`: the body starts without energy; else from what its first step ends with."""
         self._least = 0.0 if at_rest else float("inf")
-        self.rise, self.scale = 0.0, 0.0
+        self.rise, self.scale, self.floor = 0.0, 0.0, floor
 
     def look(self, report: StepReport, state: State) -> None:
         """Note a step that was taken."""
@@ -39,11 +45,18 @@ class Gained:
         """Go on from `monitors`."""
         self.rise, self.scale, self._least = (monitors[f"energy_{name}"] for name in ("rise", "scale", "least"))
 
-    def note(self) -> str:
-        """A sentence where it is too much."""
-        if self.rise <= SHARE * self.scale:
+    def note(self, scheme: str) -> str:
+        """A sentence where it is too much; `scheme` is that of the study."""
+        if self.rise <= max(SHARE * self.scale, self.floor):
             return ""
+        other = 'time.scheme = "backward-euler", or ' if scheme not in ("backward-euler", "quasi-static") else ""
         return (
             f"the body gained {self.rise:.3g} J of energy from nowhere, {self.rise / self.scale:.0%} of all that was "
-            'at play: its motion is not to be trusted; try time.scheme = "backward-euler", or a shorter time.step'
+            f"at play: its motion is not to be trusted; try {other}a shorter time.step"
         )
+
+
+def worth_telling(stress: Stress) -> float:
+    """Y V STRAIN^2 of a body, J (collective)."""
+    domain = stress.domain
+    return float(total(domain.comm, np.sum(stress.material.young * domain.volumes))[0]) * STRAIN**2

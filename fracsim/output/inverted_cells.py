@@ -14,7 +14,7 @@ from ..mesh.ranks import total
 FLAT = 1e-6  # a cell with no more than this share of its volume left is none
 
 
-class Inverted:
+class InvertedCells:
     """The least J = det F of the whole cells, over the frames of a run.
 
     No body turns inside out. An energy that lets it (stvk, corotated), or a boundary that forces it, leads to an answer

@@ -13,10 +13,10 @@ from mpi4py import MPI
 
 from ..mesh.ranks import total
 from ..stepping.stepper import Stepper
-from .energy_gain import Gained
+from .energy_gain import EnergyGain
 from .folder import versions
 from .history import History
-from .inverted_cells import Inverted
+from .inverted_cells import InvertedCells
 from .writing import replace_text, written
 
 
@@ -33,7 +33,7 @@ class Meter:
         self._began = time.perf_counter() if began is None else began
         self._cpu_began = time.process_time()
         self.setup, self.output = 0.0, 0.0
-        self._earlier: dict[str, Any] = {"steps_failed": 0, "wall": 0.0, "cpu": 0.0, "memory": 0.0, "seconds": {}}
+        self._earlier: dict[str, Any] = {"trouble": {}, "wall": 0.0, "cpu": 0.0, "memory": 0.0, "seconds": {}}
 
     def begin_steps(self) -> None:
         """The set-up is over."""
@@ -47,14 +47,11 @@ class Meter:
         cpu, memory = total(self._comm, [time.process_time() - self._cpu_began, _peak_memory()])
         seconds = {"setup": self.setup, **self._stepper.phases, "output": self.output}
         return {
-            "steps_failed": earlier["steps_failed"] + self._stepper.trouble.steps_failed,
+            "trouble": _sum(earlier["trouble"], self._stepper.troubles()),
             "wall": earlier["wall"] + time.perf_counter() - self._began,
             "cpu": earlier["cpu"] + float(cpu),
             "memory": max(earlier["memory"], float(memory)),
-            "seconds": {
-                name: earlier["seconds"].get(name, 0.0) + seconds.get(name, 0.0)
-                for name in dict.fromkeys([*seconds, *earlier["seconds"]])
-            },
+            "seconds": _sum(seconds, earlier["seconds"]),
         }
 
     def restore(self, monitors: dict[str, Any]) -> None:
@@ -65,7 +62,7 @@ class Meter:
 class Monitors:
     """All that is watched from step to step and goes on with a restart."""
 
-    def __init__(self, history: History, inverted: Inverted, gained: Gained, meter: Meter) -> None:
+    def __init__(self, history: History, inverted: InvertedCells, gained: EnergyGain, meter: Meter) -> None:
         self.history, self.inverted, self.gained, self.meter = history, inverted, gained, meter
 
     def saved(self) -> dict[str, Any]:
@@ -83,16 +80,36 @@ class Monitors:
         """Their part of summary.json (collective)."""
         used = self.meter.read()
         return {
-            "steps_failed": used["steps_failed"], "smallest_J": self.inverted.least,
+            **used["trouble"], "smallest_J": self.inverted.least,
             "inverted_cells": self.inverted.count, "peak_reactions": self.history.peaks,
             "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
             "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
             "ranks": self.history.comm.size, "versions": versions(self.history.comm),
         }  # fmt: skip
 
-    def notes(self, energy: str) -> list[str]:
-        """Sentences on what makes the result doubtful; `energy` is that of the study."""
-        return [note for note in (self.inverted.note(energy), self.gained.note()) if note]
+    def notes(self, energy: str, scheme: str) -> list[str]:
+        """Sentences on what makes the result doubtful; `energy` and `scheme` are those of the study (collective)."""
+        trouble = trouble_in_words(self.meter.read()["trouble"])
+        return [note for note in (trouble, self.inverted.note(energy), self.gained.note(scheme)) if note]
+
+
+# what a run went on in spite of; a step that was halved and then taken is no trouble
+_TROUBLE = {
+    "unbalanced_steps": "steps that ended out of balance, for the body weakened by a break had no solution",
+    "linear_failures": "linear solves that failed and were taken as no correction",
+    "cells_not_finite": "cells crushed flat, whose stress was no number and counted as none",
+}
+
+
+def trouble_in_words(trouble: dict[str, int]) -> str:
+    """One sentence; empty where nothing was wrong."""
+    found = [f"{trouble[name]} {words}" for name, words in _TROUBLE.items() if trouble.get(name)]
+    return f"the run went on in spite of {'; '.join(found)} (counted in summary.json)" if found else ""
+
+
+def _sum[Number: (int, float)](first: dict[str, Number], second: dict[str, Number]) -> dict[str, Number]:
+    """Sums by name."""
+    return {name: first.get(name, 0) + second.get(name, 0) for name in dict.fromkeys([*first, *second])}
 
 
 def write_summary(comm: MPI.Comm, folder: Path, summary: dict[str, Any]) -> None:

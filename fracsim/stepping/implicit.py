@@ -24,6 +24,10 @@ class ImplicitStepper(BalanceStepper):
         super().__init__(balance, sizes, flow, breaking)
         self.solver = solver
 
+    def troubles(self) -> dict[str, int]:
+        """Counts of what failed on the way."""
+        return super().troubles() | {"linear_failures": self.solver.linear_failures}
+
     def _recalled(self) -> None:
         super()._recalled()
         self.solver.damage_changed()

@@ -19,7 +19,7 @@ from .stepper import SolveResult
 DEFAULTS: Options = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
-    "snes_max_it": 25,
+    "snes_max_it": 50,  # near a limit it would be the last digits that decide whether a step is halved
     "snes_rtol": 1e-6,  # 1e-4 takes the first guess for the answer where cells are slivers
     "snes_stol": 0.0,
     "snes_lag_preconditioner": -2,  # made at the first tangent, then kept
@@ -117,26 +117,25 @@ class Solver:
         """
         if self._with_factors:
             self._with_factors -= 1
-            result = self._attempt_directly(guess)
-            if not self._linear_failure(result):
-                return result
+            return self._attempt_directly(guess)
         result = self._attempt_iteratively(guess)
-        if not self._linear_failure(result):
+        if not self._misled(result):
             self._spell = FIRST_SPELL
         elif self._may_factorise():
             result = self._attempt_directly(guess)
-            self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+            if result.converged:
+                self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
         return result
 
     def _attempt_iteratively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         result = self._attempt(guess)
-        if self._linear_failure(result):
+        if self._misled(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
             self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
             result = self._attempt(guess)
             self._preconditioner.keep = self._iterative
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
-        if self._linear_failure(result) and self.snes.ksp.getType() == "cg" and not stalled:
+        if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             self.snes.ksp.setGMRESRestart(RESTART)
@@ -171,8 +170,15 @@ class Solver:
         ksp.setType(kind)
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
 
-    def _linear_failure(self, result: SolveResult) -> bool:
-        return not result.converged and self.snes.ksp.reason < 0
+    def _misled(self, result: SolveResult) -> bool:
+        """Whether it was the linear solves that failed: outright, or by what they found.
+
+        A solution of K d = -r lowers |r| for short steps along it, so a line search that fails was given none: CG may
+        stop on a tangent that is not positive before it notices. Whether it does is a matter of the last digits, and
+        so would be a step that is halved for it.
+        """
+        line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
+        return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
 
     def _attempt(self, guess: npt.NDArray[np.float64]) -> SolveResult:
         self._shrink()
@@ -191,20 +197,25 @@ class Solver:
     def linear_response(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m.
 
-        0 where the linear solve fails, which is counted: near incompressibility tangents may be indefinite.
+        Near incompressibility tangents may be indefinite: factors where iterations fail. 0 where nothing helps, which
+        is counted.
         """
         self._shrink()
-        with self._factors() if self._with_factors else nullcontext():
+        ways = [nullcontext, self._factors] if self._may_factorise() else [nullcontext]
+        for way in ways[1:] if self._with_factors else ways:
             self.balance.vector.array_w[:] = force
-            if not self._solve_linear():
-                return np.zeros_like(force)
-        result: npt.NDArray[np.float64] = self._correction.array_r.copy()
-        return result
+            with way():
+                solved = self._solve_linear()
+            if solved:
+                return np.asarray(self._correction.array_r.copy())
+        self.linear_failures += 1
+        return np.zeros_like(force)
 
     def _extend(self) -> int:
         """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
         self.balance.extension_residual(self._x, self.balance.vector)
-        self._solve_linear()
+        if not self._solve_linear():
+            self.linear_failures += 1
         self._x.axpy(-1.0, self._correction)
         return int(self.snes.ksp.its)
 
@@ -214,7 +225,6 @@ class Solver:
         self._assemble_tangent(tangent)
         ksp.setOperators(tangent)
         ksp.solve(self.balance.vector, self._correction)
-        self.linear_failures += ksp.reason <= 0
         return bool(ksp.reason > 0)
 
     def _assemble(self, tangent: PETSc.Mat) -> None:

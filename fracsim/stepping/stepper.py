@@ -10,7 +10,7 @@ fails, and grows back after easy ones; then the body flows and breaks.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -83,6 +83,9 @@ class Stepper(Protocol):
     phases: dict[str, float]
     trouble: Trouble
 
+    def troubles(self) -> dict[str, int]:
+        """What went wrong on the way without ending the run: counts by name, over all ranks (collective)."""
+
     def start(self, velocity: Values | None = None) -> State:
         """The state at t = 0, at rest or with a velocity (owned dofs,) in m/s (collective)."""
 
@@ -104,6 +107,11 @@ class BalanceStepper:
         self.comm = balance.domain.comm
         self.trouble = Trouble()
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
+
+    def troubles(self) -> dict[str, int]:
+        """Counts of what failed on the way."""
+        crushed = int(total(self.comm, self.breaking.not_finite)[0])
+        return asdict(self.trouble) | {"cells_not_finite": crushed}
 
     # --- the state at the start ---
 

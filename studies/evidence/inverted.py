@@ -41,7 +41,7 @@ def main() -> None:
 def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
     from ...mesh.ranks import total
-    from ...output.inverted_cells import Inverted
+    from ...output.inverted_cells import InvertedCells
     from ...scene import build_scene
     from ...study.file import validate
 
@@ -58,7 +58,7 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
         state, report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)
         newton.append(report.solve.newton)
-    watch = Inverted(scene.balance.stress)
+    watch = InvertedCells(scene.balance.stress)
     watch.look(state.t)
     if comm.rank == 0 and (note := watch.note(energy)):
         print(f"fracsim: note: {note}", file=sys.stderr)

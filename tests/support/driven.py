@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.output.inverted_cells import Inverted
+from fracsim.output.inverted_cells import InvertedCells
 from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence import extremes
 from fracsim.study.file import validate
@@ -46,7 +46,7 @@ def nearly_incompressible(scheme: str) -> list[float]:
 def crushed() -> list[float]:
     """(cells, smallest J, s) that are told of a block mirrored along x."""
     scene, state, _ = stepped(extremes.block(-1.0, steps=1, confined=True), 1)
-    watch = Inverted(scene.balance.stress)
+    watch = InvertedCells(scene.balance.stress)
     watch.look(state.t)
     return [watch.count, watch.least, watch.since]
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from fracsim import cli
 from fracsim.errors import InputError, NotConverged
 from fracsim.mesh import ranks
-from fracsim.stepping import implicit
+from fracsim.stepping import stepper as stepper_module
 
 FAILURES: dict[str, BaseException] = {
     "input": InputError("only here"),
@@ -21,10 +21,10 @@ FAILURES: dict[str, BaseException] = {
 rank, kind, *arguments = sys.argv[1:]
 ranks.PATIENCE = 1.0  # as long as the other rank would need to fail in the same place
 calls = 0
-advance = implicit.Stepper.advance
+advance = stepper_module.BalanceStepper.advance
 
 
-def failing(stepper: implicit.Stepper, *given: Any) -> Any:
+def failing(stepper: stepper_module.BalanceStepper, *given: Any) -> Any:
     global calls
     calls += 1
     if calls == 2 and MPI.COMM_WORLD.rank == int(rank):
@@ -32,6 +32,6 @@ def failing(stepper: implicit.Stepper, *given: Any) -> Any:
     return advance(stepper, *given)
 
 
-implicit.Stepper.advance = failing  # type: ignore[method-assign]
+stepper_module.BalanceStepper.advance = failing  # type: ignore[method-assign]
 sys.argv = ["fracsim", "run", *arguments]
 cli.main()
