@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from .mesh.pieces import Pieces
     from .output.surface.output import SurfaceOutput
 
+FRAMES = 50  # of a run whose study says neither every nor interval
+
 
 class Run:
     """Steps a scene to its end and writes the output folder."""
@@ -113,7 +115,7 @@ class Run:
         source = self.scene.domain.source
         self.fields = self._written("fields.xdmf", lambda: FieldsFile(folder, source, t) if source else None)
         self._open_surface(restart)
-        self._clock = OutputClock(study.output, study.time)
+        self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
         self._bodies = int(self.comm.bcast(bodies_of(source)[0] if source is not None else None))
         # it tells how the run ended, which is open again
@@ -179,7 +181,7 @@ class Run:
 
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
-        progress = Progress(self.comm, self.scene.study)
+        progress = Progress(self.comm, self.scene.study.time.end)
         try:
             with progress:
                 self._loop(progress)

@@ -167,6 +167,10 @@ REFUSED: list[tuple[Data, str]] = [
     (held_at({"point": [9, 0, 0], "normal": [1, 0, 0]}), "boundary.0.on selects no node; the body lies in"),
     (held_at({"point": [0, 0, 0], "normal": [0, 0, 0]}), "a normal must not be zero"),
     (right(velocity=[1, 0]), "boundary.1.velocity = [1.0, 0.0]: this mesh needs 3 numbers"),
+    (
+        changed(STRIP, fracture={"fibre": {"direction": [1, 0, 0]}}),
+        "fracture.fibre.direction = [1.0, 0.0, 0.0]: this mesh needs 2 numbers",
+    ),
     (right(traction=[1, 0]), "boundary.1.traction = [1.0, 0.0]: this mesh needs 3 numbers"),
     (changed(BAR, load={"gravity": [0, -9.81]}), "load.gravity = [0.0, -9.81]: this mesh needs 3 numbers"),
     (

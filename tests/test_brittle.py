@@ -277,7 +277,7 @@ def test_a_curved_surface_follows_its_field(dim: int) -> None:
     for h in (0.1, 0.05):
         mesh = box(dim, h)
         start = [0.5, 0.3, 0.25][:dim]
-        made = open_at(mesh, [start], [(np.array(start) - centre).tolist()], field=rays, shape="curved")
+        made = open_at(mesh, [start], [(np.array(start) - centre).tolist()], field=rays, curved=True)
         radius = np.linalg.norm(made.opened.starts[0] - centre)
         deviation.append(np.abs(np.linalg.norm(made.places - centre, axis=1) - radius).max())
         assert made.surface.pieces == 2
@@ -286,7 +286,7 @@ def test_a_curved_surface_follows_its_field(dim: int) -> None:
 
 def test_without_tension_a_curved_surface_goes_straight_on() -> None:
     """Where the body carries nothing the weight is 0: the plane of the start, to round-off."""
-    made = open_at(box(3), [[0.5, 0.4, 0.25]], [[1.0, 0.3, 0.2]], field=np.zeros_like, shape="curved")
+    made = open_at(box(3), [[0.5, 0.4, 0.25]], [[1.0, 0.3, 0.2]], field=np.zeros_like, curved=True)
     normal = np.array([1.0, 0.3, 0.2]) / np.linalg.norm([1.0, 0.3, 0.2])
     assert np.abs((made.places - made.opened.starts[0]) @ normal).max() < 1e-12
     assert made.surface.pieces == 2
@@ -308,7 +308,7 @@ def test_moving_nodes_over_spares_a_curved_surface(dim: int) -> None:
     """A curved surface is known beside itself only; still hardly a node of it is without a cell on its own side."""
     at, normal = [0.5, 0.3, 0.25][:dim], [1.0, 0.3, 0.2][:dim]
     plain, moved = (
-        open_at(box(dim, 0.05), [at], [normal], settle, field=np.zeros_like, shape="curved") for settle in (False, True)
+        open_at(box(dim, 0.05), [at], [normal], settle, field=np.zeros_like, curved=True) for settle in (False, True)
     )
     common = {tuple(key) for key in plain.opened.keys.tolist()} & {tuple(key) for key in moved.opened.keys.tolist()}
     assert len(common) > 0.9 * len(plain.opened.keys) and moved.surface.pieces == 2

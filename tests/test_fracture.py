@@ -29,7 +29,6 @@ from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.scene import Scene
 from fracsim.stepping.state import State
-from fracsim.study import Fracture
 from support.laws import T_stress, rotation
 from support.oscillator import slopes
 from support.scenes import Values, cell_corners, deform, displacement, each_step, make_scene, march, positions
@@ -314,8 +313,7 @@ def make_pass(scene: Scene, strength: float, radius: float) -> Breaking:
     """A pass of its own on the same body."""
     stress, graph = scene.balance.stress, EdgeGraph(scene.domain)
     average = NonlocalAverage(scene.domain, radius, "linear") if radius else None
-    of_edges = Strength(graph, Fracture(strength=strength, tie_break=0.0), scene.study.material)
-    return Breaking(stress, graph, OverloadedEdges(stress, graph, of_edges, average))
+    return Breaking(stress, graph, OverloadedEdges(stress, graph, Strength(graph, strength), average))
 
 
 def broken_by(fracture: Breaking) -> npt.NDArray[np.bool_]:

@@ -11,8 +11,8 @@ from scipy.stats import kstest
 
 from fracsim.fracture.brittle.body import Body
 from fracsim.fracture.brittle.grains import Grains, least, sow
+from fracsim.fracture.brittle.rules import GrainRules
 from fracsim.meshes.data import MeshData
-from fracsim.study import Grains as Table
 from fracsim.study import Mesh
 from fracsim.study.mesh_source import build_mesh
 from support.brittle import Broken, cut_points, open_at
@@ -27,7 +27,7 @@ def box(dim: int, h: float = 0.06) -> MeshData:
 
 def grains_of(dim: int, settle: bool = False, **table: Any) -> tuple[Body, Grains]:
     body = Body(box(dim))
-    return body, Grains(body, Table.model_validate({"count": 12, "seed": 4} | table), settle)
+    return body, Grains(body, GrainRules(**({"count": 12, "seed": 4} | table)), settle)
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -45,12 +45,12 @@ def test_seeds_are_uniform_in_the_body() -> None:
     """Each coordinate of points sown in a box is uniform (Kolmogorov-Smirnov, a seed that is fixed); same seed, same
     points; weights keep to their range."""
     body = Body(box(3, 0.2))
-    seeds, weights = sow(body, Table(count=2000, seed=1, spread=0.3))
+    seeds, weights = sow(body, GrainRules(count=2000, seed=1, spread=0.3))
     for axis, length in enumerate((1.0, 0.8, 0.5)):
         assert kstest(seeds[:, axis] / length, "uniform").pvalue > 0.01
     assert 0.7 <= weights.min() < 0.71 and 1.29 < weights.max() <= 1.3
-    assert np.array_equal(seeds, sow(body, Table(count=2000, seed=1, spread=0.3))[0])
-    assert not np.array_equal(seeds, sow(body, Table(count=2000, seed=2, spread=0.3))[0])
+    assert np.array_equal(seeds, sow(body, GrainRules(count=2000, seed=1, spread=0.3))[0])
+    assert not np.array_equal(seeds, sow(body, GrainRules(count=2000, seed=2, spread=0.3))[0])
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -89,8 +89,8 @@ def test_settled_nodes_have_a_cell_of_their_grain(dim: int) -> None:
 def opened(dim: int, **grains: Any) -> tuple[Broken, Grains, MeshData]:
     mesh, table = box(dim), {"count": 12, "seed": 4} | grains
     places = [[0.5, 0.4, 0.25][:dim], [0.15, 0.2, 0.1][:dim]]
-    made = open_at(mesh, places, [[1.0, 0.2, 0.1][:dim]] * 2, grains=table)
-    return made, Grains(Body(mesh), Table.model_validate(table), False), mesh
+    made = open_at(mesh, places, [[1.0, 0.2, 0.1][:dim]] * 2, grains=GrainRules(**table))
+    return made, Grains(Body(mesh), GrainRules(**table), False), mesh
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -131,9 +131,16 @@ def test_bias_runs_along_grain_boundaries(dim: int, shape: str) -> None:
     normal = np.array([1.0, 0.2, 0.1][:dim]) / np.linalg.norm([1.0, 0.2, 0.1][:dim])
     field = (lambda places: np.broadcast_to(normal, places.shape)) if shape == "curved" else None
     table = {"count": 40, "seed": 1, "mode": "bias"}
-    made = open_at(mesh, [[0.5, 0.4, 0.25][:dim]], [normal.tolist()], shape=shape, field=field, grains=table)
+    made = open_at(
+        mesh,
+        [[0.5, 0.4, 0.25][:dim]],
+        [normal.tolist()],
+        curved=shape == "curved",
+        field=field,
+        grains=GrainRules(**table),
+    )
     body = Body(mesh)
-    grains = Grains(body, Table.model_validate(table), False)
+    grains = Grains(body, GrainRules(**table), False)
     ends = grains.of_node[made.opened.keys]
     assert len(ends) > 5 and np.all(ends[:, 0] != ends[:, 1])
     assert made.surface.pieces == 2

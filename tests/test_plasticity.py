@@ -11,6 +11,8 @@ import pytest
 from scipy.optimize import brentq
 
 from fracsim.forms.energies import ENERGIES
+from fracsim.forms.schemes import SCHEMES
+from fracsim.mechanics.flow_prediction import Implicit
 from fracsim.mechanics.plasticity import WEAKEST
 from fracsim.mechanics.return_mapping import CLOSE
 from fracsim.meshes import BUILDERS
@@ -178,6 +180,13 @@ def test_a_step_is_solved_with_the_last_flow_once_more(energy: str) -> None:
         found = np.sum(scene.balance.stress.force().reshape(-1, 3) * (points @ H.T))
         assert found == pytest.approx(np.sum(tau * (H @ np.linalg.inv(F))), rel=1e-10)
     np.testing.assert_array_equal(plastic.rows, rows)
+
+
+def test_nothing_is_extrapolated_where_u_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Explicit steps, whatever the scheme is called: no time history stands in for the flow of the step."""
+    monkeypatch.setitem(SCHEMES, "newmark", SCHEMES["explicit"])
+    scene, _ = pulled([0, TINY], 100, "neo-hookean", "newmark", update="extrapolated")
+    assert isinstance(scene.balance.stress.material.plastic.prediction, Implicit)
 
 
 def test_a_stretch_never_turns_over() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fracsim.mesh.places import Group
 from fracsim.scene import Scene
 from fracsim.stepping.stepper import StepReport
 from support.scenes import DIRECT, Walk, each_step, make_scene, march
@@ -38,7 +39,7 @@ def torn_plate(**tables: Any) -> tuple[Scene, Walk]:
 
 def grip(scene: Scene) -> float:
     """Reaction of the upper edge along y, N."""
-    top = scene.domain.nodes_of("top", "top")
+    top = scene.domain.nodes_of(Group("top"))
     return float(scene.balance.reactions.reshape(-1, 2)[top, 1].sum())
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fracsim.fracture.strength import along_fibre, weibull
-from fracsim.study import Fibre, Heterogeneity
+from fracsim.fracture.strength import Fibre, Scatter, along_fibre, weibull
 from support.scenes import make_scene, march
 
 
@@ -17,7 +16,7 @@ from support.scenes import make_scene, march
 def test_scatter_is_weibull_with_mean_one(modulus: float) -> None:
     """P(w < x) = 1 - exp(-(x/s)^m), s = 1 / Gamma(1 + 1/m): Kolmogorov-Smirnov, and the mean within 4 errors."""
     points = np.random.default_rng(1).uniform(-1, 1, (20_000, 3))
-    sample = weibull(points, Heterogeneity(modulus=modulus, seed=3))
+    sample = weibull(points, Scatter(modulus=modulus, seed=3))
     law = stats.weibull_min(modulus, scale=1 / stats.weibull_min(modulus).mean())
     assert stats.kstest(sample, law.cdf).pvalue > 1e-3
     assert abs(sample.mean() - 1) < 4 * law.std() / np.sqrt(len(sample))
@@ -27,9 +26,9 @@ def test_the_seed_decides() -> None:
     """The same seed gives the same numbers in any order of the places, another seed other and uncorrelated ones."""
     points = np.random.default_rng(2).uniform(-1, 1, (5_000, 2))
     order = np.random.default_rng(3).permutation(len(points))
-    first, again, other = (weibull(points, Heterogeneity(modulus=5.0, seed=seed)) for seed in (7, 7, 8))
+    first, again, other = (weibull(points, Scatter(modulus=5.0, seed=seed)) for seed in (7, 7, 8))
     assert np.array_equal(first, again)
-    assert np.array_equal(weibull(points[order], Heterogeneity(modulus=5.0, seed=7)), first[order])
+    assert np.array_equal(weibull(points[order], Scatter(modulus=5.0, seed=7)), first[order])
     assert abs(np.corrcoef(first, other)[0, 1]) < 4 / np.sqrt(len(points))
 
 

@@ -10,29 +10,52 @@ direction n and the fibre a. All of them belong to the place of the edge, so tha
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mechanics.material import PerCell, per_cell
-from ..mechanics.time_functions import of_size
+from ..mechanics.material import PerCell
 from ..mesh.edges import EdgeGraph
-from ..study import Fibre, Fracture, Heterogeneity, Material
 
 Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Weibull's modulus m (5 scatters like stone, 50 hardly at all), and the seed of the draw."""
+
+    modulus: float
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Fibre:
+    """A direction (d,) of any length, along which the strength is `ratio` times that across it."""
+
+    direction: Sequence[float] | Values
+    ratio: float = 1.0
 
 
 class Strength:
     """Pa, for edges of cells of a distributed mesh."""
 
-    def __init__(self, graph: EdgeGraph, fracture: Fracture, material: Material) -> None:
-        self._graph = graph
-        self._of_cell: PerCell = per_cell(graph.domain, fracture, "strength", material.regions)
-        self._factor = self._edge_factors(fracture)
+    def __init__(
+        self,
+        graph: EdgeGraph,
+        of_cell: PerCell,
+        *,
+        tie_break: float = 0.0,
+        scatter: Scatter | None = None,
+        fibre: Fibre | None = None,
+    ) -> None:
+        """`of_cell`: Pa, a number or (cells,); `tie_break`: relative perturbation from edge to edge (collective)."""
+        self._graph, self._of_cell, self._tie_break = graph, of_cell, tie_break
+        self._factor = self._edge_factors(scatter, fibre)
         smallest = float(np.min(self._factor, initial=np.inf)) if self._factor is not None else 1.0
-        self._tie_break = fracture.tie_break
-        weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - fracture.tie_break)
+        weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - tie_break)
         self.weakest = graph.domain.comm.allreduce(weakest, op=MPI.MIN)  # no edge of the body is weaker
 
     def __call__(self, cells: npt.NDArray[np.int64], edges: npt.NDArray[np.int32]) -> Values:
@@ -52,15 +75,15 @@ class Strength:
         ends = self._graph.domain.nodes[self._graph.edge_nodes[edges]]
         return ends[:, 0] + ends[:, 1]
 
-    def _edge_factors(self, fracture: Fracture) -> Values | None:
+    def _edge_factors(self, scatter: Scatter | None, fibre: Fibre | None) -> Values | None:
         """w_e f_e of every local edge; None where all of them are 1."""
-        if fracture.heterogeneity is None and fracture.fibre is None:
+        if scatter is None and fibre is None:
             return None
         factor = np.ones(len(self._graph.broken))
-        if fracture.heterogeneity is not None:
-            factor *= weibull(self._twice_middle(np.arange(len(factor))), fracture.heterogeneity)
-        if fracture.fibre is not None:
-            factor *= along_fibre(self._directions(), fracture.fibre)
+        if scatter is not None:
+            factor *= weibull(self._twice_middle(np.arange(len(factor))), scatter)
+        if fibre is not None:
+            factor *= along_fibre(self._directions(), fibre)
         return factor
 
     def _directions(self) -> Values:
@@ -68,16 +91,16 @@ class Strength:
         return ends[:, 1] - ends[:, 0]
 
 
-def weibull(points: Values, heterogeneity: Heterogeneity) -> Values:
+def weibull(points: Values, scatter: Scatter) -> Values:
     """Weibull numbers of mean 1 and the given modulus, one a place."""
-    m = heterogeneity.modulus
-    survival = (1 - hashed(points, heterogeneity.seed)) / 2  # 1 - U, in (0, 1]
+    m = scatter.modulus
+    survival = (1 - hashed(points, scatter.seed)) / 2  # 1 - U, in (0, 1]
     return np.asarray((-np.log(survival)) ** (1 / m) / math.gamma(1 + 1 / m), np.float64)
 
 
 def along_fibre(vectors: Values, fibre: Fibre) -> Values:
     """1 + (ratio - 1) cos^2 of the angle between edges ((n, d) vectors) and the fibre: `ratio` along it, 1 across."""
-    a = of_size(fibre.direction, vectors.shape[1], "fracture.fibre.direction")
+    a = np.asarray(fibre.direction, float)
     cosine2 = (vectors @ a) ** 2 / (np.einsum("ni,ni->n", vectors, vectors) * (a @ a))
     return np.asarray(1 + (fibre.ratio - 1) * cosine2)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +12,6 @@ from dolfinx import fem
 
 from ..forms.energies import ENERGIES, Energy, lame, plane_stress_lambda
 from ..mesh.domain import Domain
-from ..mesh.names import check_regions
-from ..study import Material, Region
 
 PerCell = npt.NDArray[np.float64] | float
 
@@ -29,24 +28,22 @@ class MaterialFields:
     plastic: Any = None  # mechanics.plasticity.Plasticity of a body that flows
 
 
-def material_fields(domain: Domain, material: Material) -> MaterialFields:
-    """Coefficients of [material] with its regions. InputError where a region does not exist in the mesh."""
-    check_regions(material.regions, domain.region_names)
-    young, poisson, density = (per_cell(domain, material, key) for key in ("young", "poisson", "density"))
+def material_fields(
+    domain: Domain, energy: str, *, young: PerCell, poisson: PerCell, density: PerCell, plane_stress: bool = False
+) -> MaterialFields:
+    """A material by the name of its energy (forms.energies.ENERGIES), Young's modulus in Pa, Poisson's ratio and
+    density in kg/m^3, each a number or (cells,). `plane_stress`: of a 2D mesh, in place of plane strain."""
     mu, lmbda = lame(young, poisson)  # type: ignore[arg-type]
     options = {}
-    if domain.dim == 2 and material.plane == "stress":
+    if domain.dim == 2 and plane_stress:
         lmbda = plane_stress_lambda(mu, lmbda)
         options = {"reduced": True}
-    energy = ENERGIES[material.energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
-    return MaterialFields(energy, density, young, mu, lmbda)
+    psi = ENERGIES[energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
+    return MaterialFields(psi, density, young, mu, lmbda)
 
 
-def per_cell(domain: Domain, source: Any, key: str, regions: dict[str, Region] | None = None) -> PerCell:
-    """`key` of a table as one number, or as (cells,) where a region of the material overrides it."""
-    base = float(getattr(source, key))
-    overrides = source.regions if regions is None else regions
-    special = {name: getattr(region, key) for name, region in overrides.items() if getattr(region, key) is not None}
+def by_region(domain: Domain, base: float, special: Mapping[str, float]) -> PerCell:
+    """A parameter as one number, or as (cells,) where regions, by name, have another value."""
     if not special:
         return base
     values = np.full(domain.cell_count, base)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,14 +13,31 @@ from dolfinx import fem
 
 from ..forms.plasticity import Plastic
 from ..mesh.domain import Domain
-from ..study import Study
 from .flow_prediction import Extrapolated, FlowPrediction, Implicit
-from .material import MaterialFields, PerCell, per_cell
+from .material import MaterialFields, PerCell
 
 Values = npt.NDArray[np.float64]
 Cells = npt.NDArray[np.int32]
 
 WEAKEST = 0.01  # share of the yield stress that softening leaves
+
+
+@dataclass(frozen=True)
+class YieldLaw:
+    """When cells flow, and how fast.
+
+    Attributes:
+        yield_stress: Pa, of the Cauchy stress, a number or (cells,).
+        frobenius: compared with it is the norm of the whole stress; else von Mises'.
+        flow_rate: nu, 1/s; inf: independent of the rate.    hardening: K, Pa; < 0 softens.
+        update: what a step is solved with (mechanics.flow_prediction).
+    """
+
+    yield_stress: PerCell
+    frobenius: bool = False
+    flow_rate: float = math.inf
+    hardening: float = 0.0
+    update: Literal["extrapolated", "implicit", "staggered"] = "extrapolated"
 
 
 class Plasticity:
@@ -33,21 +51,20 @@ class Plasticity:
         fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
     """
 
-    def __init__(self, domain: Domain, study: Study, material: MaterialFields) -> None:
-        table = study.plasticity
-        assert table is not None
-        self.rate, self.hardening, self.frobenius = table.flow_rate, table.hardening, table.measure == "frobenius"
+    def __init__(self, domain: Domain, law: YieldLaw, material: MaterialFields, *, implicit: bool = True) -> None:
+        """`implicit`: whether u is what a step is solved for; explicit schemes know it beforehand."""
+        self.rate, self.hardening, self.frobenius = law.flow_rate, law.hardening, law.frobenius
         self.dt, self.fraction = 0.0, 0.0
-        self._yield: PerCell = per_cell(domain, table, "yield_stress", study.material.regions)
+        self._yield = law.yield_stress
         self._modulus: PerCell = 3 * material.mu
         self.strain = np.zeros(domain.cell_count)
         self.inverse = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (3, 3))), name="inverse plastic part")
         self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: domain.cell_count]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
-        # explicit steps know u before the stress is asked for: nothing need be extrapolated
-        known = table.update == "extrapolated" and study.time.scheme == "explicit"
-        self.prediction = self._prediction(domain, "implicit" if known else table.update)
+        # where u is known before the stress is asked for nothing need be extrapolated
+        known = law.update == "extrapolated" and not implicit
+        self.prediction = self._prediction(domain, "implicit" if known else law.update)
         self.refresh()
         self._memory: Values | None = None
 
@@ -108,7 +125,10 @@ def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
     return ufl.as_tensor([[inverse[0, 0], inverse[0, 1], 0], [inverse[1, 0], inverse[1, 1], 0], [0, 0, inverse[2, 2]]])
 
 
-def plastic_material(domain: Domain, study: Study, material: MaterialFields) -> MaterialFields:
-    """The material with an energy of the elastic part of F, and with what its cells remember."""
-    plastic = Plasticity(domain, study, material)
+def plastic_material(
+    domain: Domain, law: YieldLaw, material: MaterialFields, *, implicit: bool = True
+) -> MaterialFields:
+    """The material with an energy of the elastic part of F, and with what its cells remember; `implicit`: of the
+    scheme."""
+    plastic = Plasticity(domain, law, material, implicit=implicit)
     return replace(material, energy=plastic.energy, plastic=plastic)

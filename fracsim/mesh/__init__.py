@@ -3,7 +3,7 @@
 ranks           small collective operations; errors that reach every rank
 domain          the partitioned mesh with its named groups, function spaces, and maps to the input mesh
 topology        cells and edges of the input mesh, numbered once
-names           groups and regions as a study calls them
+names, places   groups and regions by name; boxes and planes
 simplices       edges of a triangle or tetrahedron, and what every pattern of broken ones means
 small_matrices  arrays of 2 x 2 and 3 x 3 matrices
 edges           the edges of the mesh and their integrity

@@ -17,11 +17,12 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import format_point
-from ..study import Box, Plane
 from .names import check_group
+from .places import Group, InBox, OnPlane, Place
 from .ranks import Gather, total
 
 Ints = npt.NDArray[np.int32]
+Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -135,36 +136,50 @@ class Domain:
         volume, cells = total(self.comm, np.array([self.volumes.sum(), self.cell_count]))
         return float((volume / cells) ** (1 / self.dim))
 
-    def nodes_of(self, where: str | Box | Plane, key: str) -> Ints:
-        """Local nodes (owned and ghost) of a facet group, a box or a plane; InputError where there are none."""
-        nodes = self._group_nodes(where, key) if isinstance(where, str) else self._selected(where, key)
+    def nodes_of(self, place: Place, key: str = "on") -> Ints:
+        """Local nodes (owned and ghost) of a place; InputError, naming the key, where there are none (collective)."""
+        nodes = self._group_nodes(place, key) if isinstance(place, Group) else self._selected(place)
         if total(self.comm, len(nodes))[0] == 0:
-            raise InputError(f"{key}: {describe(where)} selects no node; the body lies in {self.extent()}")
+            raise InputError(f"{key}: {place} selects no node; the body lies in {self.extent()}")
         return nodes
 
-    def facets_of(self, where: str | Box | Plane, key: str) -> Ints:
-        """Local boundary facets of a group, or those with all nodes in a box or on a plane."""
-        if isinstance(where, str):
-            facets = np.intersect1d(self.group(where, key), self._exterior)
+    def facets_of(self, place: Place, key: str = "on") -> Ints:
+        """Local boundary facets of a group, or those with all nodes in a box or on a plane (collective)."""
+        if isinstance(place, Group):
+            facets = np.intersect1d(self.group(place.name, key), self._exterior)
         else:
-            facets = self._facets_within(self._selected(where, key))
+            facets = self._facets_within(self._selected(place))
         if total(self.comm, len(facets))[0] == 0:
-            raise InputError(f"{key}: {describe(where)} selects no boundary facet; the body lies in {self.extent()}")
+            raise InputError(f"{key}: {place} selects no boundary facet; the body lies in {self.extent()}")
         return facets
+
+    def nearest_node(self, point: Values, key: str = "point") -> Ints:
+        """The owned node nearest to a point (d,), on the one rank that has it (collective).
+
+        Ties go to the lowest node of the input mesh. InputError where the point lies outside the bounding box.
+        """
+        low, high = self.lower - 1e-9 * self.size, self.upper + 1e-9 * self.size
+        if np.any(point < low) or np.any(point > high):
+            raise InputError(f"{key} = {np.asarray(point).tolist()} lies outside the body, which spans {self.extent()}")
+        distance = np.linalg.norm(self.nodes[: self.node_count] - point, axis=1)
+        best = (np.inf, np.iinfo(np.int64).max, -1)
+        if len(distance):
+            rounded = np.round(distance / (1e-12 * self.size))
+            node = np.lexsort((self.node_input[: self.node_count], rounded))[0]
+            best = (float(rounded[node]), int(self.node_input[node]), int(node))
+        winner = min(self.comm.allgather(best[:2]))
+        return np.array([best[2]] if best[:2] == winner else [], np.int32)
 
     def group(self, name: str, key: str) -> Ints:
         """Facets of a named group; InputError lists the groups that exist."""
         check_group(name, self.facets, key)
         return self.facets[name]
 
-    def _group_nodes(self, name: str, key: str) -> Ints:
-        facets = self.group(name, key)
-        return fem.locate_dofs_topological(self.space, self.dim - 1, facets)
+    def _group_nodes(self, place: Group, key: str) -> Ints:
+        return fem.locate_dofs_topological(self.space, self.dim - 1, self.group(place.name, key))
 
-    def _selected(self, where: Box | Plane, key: str) -> Ints:
-        select = in_box if isinstance(where, Box) else on_plane
-        inside = select(where, self.nodes, self.size, key)  # type: ignore[arg-type]
-        return np.flatnonzero(inside).astype(np.int32)
+    def _selected(self, place: InBox | OnPlane) -> Ints:
+        return np.flatnonzero(place.selects(self.nodes, self.size)).astype(np.int32)
 
     def _facets_within(self, nodes: Ints) -> Ints:
         exterior = self._exterior
@@ -182,38 +197,6 @@ class Domain:
     def extent(self) -> str:
         """The bounding box in words, m."""
         return f"{format_point(self.lower)} to {format_point(self.upper)}"
-
-
-def in_box(box: Box, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:
-    """Which points lie in the closed box, give or take 1e-9 of the body's size: faces that coincide are meant."""
-    low, high = (_of_dimension(corner, points, f"{key}.box") for corner in box.box)
-    slack = 1e-9 * size
-    return np.all((points >= low - slack) & (points <= high + slack), axis=1)
-
-
-def on_plane(plane: Plane, points: npt.NDArray[np.float64], size: float, key: str) -> npt.NDArray[np.bool_]:
-    """Which points lie within `within` of the plane (default 1e-6 of the body's size)."""
-    normal = _of_dimension(plane.normal, points, f"{key}.normal")
-    point = _of_dimension(plane.point, points, f"{key}.point")
-    length = np.linalg.norm(normal)
-    if length == 0:
-        raise InputError(f"{key}.normal = {plane.normal}: a normal must not be zero")
-    return np.abs((points - point) @ normal) / length <= (plane.within or 1e-6 * size)
-
-
-def _of_dimension(vector: list[float], points: npt.NDArray[np.float64], key: str) -> npt.NDArray[np.float64]:
-    if len(vector) != points.shape[1]:
-        raise InputError(f"{key} = {vector}: the mesh has {points.shape[1]} dimensions; give as many numbers")
-    return np.asarray(vector, float)
-
-
-def describe(where: str | Box | Plane) -> str:
-    """A place in words."""
-    if isinstance(where, str):
-        return f'group "{where}"'
-    if isinstance(where, Box):
-        return f"box {where.box[0]} to {where.box[1]}"
-    return f"plane through {where.point} with normal {where.normal}"
 
 
 def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:

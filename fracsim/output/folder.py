@@ -15,7 +15,6 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError
 from ..stepping.state import State
-from ..study import Output, Time
 from .checkpoint import checkpoint_path, read_notes
 from .fields_file import read_times
 from .history import read_rows
@@ -68,11 +67,11 @@ def versions(comm: MPI.Comm) -> dict[str, str]:
 
 
 class OutputClock:
-    """When a frame is due: every so many steps, or so many seconds of simulated time. Default: 50 frames a run."""
+    """When a frame is due."""
 
-    def __init__(self, output: Output, timing: Time) -> None:
-        self._every = output.every
-        self._interval = output.interval or timing.end / 50
+    def __init__(self, every: int | None, interval: float) -> None:
+        """Every so many steps; with None, every so many seconds of simulated time."""
+        self._every, self._interval = every, interval
         self._last = 0.0
 
     def due(self, state: State) -> bool:

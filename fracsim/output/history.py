@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from io import RawIOBase
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +15,11 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
-from ..mechanics.time_functions import of_size
-from ..mesh.domain import Domain, Ints
+from ..mesh.domain import Ints
 from ..mesh.ranks import total
 from ..meshes.words import AXES
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
-from ..study import Probe
 from .writing import replace_text, write_all, written
 
 COLUMNS = (
@@ -30,17 +30,25 @@ COLUMNS = (
 Reading = Callable[[], npt.NDArray[np.float64]]
 
 
-class Probes:
-    """Displacements and reactions that the study asks for."""
+@dataclass(frozen=True)
+class Probe:
+    """The mean displacement of nodes in m, or the sum of the reactions on them in N; `nodes`: local ones."""
 
-    def __init__(self, balance: Balance, probes: list[Probe]) -> None:
+    name: str
+    quantity: Literal["displacement", "reaction"]
+    nodes: Ints
+
+
+class Probes:
+    """Reads displacements and reactions off a body."""
+
+    def __init__(self, balance: Balance, probes: Sequence[Probe] = ()) -> None:
+        """Counts the nodes of each (collective)."""
         self._balance, self._domain = balance, balance.domain
-        self.names: list[str] = []
-        self._readings: list[Reading] = []
-        for index, probe in enumerate(probes):
-            kind = "reaction" if probe.quantity == "reaction" else "probe"
-            self.names += [f"{kind}_{probe.name}_{axis}" for axis in AXES[: self._domain.dim]]
-            self._readings.append(self._reading(probe, f"probe.{index}"))
+        kinds = {"reaction": "reaction", "displacement": "probe"}
+        axes = AXES[: self._domain.dim]
+        self.names = [f"{kinds[probe.quantity]}_{probe.name}_{axis}" for probe in probes for axis in axes]
+        self._readings = [self._reading(probe) for probe in probes]
 
     def __call__(self) -> npt.NDArray[np.float64]:
         """All readings in the order of `names` (collective)."""
@@ -48,12 +56,8 @@ class Probes:
             return np.empty(0)
         return total(self._domain.comm, np.concatenate([reading() for reading in self._readings]))
 
-    def _reading(self, probe: Probe, key: str) -> Reading:
-        if probe.point is not None:
-            return self._mean_displacement(nearest_node(self._domain, probe.point, f"{key}.point"))
-        assert probe.on is not None
-        nodes = self._domain.nodes_of(probe.on, f"{key}.on")
-        owned = nodes[nodes < self._domain.node_count]
+    def _reading(self, probe: Probe) -> Reading:
+        owned = probe.nodes[probe.nodes < self._domain.node_count]
         if probe.quantity == "displacement":
             return self._mean_displacement(owned)
         return lambda: self._balance.reactions.reshape(-1, self._domain.dim)[owned].sum(axis=0)
@@ -62,22 +66,6 @@ class Probes:
         count = total(self._domain.comm, len(owned))[0]
         d = self._domain.dim
         return lambda: self._balance.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
-
-
-def nearest_node(domain: Domain, point: list[float], key: str) -> Ints:
-    """The owned node nearest to a point, on the one rank that has it; ties go to the lowest node of the input mesh."""
-    target = of_size(point, domain.dim, key)
-    low, high = domain.lower - 1e-9 * domain.size, domain.upper + 1e-9 * domain.size
-    if np.any(target < low) or np.any(target > high):
-        raise InputError(f"{key} = {point} lies outside the body, which spans {domain.extent()}")
-    distance = np.linalg.norm(domain.nodes[: domain.node_count] - target, axis=1)
-    best = (np.inf, np.iinfo(np.int64).max, -1)
-    if len(distance):
-        rounded = np.round(distance / (1e-12 * domain.size))
-        node = np.lexsort((domain.node_input[: domain.node_count], rounded))[0]
-        best = (float(rounded[node]), int(domain.node_input[node]), int(node))
-    winner = min(domain.comm.allgather(best[:2]))
-    return np.array([best[2]] if best[:2] == winner else [], np.int32)
 
 
 def history_columns(probe_names: list[str]) -> list[str]:

@@ -9,15 +9,15 @@ from mpi4py import MPI
 
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
-from ..study import Study
 
 
 class Progress:
     """One line that rewrites itself on a terminal; silent otherwise (batch logs stay short)."""
 
-    def __init__(self, comm: MPI.Comm, study: Study) -> None:
+    def __init__(self, comm: MPI.Comm, end: float) -> None:
+        """`end`: of the run, s."""
         self._on = comm.rank == 0 and sys.stderr.isatty()
-        self._end = study.time.end
+        self._end = end
         self._began = time.monotonic()
         self._from: float | None = None
 

@@ -133,7 +133,7 @@ def _read_history(path: Path) -> dict[str, Values]:
 
 def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
     """How far the groups are driven whose reaction is recorded, m: against it a reaction is usually plotted."""
-    from ..mechanics.time_functions import motion_function
+    from ..study.conditions import conditions, place_of
     from ..study.file import load_study
 
     motions: dict[str, Values] = {}
@@ -141,13 +141,15 @@ def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
         study = load_study(folder / "study.toml")
     except InputError:  # written by another version: its history can be shown all the same
         return motions
-    for probe in study.probe:
+    for i, probe in enumerate(study.probe):
         axes = [axis for axis in "xyz" if f"reaction_{probe.name}_{axis}" in history]
-        for i, entry in enumerate(study.boundary):
-            if axes and entry.on == probe.on and entry.kind in ("displacement", "velocity"):
-                law, held = motion_function(entry, len(axes), f"boundary.{i}")
-                path = np.array([law(t) for t in history["time"]]).reshape(-1, len(axes))
-                chosen = [k for k in range(len(axes)) if held[k] and np.any(path[:, k])]
+        if not axes or probe.on is None:
+            continue
+        place = place_of(probe.on, len(axes), f"probe.{i}.on")
+        for entry in conditions(study, len(axes)):
+            if entry.place == place and entry.kind in ("displacement", "velocity"):
+                path = np.array([entry.function(t) for t in history["time"]]).reshape(-1, len(axes))
+                chosen = [k for k in range(len(axes)) if entry.components[k] and np.any(path[:, k])]
                 motions |= {f"motion_{probe.name}_{axes[k]}": path[:, k] for k in chosen}
     return motions
 

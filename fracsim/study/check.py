@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.time_functions import in_time, motion_function, of_size
 from ..mesh.bodies import bodies_of, not_held
 from ..mesh.names import check_group, check_regions
+from ..mesh.places import Group, Place
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import AXES, format_point
-from . import MOTIONS, Box, Brittle, Plane, Study
+from . import Brittle, Study
+from .conditions import conditions, fibre_direction, initial_motion, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
 
 if TYPE_CHECKING:
@@ -92,9 +93,8 @@ def _check(study: Study, anatomy: Anatomy) -> None:
 def _check_held(study: Study, dim: int) -> None:
     """A motion along an axis that no entry holds. Turning and single bodies need the mesh: the run finds them."""
     held = np.zeros(dim, bool)
-    for i, entry in enumerate(study.boundary):
-        if entry.kind in MOTIONS:
-            held |= motion_function(entry, dim, f"boundary.{i}")[1]
+    for condition in conditions(study, dim):
+        held |= condition.components
     if not held.all():
         raise InputError(not_held("the body", f"moving along {AXES[int(np.argmin(held))]}"))
 
@@ -103,46 +103,24 @@ def _check_groups(study: Study, anatomy: Anatomy) -> None:
     places = [(f"boundary.{i}.on", entry.on) for i, entry in enumerate(study.boundary)]
     places += [(f"probe.{i}.on", probe.on) for i, probe in enumerate(study.probe) if probe.on is not None]
     for key, where in places:
-        if isinstance(where, str):
-            check_group(where, anatomy.groups, key)
-        else:
-            _check_place(key, where, anatomy)
+        _check_place(key, place_of(where, anatomy.dim, key), anatomy)
     check_regions(study.material.regions, anatomy.regions)
 
 
-def _check_place(key: str, where: Box | Plane, anatomy: Anatomy) -> None:
-    """Whether a box or plane meets the body's bounding box at all."""
-    if isinstance(where, Box):
-        low, high = (of_size(corner, anatomy.dim, f"{key}.box") for corner in where.box)
-        slack = 1e-9 * float(np.linalg.norm(np.subtract(anatomy.upper, anatomy.lower)))
-        misses = np.any(low > np.array(anatomy.upper) + slack) or np.any(high < np.array(anatomy.lower) - slack)
-    else:
-        normal, point = (of_size(getattr(where, name), anatomy.dim, f"{key}.{name}") for name in ("normal", "point"))
-        if not np.any(normal):
-            raise InputError(f"{key}.normal = {where.normal}: a normal must not be zero")
-        ends = np.sort(normal * (np.array([anatomy.lower, anatomy.upper]) - point), axis=0)
-        slack = (where.within or 0.0) * np.linalg.norm(normal) + 1e-9 * np.abs(ends[np.isfinite(ends)]).sum()
-        misses = ends[0].sum() > slack or ends[1].sum() < -slack
-    if misses:
+def _check_place(key: str, place: Place, anatomy: Anatomy) -> None:
+    """Whether the mesh has the group, or a box or plane meets the body's bounding box at all."""
+    if isinstance(place, Group):
+        check_group(place.name, anatomy.groups, key)
+    elif not place.meets(np.array(anatomy.lower), np.array(anatomy.upper)):
         raise InputError(f"{key} selects no node; the body lies in {_extent(anatomy)}")
 
 
 def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     dim = anatomy.dim
-    for i, entry in enumerate(study.boundary):
-        key = f"boundary.{i}"
-        if entry.kind in MOTIONS:
-            motion_function(entry, dim, key)
-        else:
-            in_time(getattr(entry, entry.kind), f"{key}.{entry.kind}", dim if entry.kind == "traction" else 1)
-    if study.load is not None:
-        for name in ("gravity", "body_force"):
-            if (value := getattr(study.load, name)) is not None:
-                in_time(value, f"load.{name}", dim)
-    if study.initial is not None and study.initial.velocity is not None:
-        of_size(study.initial.velocity, dim, "initial.velocity")
-    if study.initial is not None and study.initial.spin is not None:
-        of_size(study.initial.spin, 1 if dim == 2 else 3, "initial.spin")
+    conditions(study, dim)
+    volume_loads(study, dim)
+    initial_motion(study, dim)
+    fibre_direction(study, dim)
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, anatomy, f"probe.{i}.point")

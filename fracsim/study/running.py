@@ -85,7 +85,7 @@ class Probe(Table):
         return self
 
     @property
-    def quantity(self) -> str:
+    def quantity(self) -> Literal["displacement", "reaction"]:
         """What is recorded."""
         return self.record or ("displacement" if self.point is not None else "reaction")
 

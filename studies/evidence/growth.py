@@ -170,10 +170,9 @@ class VirtualNodes:
     def __init__(self, run: Any, whole: Any) -> None:
         """`run` has the cuts; the motion is that of the `whole` body: nodes that a cut set loose are no part of a cell
         any more, and would turn the cells inside out that the copies are."""
-        from ...mechanics.material import material_fields
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
-        from ...scene import make_stepper, scene_on
+        from ...scene import make_stepper, material_of, scene_on
         from ...stepping.after_step import NoFlow, Unbreakable
         from .virtual_nodes import duplicate
 
@@ -182,7 +181,7 @@ class VirtualNodes:
         self.new = duplicate(old.cell_nodes, node_groups(old.dim)[graph.pattern], old.node_count)
         domain = distribute(old.comm, self._mesh(old))
         share = self.new.share[domain.cell_input]
-        material = material_fields(domain, study.material)
+        material = material_of(study, domain)
         scene = scene_on(domain, study, replace(material, density=share * material.density))
         assert scene.balance.stress.chi is not None
         scene.balance.stress.chi.x.array[: len(share)] = share

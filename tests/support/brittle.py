@@ -12,12 +12,12 @@ import pyvista
 from fracsim.fracture.brittle.body import Body
 from fracsim.fracture.brittle.level_set import DirectionField
 from fracsim.fracture.brittle.pattern import Load, Opened, Pattern
+from fracsim.fracture.brittle.rules import SurfaceRules
 from fracsim.mesh.split.build import Split, split
 from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
 from fracsim.output.surface.fragments import volumes
 from fracsim.scene import Scene
-from fracsim.study import Brittle
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -55,7 +55,7 @@ def open_at(
 
     `field`: a function from places (C, d) to directions of tension in the whole body.
     """
-    pattern = Pattern(mesh, Brittle(surfaces=len(places), **table), 1e-6, settle)
+    pattern = Pattern(mesh, SurfaceRules(surfaces=len(places), **table), 1e-6, settle)
     body, dim = pattern.body, mesh.dim
     cells = np.array([near(body, place) for place in places])
     direction = np.array(normals, float) / np.linalg.norm(normals, axis=1)[:, None]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ...study import Grains as GrainsTable
 from .body import Body
+from .rules import GrainRules
 from .sheet import NEAREST, ROUNDS
 
 Ints = npt.NDArray[np.int64]
@@ -25,15 +25,15 @@ class Grains:
 
     Attributes:
         seeds: (n, d) m, uniform in the body.    weights: (n,) k_i.
-        mode: see study.Grains.
+        mode: see GrainRules.
         of_node: (N,) grain of each node.    of_cell: (C,) grain of each centroid.
         edges: (k,) edges between grains.    cut: (k,) where their boundaries cut them, from the lower node.
     """
 
-    def __init__(self, body: Body, table: GrainsTable, settle: bool) -> None:
+    def __init__(self, body: Body, rules: GrainRules, settle: bool) -> None:
         """`settle`: no node without a cell in its own grain, as far as its cells allow."""
-        self.mode = table.mode
-        self.seeds, self.weights = sow(body, table)
+        self.mode = rules.mode
+        self.seeds, self.weights = sow(body, rules)
         self.of_node, _ = least(body.points, self.seeds, self.weights)
         self.of_cell, _ = least(body.centroids, self.seeds, self.weights)
         if settle:
@@ -68,14 +68,14 @@ class Grains:
         return np.asarray(self.weights[grain] ** 2 * np.sum((points - self.seeds[grain]) ** 2, axis=1))
 
 
-def sow(body: Body, table: GrainsTable) -> tuple[Values, Values]:
+def sow(body: Body, rules: GrainRules) -> tuple[Values, Values]:
     """Points drawn uniformly from the body, (n, d) in m, and weights (n,) drawn from 1 - spread to 1 + spread."""
-    random = np.random.Generator(np.random.PCG64(table.seed))
+    random = np.random.Generator(np.random.PCG64(rules.seed))
     share = np.cumsum(body.volumes)
-    cell = np.searchsorted(share / share[-1], random.random(table.count), side="right")
-    inside = random.dirichlet(np.ones(body.dim + 1), table.count)
+    cell = np.searchsorted(share / share[-1], random.random(rules.count), side="right")
+    inside = random.dirichlet(np.ones(body.dim + 1), rules.count)
     seeds = np.einsum("nk,nki->ni", inside, body.points[body.cells[np.minimum(cell, len(body.cells) - 1)]])
-    return seeds, random.uniform(1 - table.spread, 1 + table.spread, table.count)
+    return seeds, random.uniform(1 - rules.spread, 1 + rules.spread, rules.count)
 
 
 def least(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]:

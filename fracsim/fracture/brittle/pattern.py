@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...meshes.data import MeshData
-from ...study import Brittle
 from .body import Body
 from .grains import Grains
 from .level_set import Curved, DirectionField, planar
 from .principal import directions, material_normals
+from .rules import SurfaceRules
 from .sheet import Crossing, cut_places, settled, sides_of
 from .start import Starts
 
@@ -53,11 +53,11 @@ class Opened:
 class Pattern:
     """Opens surfaces in a mesh, on the rank that has it; made when the first surface starts."""
 
-    def __init__(self, mesh: MeshData, brittle: Brittle, spacing: float, settle: bool) -> None:
+    def __init__(self, mesh: MeshData, rules: SurfaceRules, spacing: float, settle: bool) -> None:
         """`settle`: nodes that a surface leaves without a whole cell go over to its other side."""
-        self.body, self.brittle = Body(mesh), brittle
+        self.body, self.rules = Body(mesh), rules
         self._spacing, self._settle = spacing, settle
-        self.grains = Grains(self.body, brittle.grains, settle) if brittle.grains is not None else None
+        self.grains = Grains(self.body, rules.grains, settle) if rules.grains is not None else None
 
     def open(
         self, load: Load, broken_keys: Ints, taken: Values, most: int, field: DirectionField | None = None
@@ -65,7 +65,7 @@ class Pattern:
         """Up to `most` surfaces from the cells loaded most, none nearer than the spacing to another or to those `taken`
         (n, d) before. A cell that a surface of this pass has touched is relieved: none starts there."""
         body, places = self.body, self.body.centroids[load.cell]
-        normals = material_normals(directions(load.stress, places, self.brittle.seed), load.gradient)
+        normals = material_normals(directions(load.stress, places, self.rules.seed), load.gradient)
         state, starts = _State(body, broken_keys), Starts(places, load.load, self._spacing, taken)
         at: list[Values] = []
         while len(at) < most and (start := starts.next()) is not None:

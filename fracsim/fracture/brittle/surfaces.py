@@ -10,12 +10,12 @@ import numpy.typing as npt
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
 from ...mesh.ranks import from_root, total
-from ...study import Brittle
 from ..criterion import Average, CarriedStress, Edges
 from ..strength import Strength
 from .level_set import DirectionField
 from .pattern import Load, Opened, Pattern
 from .principal import largest, tensors, upper_bound
+from .rules import SurfaceRules
 
 Cells = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -33,12 +33,12 @@ class BrittleSurfaces:
     """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, brittle: Brittle
+        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, rules: SurfaceRules
     ) -> None:
-        self._stress, self._graph, self.strength, self._brittle = stress, graph, strength, brittle
+        self._stress, self._graph, self.strength, self._rules = stress, graph, strength, rules
         self._domain = stress.domain
         self._carried = CarriedStress(stress, graph, average, whole_tensor=True)
-        self.spacing = brittle.spacing if brittle.spacing is not None else SPACING * self._domain.mean_edge
+        self.spacing = rules.spacing if rules.spacing is not None else SPACING * self._domain.mean_edge
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut: Values = np.full(len(graph.broken), np.nan)
         self._pattern: Pattern | None = None
@@ -46,7 +46,7 @@ class BrittleSurfaces:
     @property
     def left(self) -> int:
         """Surfaces that may still start."""
-        return self._brittle.surfaces - len(self.starts)
+        return self._rules.surfaces - len(self.starts)
 
     def __call__(self, stress: Values) -> tuple[Edges, Values]:
         """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""
@@ -58,8 +58,7 @@ class BrittleSurfaces:
         if not total(self._domain.comm, len(load.cell))[0]:
             return none
         parts = self._domain.comm.gather(load)
-        curved = self._brittle.shape == "curved"
-        field = self._field(self._carried.everywhere(carried, active)) if curved else None
+        field = self._field(self._carried.everywhere(carried, active)) if self._rules.curved else None
         broken = self._graph.broken_keys()
         opened: Opened = from_root(self._domain.comm, lambda: self._open(parts, broken, field))
         self.starts = np.concatenate([self.starts, opened.starts])
@@ -107,11 +106,11 @@ class BrittleSurfaces:
         if self._pattern is None:
             assert self._domain.source is not None
             settle = self._stress.chi is not None
-            self._pattern = Pattern(self._domain.source, self._brittle, self.spacing, settle)
+            self._pattern = Pattern(self._domain.source, self._rules, self.spacing, settle)
         load = Load(*(np.concatenate([getattr(part, name) for part in parts]) for name in Load.__annotations__))
         order = np.argsort(load.cell)
         load = Load(*(getattr(load, name)[order] for name in Load.__annotations__))
-        most = min(self.left, self._brittle.per_pass or self.left)
+        most = min(self.left, self._rules.per_pass or self.left)
         along = DirectionField.of(self._pattern.body, *field) if field is not None else None
         return self._pattern.open(load, broken, self.starts, most, along)
 

@@ -28,6 +28,7 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
 
     from ....mechanics.loads import surface_measures
     from ....mesh.domain import distribute
+    from ....mesh.places import Group
     from ....study.check import checked_mesh
     from ....study.file import validate
 
@@ -46,7 +47,7 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
         return 2 * mu * strain + lmbda * ufl.tr(strain) * ufl.Identity(d)
 
     loads = [entry for entry in checked.boundary if entry.kind == "traction"]
-    measures = surface_measures(domain, [domain.facets_of(entry.on, "boundary") for entry in loads])
+    measures = surface_measures(domain, [domain.facets_of(Group(str(entry.on))) for entry in loads])
     zero: Any = fem.Constant(domain.mesh, np.zeros(d))
     force = ufl.inner(zero, w) * ufl.dx
     for entry, ds in zip(loads, measures, strict=True):

@@ -1,0 +1,118 @@
+"""A study bound to its mesh: everything that a run moves, built and checked before anything is written.
+
+Here alone a study becomes physics: what lies below this room takes numbers, arrays and functions.
+
+material    the energy, its moduli and the yield law
+terms       what adds to the balance of forces, and the balance
+breaking    what flows and what breaks after a step
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+from ..forms.schemes import Scheme
+from ..mechanics.balance import Balance
+from ..mechanics.material import MaterialFields
+from ..mechanics.supports import check_supports
+from ..mesh.domain import Domain, distribute
+from ..mesh.ranks import on_root
+from ..output.history import Probe, Probes
+from ..stepping.after_step import Breaking, Flow, Unbreakable
+from ..stepping.initial import initial_velocity
+from ..stepping.newton import Solver
+from ..stepping.state import State
+from ..stepping.stepper import Stepper, StepSizes
+from ..study import Study, Time
+from ..study.check import checked_mesh
+from ..study.conditions import initial_motion, of_size, place_of
+from .breaking import breaking_of, flow_of
+from .material import material_of
+from .terms import TERMS, Parts, balance_of
+
+__all__ = ["TERMS", "Parts", "Scene", "build_scene", "make_scheme", "make_stepper", "material_of", "scene_on"]
+
+
+@dataclass
+class Scene:
+    """A study bound to its mesh: what a run moves.
+
+    Attributes:
+        solver: of implicit schemes; None for explicit ones.    fracture: what breaks; None where nothing does.
+    """
+
+    study: Study
+    domain: Domain
+    balance: Balance
+    solver: Solver | None
+    stepper: Stepper
+    fracture: Any
+    probes: Probes
+
+    def start(self) -> State:
+        """The state at t = 0 (collective)."""
+        motion = initial_motion(self.study, self.domain.dim)
+        return self.stepper.start(None if motion is None else initial_velocity(self.balance, *motion))
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back (collective)."""
+        if self.solver is not None:
+            self.solver.destroy()
+        self.balance.destroy()
+
+
+def build_scene(comm: MPI.Comm, study: Study) -> Scene:
+    """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
+    return scene_on(distribute(comm, on_root(comm, lambda: checked_mesh(study))), study)
+
+
+def scene_on(domain: Domain, study: Study, material: MaterialFields | None = None) -> Scene:
+    """The scene of a study on a mesh that is there; `material`: in place of the study's own."""
+    scheme = make_scheme(study.time)
+    balance = balance_of(study, domain, scheme, material or material_of(study, domain))
+    if not scheme.inertia:
+        check_supports(domain, balance.motion)
+    flow = flow_of(study, balance)
+    breaking = breaking_of(study, balance)
+    solver = Solver(balance, study.solver) if scheme.implicit else None
+    stepper = make_stepper(balance, study.time, flow, breaking or Unbreakable(balance, flow), solver)
+    return Scene(study, domain, balance, solver, stepper, breaking, Probes(balance, _probes(study, domain)))
+
+
+def make_scheme(timing: Time) -> Scheme:
+    """The time scheme of a study."""
+    return timing.kind(**timing.parameters)
+
+
+def make_stepper(balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None) -> Stepper:
+    """What steps a balance of this scheme."""
+    sizes = StepSizes(timing.step, timing.end, timing.smallest or timing.step / 1024, timing.adapt)
+    if solver is None:
+        from ..stepping.explicit import ExplicitStepper
+
+        return ExplicitStepper(balance, sizes, flow, breaking)
+    if balance.scheme.inertia:
+        from ..stepping.implicit import ImplicitStepper
+
+        return ImplicitStepper(balance, sizes, flow, breaking, solver)
+    from ..stepping.quasi_static import QuasiStaticStepper
+
+    return QuasiStaticStepper(balance, sizes, flow, breaking, solver)
+
+
+def _probes(study: Study, domain: Domain) -> list[Probe]:
+    """[[probe]] entries with the nodes that they look at."""
+    probes = []
+    for i, entry in enumerate(study.probe):
+        if entry.point is not None:
+            key = f"probe.{i}.point"
+            nodes = domain.nearest_node(of_size(entry.point, domain.dim, key), key)
+        else:
+            assert entry.on is not None
+            key = f"probe.{i}.on"
+            nodes = domain.nodes_of(place_of(entry.on, domain.dim, key), key)
+        probes.append(Probe(entry.name, entry.quantity, nodes))
+    return probes

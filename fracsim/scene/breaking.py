@@ -1,0 +1,81 @@
+"""What happens to the body of a study at the end of a step: it flows, then it breaks. Nothing is imported in vain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..mechanics.balance import Balance
+from ..mechanics.stress import Stress
+from ..mesh.domain import Domain
+from ..stepping.after_step import Flow, NoFlow
+from ..study import Brittle, Study
+from ..study.conditions import fibre_direction
+from .material import per_cell
+
+if TYPE_CHECKING:
+    from ..fracture.brittle.rules import SurfaceRules
+    from ..fracture.strength import Strength
+
+
+def flow_of(study: Study, balance: Balance) -> Flow:
+    """What flows."""
+    if study.plasticity is None:
+        return NoFlow()
+    from ..mechanics.return_mapping import ReturnMapping
+
+    return ReturnMapping(balance.stress)
+
+
+def breaking_of(study: Study, balance: Balance) -> Any:
+    """What breaks; None without [fracture]."""
+    if study.fracture is None:
+        return None
+    from ..fracture.breaking import Breaking
+    from ..mesh.edges import EdgeGraph
+
+    graph = EdgeGraph(balance.domain)
+    passes = study.fracture.passes
+    if passes is None and balance.scheme.inertia:
+        passes = 1
+    return Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes)
+
+
+def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
+    """Which edges fail."""
+    from ..fracture.criterion import OverloadedEdges
+
+    assert study.fracture is not None
+    strength = _strength(study, stress.domain, graph)
+    average = None
+    if study.fracture.radius:
+        from ..fracture.nonlocal_average import NonlocalAverage
+
+        average = NonlocalAverage(stress.domain, study.fracture.radius, study.fracture.kernel)
+    if study.brittle is None:
+        return OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+    from ..fracture.brittle.surfaces import BrittleSurfaces
+
+    return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
+
+
+def _strength(study: Study, domain: Domain, graph: Any) -> Strength:
+    """Strength of edges by region, with scatter and a fibre."""
+    from ..fracture.strength import Fibre, Scatter, Strength
+
+    table = study.fracture
+    assert table is not None
+    scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed)
+    direction = fibre_direction(study, domain.dim)
+    fibre = Fibre(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
+    of_cell = per_cell(study, domain, table, "strength")
+    return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
+
+
+def surface_rules(table: Brittle) -> SurfaceRules:
+    """[brittle] as numbers."""
+    from ..fracture.brittle.rules import GrainRules, SurfaceRules
+
+    given = table.grains
+    grains = None if given is None else GrainRules(given.count, given.seed, given.spread, given.mode)
+    curved = table.shape == "curved"
+    return SurfaceRules(table.surfaces, table.spacing, curved, table.seed, table.per_pass, grains)

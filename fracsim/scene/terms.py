@@ -1,0 +1,119 @@
+"""The balance of forces that a study asks for: which terms, and what they are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from dolfinx import fem
+
+from ..forms.schemes import Scheme
+from ..mechanics.balance import Balance
+from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
+from ..mechanics.loads import DeadLoads, OnFacets, Pressure
+from ..mechanics.material import MaterialFields, coefficient
+from ..mechanics.prescribed_motion import PrescribedMotion
+from ..mechanics.stress import RESIDUAL_STIFFNESS, Stress, Weakening
+from ..mechanics.term import Term
+from ..mechanics.vectors import Assembler
+from ..mesh.domain import Domain
+from ..study import Study
+from ..study.conditions import Condition, conditions, volume_loads
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What terms of the balance are made from.
+
+    Attributes:
+        u: the displacement.    density: kg/m^3, a UFL coefficient.    stress, mass, motion: see mechanics.balance.
+        conditions: the entries of [[boundary]].
+    """
+
+    study: Study
+    scheme: Scheme
+    assembler: Assembler
+    u: fem.Function
+    density: Any
+    stress: Stress
+    mass: Mass
+    motion: PrescribedMotion
+    conditions: list[Condition]
+
+    @property
+    def domain(self) -> Domain:
+        return self.assembler.domain
+
+    def on_facets(self, kind: str) -> list[OnFacets]:
+        """Facets and function of time of each condition of a kind."""
+        of_kind = [each for each in self.conditions if each.kind == kind]
+        return [(self.domain.facets_of(each.place, f"{each.key}.on"), each.function) for each in of_kind]
+
+
+def _viscosity(parts: Parts) -> Term | None:
+    damping = parts.study.damping
+    if damping is None or not damping.stiffness:
+        return None
+    from ..mechanics.damping import Viscosity
+
+    return Viscosity(parts.assembler, parts.u, parts.stress, damping.stiffness)
+
+
+def _pressure(parts: Parts) -> Term | None:
+    pressures = parts.on_facets("pressure")
+    linear = parts.stress.material.energy.linear
+    return Pressure(parts.assembler, parts.u, pressures, linear=linear) if pressures else None
+
+
+def _dead_loads(parts: Parts) -> Term | None:
+    tractions, on_volume = parts.on_facets("traction"), volume_loads(parts.study, parts.domain.dim)
+    if not tractions and not on_volume:
+        return None
+    gravity = (parts.density, on_volume["gravity"]) if "gravity" in on_volume else None
+    body_force = on_volume.get("body_force")
+    return DeadLoads(parts.assembler, tractions=tractions, gravity=gravity, body_force=body_force)
+
+
+def _inertia(parts: Parts) -> Term | None:
+    return Inertia(parts.u, parts.mass) if parts.scheme.inertia else None
+
+
+def _drag(parts: Parts) -> Term | None:
+    damping = parts.study.damping
+    if damping is None or not damping.mass:
+        return None
+    from ..mechanics.damping import Drag
+
+    return Drag(parts.u, parts.mass, damping.mass)
+
+
+# What may add to the balance beside the stress, in this order. A new term has its line here.
+TERMS: dict[str, Callable[[Parts], Term | None]] = {
+    "viscosity": _viscosity,
+    "pressure": _pressure,
+    "dead loads": _dead_loads,
+    "inertia": _inertia,
+    "drag": _drag,
+}
+
+
+def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
+    """The balance of a body of this material (collective). InputError where a place selects nothing."""
+    assembler, u = Assembler(domain), fem.Function(domain.space, name="displacement")
+    entries = conditions(study, domain.dim)
+    moved = [each for each in entries if each.moves]
+    nodes = [domain.nodes_of(each.place, f"{each.key}.on") for each in moved]
+    motion = PrescribedMotion(
+        domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
+    )
+    density = coefficient(domain, material.density)
+    mass: Mass = LumpedMass(assembler, density)
+    if study.time.mass == "consistent":
+        mass = ConsistentMass(assembler, density, motion.bcs)
+    fracture, floor = study.fracture, 0.0 if scheme.inertia else RESIDUAL_STIFFNESS
+    weakening = None if fracture is None else Weakening(fracture.approach, fracture.unilateral)
+    stress = Stress(assembler, u, material, weakening, floor=floor)
+    parts = Parts(study, scheme, assembler, u, density, stress, mass, motion, entries)
+    others = [term for make in TERMS.values() if (term := make(parts)) is not None]
+    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.step)

@@ -1,0 +1,127 @@
+"""What the tables of a study say of a body with d dimensions: places, and functions of time. No DOLFINx here.
+
+The one interpretation of [[boundary]], [load], [initial] and a fibre: `fracsim check` asks here whether they fit the
+mesh, the scene builds its terms from what comes out, reports plot it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
+from ..mesh.places import Group, InBox, OnPlane, Place
+from ..meshes.words import AXES
+from . import MOTIONS, Boundary, Box, Plane, Study, TimeTable
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """An entry of [[boundary]].
+
+    Attributes:
+        key: where the study has it.    kind: fix, displacement, velocity, traction or pressure.
+        function: of time: displacement (d,) in m of the three motions, traction (d,) or pressure (1,) in Pa.
+        components: (d,) which components a motion prescribes; none of a load.
+    """
+
+    key: str
+    kind: str
+    place: Place
+    function: TimeFunction
+    components: Flags
+
+    @property
+    def moves(self) -> bool:
+        """Whether it prescribes a motion."""
+        return self.kind in MOTIONS
+
+
+def conditions(study: Study, dim: int) -> list[Condition]:
+    """All entries of [[boundary]]. InputError where one does not fit the dimension."""
+    return [_condition(entry, dim, f"boundary.{i}") for i, entry in enumerate(study.boundary)]
+
+
+def _condition(entry: Boundary, dim: int, key: str) -> Condition:
+    place, value = place_of(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
+    function: TimeFunction
+    components: Flags = np.zeros(dim, bool)
+    if entry.fix is not None:
+        function, components = constant(np.zeros(dim)), _named(entry.fix, dim, key)
+    else:
+        function = table = in_time(value, f"{key}.{entry.kind}", 1 if entry.kind == "pressure" else dim)
+        if entry.kind in MOTIONS:
+            components = ~np.isnan(table.rows[0])
+        if entry.kind == "velocity":
+            function = table.integral
+    return Condition(key, entry.kind, place, function, components)
+
+
+def _named(axes: str, dim: int, key: str) -> Flags:
+    """(d,) the components that `fix` names."""
+    if beyond := set(axes) - set(AXES[:dim]):
+        raise InputError(f'{key}.fix = "{axes}": a {dim}D mesh has no {min(beyond)}')
+    return np.array([axis in axes for axis in AXES[:dim]])
+
+
+def place_of(where: str | Box | Plane, dim: int, key: str) -> Place:
+    """A place of the study. InputError where its vectors do not fit the dimension, or a normal is zero."""
+    if isinstance(where, str):
+        return Group(where)
+    if isinstance(where, Box):
+        lower, upper = (_vector(corner, dim, f"{key}.box") for corner in where.box)
+        return InBox(lower, upper)
+    normal, point = (_vector(getattr(where, name), dim, f"{key}.{name}") for name in ("normal", "point"))
+    try:
+        return OnPlane(point, normal, where.within)
+    except InputError as error:
+        raise InputError(f"{key}.{error}") from None
+
+
+def _vector(values: Sequence[float], dim: int, key: str) -> tuple[float, ...]:
+    return tuple(float(value) for value in of_size(values, dim, key))
+
+
+def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
+    """gravity (d,) in m/s^2 and body_force (d,) in N/m^3, as far as [load] has them."""
+    given = {} if study.load is None else {key: getattr(study.load, key) for key in ("gravity", "body_force")}
+    return {key: in_time(value, f"load.{key}", dim) for key, value in given.items() if value is not None}
+
+
+def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None] | None:
+    """Velocity (d,) in m/s and spin in rad/s (one number in 2D) of [initial]; None without the table."""
+    initial = study.initial
+    if initial is None:
+        return None
+    velocity = None if initial.velocity is None else of_size(initial.velocity, dim, "initial.velocity")
+    spin = None if initial.spin is None else of_size(initial.spin, 1 if dim == 2 else 3, "initial.spin")
+    return velocity, spin
+
+
+def fibre_direction(study: Study, dim: int) -> Values | None:
+    """(d,) of [fracture.fibre]; None without the table."""
+    fibre = study.fracture.fibre if study.fracture is not None else None
+    return None if fibre is None else of_size(fibre.direction, dim, "fracture.fibre.direction")
+
+
+def in_time(value: Any, key: str, size: int) -> Tabulated:
+    """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
+    table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
+    rows = np.array([of_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
+    if np.any(np.isnan(rows) != np.isnan(rows[0])):
+        raise InputError(f'{key}: a component that is "free" at one time must be free at all of them')
+    return Tabulated(np.asarray(table.time), rows)
+
+
+def of_size(values: Sequence[Any], size: int, key: str) -> Values:
+    """A constant vector; InputError where it does not fit the dimension of the mesh. "free" becomes nan."""
+    if len(values) != size:
+        raise InputError(f"{key} = {values}: this mesh needs {size} number{'s'[: size != 1]}")
+    return np.array([np.nan if value == "free" else float(value) for value in values])

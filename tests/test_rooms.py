@@ -1,0 +1,102 @@
+"""The rooms of fracsim/ import one way: what lies below knows nothing of what lies above it.
+
+Imports are read from the source, those inside functions and under TYPE_CHECKING as well.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import fracsim
+import fracsim.forms
+
+ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
+LAYERS = ("mesh", "mechanics", "fracture", "stepping", "output")  # each may use those before it
+BELOW = {"errors", "forms", "meshes"}  # what any of them may use
+# modules that the study room uses: those without DOLFINx
+WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.places", "mechanics.time_functions"}
+# a sweep asks the schema and who owns a folder; runs ask how groups are driven; colours and pictures read files
+OF_REPORT = {
+    "picture": {"output.surface.files"},
+    "colouring": {"output.fields_file"},
+    "runs": {"study.conditions", "study.file"},
+    "sweep": {"study.check", "study.file", "output.own_files"},
+}
+
+
+def imports(path: Path, package: str) -> set[str]:
+    """Absolute names of the modules that a file imports; `package`: the one that it is in."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            name = ".".join([*base, *([node.module] if node.module else [])])
+            # `from . import x` names modules, or what the package itself defines
+            found |= {name} if node.module else {f"{name}.{alias.name}" for alias in node.names}
+    return found
+
+
+def own(room: str) -> dict[str, set[str]]:
+    """File of a room -> what it imports of fracsim, without "fracsim."."""
+    result = {}
+    for path in sorted((ROOT / room).rglob("*.py")):
+        package = ".".join(["fracsim", *path.relative_to(ROOT).parent.parts])
+        names = {name for name in imports(path, package) if name.split(".")[0] == "fracsim"}
+        result[path.relative_to(ROOT).as_posix()] = {name.removeprefix("fracsim").strip(".") for name in names}
+    assert result
+    return result
+
+
+def rooms_of(names: set[str]) -> set[str]:
+    """First parts; "" and __version__ are the package itself, which imports nothing."""
+    return {name.split(".")[0] for name in names} - {"", "__version__"}
+
+
+@pytest.mark.parametrize("room", LAYERS)
+def test_physics_knows_nothing_above_it(room: str) -> None:
+    allowed = BELOW | set(LAYERS[: LAYERS.index(room) + 1])
+    beyond = {file: rooms_of(names) - allowed for file, names in own(room).items()}
+    assert not {file: names for file, names in beyond.items() if names}
+
+
+def test_forms_need_ufl_alone() -> None:
+    for path in sorted(FORMS.rglob("*.py")):
+        package = ".".join(["fracsim", "forms", *path.relative_to(FORMS).parent.parts])
+        for name in imports(path, package):
+            first = name.split(".")[0]
+            assert name.startswith("fracsim.forms") or first == "ufl" or first in sys.stdlib_module_names, (path, name)
+
+
+def test_a_study_is_read_without_dolfinx() -> None:
+    """What it uses of the rooms with DOLFINx are modules without it, which import only one another."""
+    modules = {name for names in own("study").values() for name in names if rooms_of({name}) & set(LAYERS)}
+    assert modules <= WITHOUT_DOLFINX
+    for module in WITHOUT_DOLFINX:
+        path = ROOT / Path(*module.split(".")).with_suffix(".py")
+        used = imports(path, f"fracsim.{module.rpartition('.')[0]}")
+        assert not {name.split(".")[0] for name in used} & {"dolfinx", "petsc4py", "mpi4py", "ufl"}
+        inner = {name for name in used if rooms_of({name.removeprefix("fracsim.")}) & set(LAYERS)}
+        assert {name.removeprefix("fracsim.") for name in inner} <= WITHOUT_DOLFINX
+
+
+def test_reports_read_files() -> None:
+    allowed = {"errors", "meshes", "report"}
+    for file, names in own("report").items():
+        exceptions = {name for name in names if rooms_of({name}) - allowed}
+        assert exceptions == OF_REPORT.get(Path(file).stem, set()), file
+
+
+def test_the_study_is_for_the_way_in_alone() -> None:
+    """cli, run and scene; and those reports that are named above."""
+    of_root = {path.name: {name[8:] for name in imports(path, "fracsim")} for path in ROOT.glob("*.py")}
+    ways_in = {file for file, names in of_root.items() if "study" in rooms_of(names)}
+    rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
+    readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
+    assert ways_in == {"cli.py", "run.py"}
+    assert readers == {"study", "scene", "report"}
