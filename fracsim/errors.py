@@ -11,6 +11,7 @@ class Exit(IntEnum):
     """Exit codes of every command."""
 
     DONE = 0
+    FALSE_CLAIM = 1
     BAD_INPUT = 2
     NOT_CONVERGED = 3
     STOPPED = 4
@@ -48,3 +49,9 @@ class CannotWrite(FracsimError):
     """Output could not be written in the middle of a run (disk full, folder gone); the message has what, and why."""
 
     exit_code = Exit.CANNOT_WRITE
+
+
+class FalseClaim(FracsimError):
+    """A report of the evidence was written, and a claim in it does not hold."""
+
+    exit_code = Exit.FALSE_CLAIM

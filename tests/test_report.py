@@ -207,17 +207,32 @@ def test_evidence_is_shown_without_importing_a_study(tmp_path: Path) -> None:
     code = f"""
 import sys
 from pathlib import Path
+from fracsim.errors import FalseClaim
 from fracsim.report.make import make_report
-make_report([Path({str(tmp_path)!r})], references=[])
+try:
+    make_report([Path({str(tmp_path)!r})], references=[])
+except FalseClaim:
+    print('told', end=' ')
 print([name for name in ("dolfinx", "fracsim.studies", "mpi4py", "petsc4py") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.strip() == "told []"
     text = (tmp_path / "report.html").read_text()
     assert "1 of 2 claims hold" in text and text.count("data:image/png;base64,") == 1 and "no picture" in text
     (tmp_path / "evidence.json").write_text("{}")
     with pytest.raises(InputError, match="cannot be read"):
         make_report([tmp_path], references=[])
+
+
+@pytest.mark.parametrize(("holds", "code"), ((True, 0), (None, 0), (False, 1)))
+def test_a_false_claim_ends_the_command_with_1(tmp_path: Path, holds: bool | None, code: int) -> None:
+    """The page is written all the same, and the message names the claim."""
+    sections = [Section("A", claims=(Claim("the sky is green", "blue", holds),))]
+    data = {"about": {}, "groups": {"precision": {"sections": to_data(sections)}}}
+    (tmp_path / "evidence.json").write_text(json.dumps(data))
+    done = fracsim("report", tmp_path)
+    assert done.returncode == code and (tmp_path / "report.html").exists()
+    assert ("1 claims do not hold: the sky is green (blue)" in done.stderr) == (code == 1)
 
 
 def test_tables_inside_tables_are_named_by_their_path() -> None:

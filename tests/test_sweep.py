@@ -15,7 +15,7 @@ import pytest
 
 from cases import BAR, command, fracsim, mpirun, write_study
 from fracsim.errors import InputError
-from fracsim.report.outcome import last_words
+from fracsim.report.exit_status import last_words
 from fracsim.report.sweep import combinations, name_of, split_list
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")

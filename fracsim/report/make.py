@@ -6,7 +6,7 @@ import json
 from datetime import date
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import FalseClaim, InputError
 from .compare import read_reference, run_sections
 from .content import Section, from_data
 from .machine import machine, programs
@@ -22,7 +22,10 @@ def make_report(
     quantity: str | None = None,
     exact: float | None = None,
 ) -> Path:
-    """Write the page on run folders, sweeps or the folder of evidence; returns its path."""
+    """Write the page on run folders, sweeps or the folder of evidence; returns its path.
+
+    InputError where that cannot be; FalseClaim, once the page is written, where a claim of the evidence does not hold.
+    """
     target = target or folders[0] / "report.html"
     if target.suffix != ".html":
         raise InputError(f"-o {target}: the report is an .html file")
@@ -45,10 +48,13 @@ def _of_evidence(folder: Path, target: Path) -> Path:
         about = dict(data["about"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{folder}/evidence.json cannot be read: {type(error).__name__}: {error}") from None
+    page = [*_verdict(sections), *sections]
     subtitle = f"{_today()}. Each number comes from a trial recorded beside this page (record.json of each folder)."
-    return write_page(
-        target, [*_verdict(sections), *sections], folder, title="fracsim: evidence", subtitle=subtitle, about=about
-    )
+    path = write_page(target, page, folder, title="fracsim: evidence", subtitle=subtitle, about=about)
+    if false := [claim for section in sections for claim in section.claims if claim.holds is False]:
+        what = "; ".join(f"{claim.text} ({claim.measured})" for claim in false)
+        raise FalseClaim(f"saved {path}, in which {len(false)} claims do not hold: {what}")
+    return path
 
 
 def _verdict(sections: list[Section]) -> list[Section]:

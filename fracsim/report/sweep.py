@@ -22,7 +22,7 @@ from ..errors import Exit, InputError, NotConverged, Stopped
 from ..output.own_files import check_owner, resumable
 from ..study.check import check_study
 from ..study.file import load_study, study_text
-from .outcome import OUTCOMES, SPEAKER, last_words
+from .exit_status import OUTCOMES, SPEAKER, last_words
 
 LONGEST_NAME = 100
 

@@ -20,7 +20,7 @@ import tomli_w
 
 import fracsim as root
 from fracsim import forms, meshes
-from fracsim.report.outcome import OUTCOMES, last_words
+from fracsim.report.exit_status import OUTCOMES, last_words
 
 from .trial import Trial
 

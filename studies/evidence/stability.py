@@ -31,7 +31,7 @@ def trials() -> list[Trial]:
 def _on_ranks(trial: Trial, ranks: int, time: int) -> Trial:
     """The run of a trial on some ranks, for the first or a further time."""
     again = f".{time}" if time else ""
-    return replace(trial, name=f"{trial.name}-r{ranks}{again}", ranks=ranks, always=trial.always and not time)
+    return replace(trial, name=f"{trial.name}-r{ranks}{again}", ranks=ranks, full=trial.full or time > 0)
 
 
 def _trial(case: str, name: str, study: x.Data, measure: str = "survived", limit: float = 60.0) -> Trial:
