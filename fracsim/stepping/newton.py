@@ -292,19 +292,7 @@ def _may_change(balance: Balance, given: Options) -> bool:
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
     """Translations and linearised rotations about the centre, orthonormal: 3 in 2D, 6 in 3D."""
-    d, nodes = domain.dim, domain.nodes[: domain.node_count]
-    X = nodes - (domain.lower + domain.upper) / 2
-    modes = [np.tile(axis, (len(X), 1)) for axis in np.eye(d)]
-    for i, j in ((0, 1), (0, 2), (1, 2))[: 1 if d == 2 else 3]:
-        rotation = np.zeros_like(X)
-        rotation[:, i], rotation[:, j] = -X[:, j], X[:, i]
-        modes.append(rotation)
-    vectors: list[PETSc.Vec] = []
-    for mode in modes:
-        vector = PETSc.Vec().createMPI((X.size, None), bsize=d, comm=domain.comm)
-        vector.array_w[:] = mode.reshape(-1)
-        for earlier in vectors:
-            vector.axpy(-vector.dot(earlier), earlier)
-        vector.normalize()
-        vectors.append(vector)
-    return PETSc.NullSpace().create(vectors=vectors, comm=domain.comm)
+    d = domain.dim
+    X = domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2
+    coordinates = PETSc.Vec().createWithArray(X.reshape(-1), bsize=d, comm=domain.comm)
+    return PETSc.NullSpace().createRigidBody(coordinates)
