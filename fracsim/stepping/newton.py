@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import numpy as np
 import numpy.typing as npt
@@ -201,7 +201,9 @@ class Solver:
         is counted.
         """
         self._shrink()
-        ways = [nullcontext, self._factors] if self._may_factorise() else [nullcontext]
+        ways: list[Callable[[], AbstractContextManager[None]]] = [nullcontext]
+        if self._may_factorise():
+            ways.append(self._factors)
         for way in ways[1:] if self._with_factors else ways:
             self.balance.vector.array_w[:] = force
             with way():
