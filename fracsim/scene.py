@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dolfinx import fem
 from mpi4py import MPI
@@ -33,6 +33,11 @@ from .stepping.state import State
 from .stepping.stepper import Stepper, StepSizes
 from .study import MOTIONS, Study, Time
 from .study.check import checked_mesh
+
+if TYPE_CHECKING:
+    from .fracture.breaking import Breaking as EdgeBreaking
+    from .fracture.criterion import Criterion
+    from .mesh.edges import EdgeGraph
 
 
 @dataclass(frozen=True)
@@ -70,12 +75,16 @@ class Scene:
     balance: Balance
     solver: Solver | None
     stepper: Stepper
-    fracture: Any
+    fracture: EdgeBreaking | None
     probes: Probes
 
     def start(self) -> State:
         """The state at t = 0 (collective)."""
         return self.stepper.start(_initial_velocity(self.study, self.balance))
+
+    def ended(self, state: State) -> bool:
+        """Whether the state is at the end of the study."""
+        return state.t >= self.study.time.end * (1 - 1e-12)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back (collective)."""
@@ -213,7 +222,7 @@ def _flow(study: Study, balance: Balance) -> Flow:
     return ReturnMapping(balance.stress)
 
 
-def _breaking(study: Study, balance: Balance, scheme: Scheme) -> Any:
+def _breaking(study: Study, balance: Balance, scheme: Scheme) -> EdgeBreaking | None:
     """What breaks; None without [fracture]."""
     if study.fracture is None:
         return None
@@ -227,7 +236,7 @@ def _breaking(study: Study, balance: Balance, scheme: Scheme) -> Any:
     return Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes)
 
 
-def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
+def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     """Which edges fail."""
     from .fracture.criterion import OverloadedEdges
     from .fracture.strength import Strength
