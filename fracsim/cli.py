@@ -8,11 +8,16 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from .study import Study
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -40,6 +45,8 @@ def run(
         raise InputError("--restart goes on with the run in the output folder, --overwrite throws it away: give one")
     from mpi4py import MPI
 
+    from .study.file import find_study
+
     comm = MPI.COMM_WORLD
     path = find_study(study)
     folder = out or Path("out") / path.stem
@@ -64,8 +71,7 @@ def check(study: StudyPath, set_: Set = _NONE) -> None:
     from .study.check import check_study
     from .study.file import load_study
 
-    path = find_study(study)
-    loaded = load_study(path, set_)
+    loaded = load_study(study, set_)
     print(loaded.title)
     for line in check_study(loaded):
         print("  " + line)
@@ -84,7 +90,7 @@ def mesh(
     from .study.file import load_study
     from .study.mesh_source import build_mesh, save_mesh
 
-    data = build_mesh(load_study(find_study(study), set_).mesh)
+    data = build_mesh(load_study(study, set_).mesh)
     for note in data.notes:
         print(f"note: {note}")
     for name, value in mesh_quality(data).items():
@@ -144,6 +150,7 @@ def sweep(
 ) -> None:
     """Run a study once for each combination of values; goes on where it was left."""
     from .report.sweep import run_sweep
+    from .study.file import find_study
 
     path = find_study(study)
     folder = out or Path("out") / f"{path.stem}-sweep"
@@ -163,24 +170,13 @@ def list_() -> None:
             print(f"  {name:18} {words}")
 
 
-def find_study(name: str) -> Path:
-    """A path as it is, or the name of a study in the package."""
-    path = Path(name)
-    if os.path.exists(path):  # unlike Path.exists it does not mind a name that is too long
-        return path
-    from .studies import folder
-
-    packaged = folder() / (name if name.endswith(".toml") else f"{name}.toml")
-    return packaged if os.path.exists(packaged) and path.parent == Path() else path
-
-
-def _load(comm: Any, path: Path, overrides: list[str], folder: Path) -> Any:
+def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Study:
     """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
     from .mesh.ranks import from_root
     from .study import Study
     from .study.file import load_study
 
-    def work() -> Any:
+    def work() -> object:
         loaded = load_study(path, overrides)
         check_folder(folder)
         return loaded.model_dump(exclude_none=True)
@@ -214,7 +210,7 @@ def main() -> NoReturn:
     sys.exit(Exit.BAD_INPUT if bare else code)
 
 
-def _guarded(work: Callable[[], Any]) -> int:
+def _guarded(work: Callable[[], object]) -> int:
     try:
         code = work()
         if code == INTERRUPTED and _is_root():
@@ -261,4 +257,4 @@ def _end_others(message: str, code: int, *, late: bool) -> None:
         end_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
 
 
-__all__ = ["app", "find_study", "main"]
+__all__ = ["app", "main"]

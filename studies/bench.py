@@ -69,7 +69,7 @@ def case(n: int, bare: bool) -> dict[str, Any]:
             if loop is not None:
                 times["bare"].append(timed(comm, loop.step))
         figures = {name: float(np.median(values[WARM:])) for name, values in times.items() if values}
-        figures["output"] = timed(comm, run._write_frame)
+        figures["output"] = timed(comm, run.write_frame)
         figures["after_fracture"] = _after_fracture(run, stage)
     memory = comm.allreduce(_peak_memory())
     return {"tetrahedra": 24 * n**3, "ranks": comm.size, "peak_memory_GiB": memory, **figures}
@@ -82,17 +82,11 @@ def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
     before = {name: event.getPerfInfo(stage)["time"] for name, event in events.items()}
     fracture = run.scene.stepper.phases["fracture"]
     stage.push()
-    times["step"].append(timed(run.comm, lambda: take_step(run)))
+    times["step"].append(timed(run.comm, run.step))
     stage.pop()
     for name, event in events.items():
         times[name].append(event.getPerfInfo(stage)["time"] - before[name])
     times["fracture"].append(run.scene.stepper.phases["fracture"] - fracture)
-
-
-def take_step(run: Any) -> None:
-    """A step as `fracsim run` takes it, without a frame."""
-    run.state, report = run.scene.stepper.advance(run.state)
-    run.history.append(run.state, report, run._figures(), run.scene.probes())
 
 
 def break_now(run: Any, flags: Any) -> None:
@@ -103,6 +97,7 @@ def break_now(run: Any, flags: Any) -> None:
     fracture.degradation(True, *fracture.evaluate())
     fracture.changed()
     run.state = run.scene.stepper.remember(run.state)
+    run.note_breaks()
     run.scene.balance.damage_changed()
     run.scene.solver.damage_changed()
 

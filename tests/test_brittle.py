@@ -388,16 +388,16 @@ def test_a_restart_remembers_its_surfaces(tmp_path: Path) -> None:
     whole()
     stopped = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "parts")
     surfaces = stopped.scene.fracture.criterion
-    stopped._interrupt.reason = lambda: "the test" if len(surfaces.starts) else ""  # type: ignore[method-assign]
+    stopped.interrupt.reason = lambda: "the test" if len(surfaces.starts) else ""  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
     assert len(surfaces.starts) == 1 and len(whole.scene.fracture.criterion.starts) == 4
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "parts", restart=True)
     again()
     np.testing.assert_allclose(again.scene.fracture.criterion.starts, whole.scene.fracture.criterion.starts, rtol=1e-14)
-    assert again.record is not None and whole.record is not None
-    assert np.array_equal(again.record.graph.broken, whole.record.graph.broken)
-    np.testing.assert_allclose(again.record.cut, whole.record.cut, atol=1e-8)
+    assert again.breaks.record is not None and whole.breaks.record is not None
+    assert np.array_equal(again.breaks.record.graph.broken, whole.breaks.record.graph.broken)
+    np.testing.assert_allclose(again.breaks.record.cut, whole.breaks.record.cut, atol=1e-8)
 
 
 def test_several_passes_open_surfaces_one_after_the_other() -> None:

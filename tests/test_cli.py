@@ -192,7 +192,7 @@ def test_interrupted_before_the_first_step(monkeypatch: pytest.MonkeyPatch, caps
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "find_study", interrupt)
+    monkeypatch.setattr("fracsim.study.file.load_study", interrupt)
     assert called(monkeypatch, "check", "loaf") == 130
     assert capsys.readouterr().err.strip() == "fracsim: interrupted before the first step; nothing was written"
 

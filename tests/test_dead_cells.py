@@ -228,12 +228,12 @@ def test_a_restart_leaves_the_same_cells_out(tmp_path: Path) -> None:
     """chi of a checkpoint binds the forms before the first step."""
     data = study(BAR, time={"scheme": "backward-euler"}, fracture={"strength": 1e9})
     going = Run(build_scene(MPI.COMM_SELF, data), tmp_path)
-    graph = going._graph
+    graph = going.scene.fracture.graph
     graph.break_edges(np.random.default_rng(3).uniform(size=len(graph.broken)) < 0.6)
     going.scene.fracture.degradation(True, *going.scene.fracture.evaluate())
     going.scene.balance.damage_changed()
-    going._note_breaks()
-    going._checkpoint()
+    going.note_breaks()
+    going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, data), tmp_path, restart=True)
     living = integrated_cells(again.scene)
     assert np.array_equal(living, integrated_cells(going.scene))

@@ -89,7 +89,7 @@ def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
     graph.weaken(np.random.default_rng(3).choice([0.0, 0.25, 0.5, 1.0], len(graph.integrity)))
     going.scene.fracture.restored()
     going.state = going.scene.stepper.remember(going.state)
-    going._checkpoint()
+    going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path, restart=True)
     np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)
     np.testing.assert_array_equal(again.scene.fracture.graph.pattern, graph.pattern)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
+from cases import fracsim
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
@@ -32,6 +37,25 @@ def test_the_study_in_the_readme_runs(tmp_path: Path) -> None:
     named = set(re.findall(r"^\| `([a-z_]+\.[a-z0-9]+|checkpoint/)", TEXT, re.MULTILINE))
     written = {path.name for path in tmp_path.iterdir()}
     assert {"history.csv", "pieces.csv", "surface.pvd", "summary.json", "study.toml"} <= named & written
+
+
+def test_the_lines_of_python_in_the_readme_step_as_the_command_does(tmp_path: Path) -> None:
+    """Exactly as printed; every row has the digits of the history.csv that the command printed below them writes."""
+    printed = re.search(r"```python\n(.*?)```\n\nThese are the numbers of `fracsim (.*?)`", TEXT, re.DOTALL)
+    assert printed is not None
+    names: dict[str, Any] = {}
+    exec(printed.group(1), names)
+    assert len(printed.group(1).splitlines()) <= 10 + 1  # one of them empty
+    result = fracsim(*printed.group(2).split(), "--set", "output.picture=false", "-o", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    with (tmp_path / "out" / "history.csv").open(newline="") as file:
+        written = list(csv.DictReader(file))
+    columns = ["time", "elastic", "kinetic", "dissipated", "broken_edges", *names["scene"].probes.names]
+    broken = list(itertools.accumulate(row[4] for row in names["rows"]))
+    assert broken[-1] == np.count_nonzero(names["broken"]) > 0
+    assert (names["chi"] < 1).any() and len(names["u"]) == len(names["scene"].balance.reactions) / 2
+    for row, count, line in zip(names["rows"], broken, written, strict=True):
+        assert [f"{value:.12g}" for value in (*row[:4], count, *row[5:])] == [line[name] for name in columns]
 
 
 def test_files_that_the_readme_names_exist() -> None:

@@ -129,17 +129,17 @@ def test_a_restart_takes_the_explicit_step_of_its_damage(tmp_path: Path, unilate
         output={"fields": ["damage"]},
     )  # fmt: skip
     going = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path)
-    stepper = going.scene.stepper
-    going.state, report = stepper.advance(going.state)
-    going._graph.break_edges(np.random.default_rng(3).uniform(size=len(going._graph.broken)) < 0.4)
-    going.scene.fracture.degradation.restore()
-    going.scene.fracture.changed()
-    going.state = state = stepper.settle(going.state)
-    going._note_breaks()
-    going._checkpoint()
+    fracture, report = going.scene.fracture, going.step()
+    assert fracture is not None
+    fracture.graph.break_edges(np.random.default_rng(3).uniform(size=len(fracture.graph.broken)) < 0.4)
+    fracture.degradation.restore()
+    fracture.changed()
+    going.state = state = going.scene.stepper.settle(going.state)
+    going.note_breaks()
+    going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path, restart=True)
     assert again.state.step == state.step > 0
-    assert again.scene.stepper._size(again.state) == stepper._size(state) != report.dt
+    assert again.step().dt == going.step().dt != report.dt
 
 
 @pytest.mark.parametrize("scheme", ["newmark", "quasi-static"])
@@ -332,8 +332,9 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-OPENING = ("run.make_folder", "run.History", "run.Frames", "run.FieldsFile", "output.surface.output.SurfaceFiles",
-           "output.surface.output.Surface", "run.OutputClock", "output.writing.os.replace")  # fmt: skip
+FRAMES, SURFACE = "output.frame_files", "output.surface.output"
+OPENING = ("run.make_folder", "run.History", f"{FRAMES}.Frames", f"{FRAMES}.FieldsFile", f"{SURFACE}.SurfaceFiles",
+           f"{SURFACE}.Surface", "run.OutputClock", "output.writing.os.replace")  # fmt: skip
 
 
 def contents(folder: Path) -> frozenset[tuple[Path, bytes]]:
@@ -404,7 +405,7 @@ def test_a_signal_while_the_output_is_opened_ends_before_the_first_step(
             os.kill(os.getpid(), signal.SIGTERM)
             return Frames(*arguments)
 
-        patch.setattr("fracsim.run.Frames", frames)
+        patch.setattr("fracsim.output.frame_files.Frames", frames)
         with pytest.raises(
             Stopped, match=r"signal SIGTERM before the first step, at t = .* s\. Checkpoint: .*state\.h5"
         ):

@@ -41,10 +41,10 @@ def last(folder: Path) -> Any:
 
 def test_a_run_writes_its_surface(torn: Run) -> None:
     """A frame for each of fields.xdmf at the same times; pieces of the last one are those of history.csv."""
-    assert torn.fields is not None
-    assert [shot.t for shot in find_frames(torn.folder)] == pytest.approx(torn.fields.times, rel=1e-11)
+    assert torn.frames.fields is not None
+    assert [shot.t for shot in find_frames(torn.folder)] == pytest.approx(torn.frames.fields.times, rel=1e-11)
     grid = last(torn.folder)
-    assert len(np.unique(grid.point_data["piece"])) == torn._figures()[2] > 1
+    assert len(np.unique(grid.point_data["piece"])) == torn.breaks.figures[2] > 1
     assert {"von_mises", "strain", "origin", "age", "cell"} <= set(grid.cell_data)
     assert list(grid.field_data["origins"])[-1] == "crack" or "crack" in list(grid.field_data["origins"])
 
@@ -63,10 +63,10 @@ def test_mass_and_momentum_of_the_pieces(torn: Run) -> None:
 def test_cuts_by_forces_move_the_crack_only(torn: Run, tmp_path: Path) -> None:
     """The same edges break, cut elsewhere than in the middle; the area of the body in 2D stays that of the mesh."""
     other = run(changed(TEARING, output={"cut": "forces"}), tmp_path)
-    assert other.record is not None and torn.record is not None
-    assert np.array_equal(other.record.graph.broken, torn.record.graph.broken)
-    cut = other.record.cut[other.record.graph.broken]
-    assert np.isnan(torn.record.cut).all()
+    assert other.breaks.record is not None and torn.breaks.record is not None
+    assert np.array_equal(other.breaks.record.graph.broken, torn.breaks.record.graph.broken)
+    cut = other.breaks.record.cut[other.breaks.record.graph.broken]
+    assert np.isnan(torn.breaks.record.cut).all()
     assert np.all((cut >= 0.1) & (cut <= 0.9)) and np.ptp(cut) > 0.05
     for made in (other, torn):
         grid = last(made.folder)
@@ -84,11 +84,11 @@ def area(grid: Any) -> float:
 def test_a_restart_goes_on_with_the_same_pieces_and_ages(torn: Run, tmp_path: Path) -> None:
     """Stopped in the middle of tearing and continued: points, piece numbers and ages as without the stop."""
     stopped = Run(build_scene(MPI.COMM_SELF, study(TEARING)), tmp_path)
-    reason, steps = stopped._interrupt.reason, iter(range(6))
-    stopped._interrupt.reason = lambda: reason() or ("" if next(steps, None) is not None else "the test")  # type: ignore[method-assign]
+    reason, steps = stopped.interrupt.reason, iter(range(6))
+    stopped.interrupt.reason = lambda: reason() or ("" if next(steps, None) is not None else "the test")  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
-    assert stopped.record is not None and stopped.record.graph.broken.any()
+    assert stopped.breaks.record is not None and stopped.breaks.record.graph.broken.any()
     run(TEARING, tmp_path, restart=True)
     found, wanted = last(tmp_path), last(torn.folder)
     assert np.array_equal(found.point_data["piece"], wanted.point_data["piece"])
@@ -100,7 +100,7 @@ def test_a_restart_goes_on_with_the_same_pieces_and_ages(torn: Run, tmp_path: Pa
 def test_no_surface_where_none_is_wanted(wanted: bool | None, tmp_path: Path) -> None:
     """Without [fracture], or with surface = false, there is none and nothing is kept for it."""
     data = BAR if wanted is None else changed(TEARING, output={"surface": False})
-    assert run(data, tmp_path).surface is None
+    assert run(data, tmp_path).frames.surface is None
     assert not (tmp_path / "surface.pvd").exists() and not (tmp_path / "surface").exists()
 
 

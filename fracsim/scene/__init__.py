@@ -10,7 +10,7 @@ breaking    what flows and what breaks after a step
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -33,6 +33,9 @@ from .breaking import breaking_of, flow_of
 from .material import material_of
 from .terms import TERMS, Parts, balance_of
 
+if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking as EdgeBreaking
+
 __all__ = ["TERMS", "Parts", "Scene", "build_scene", "make_scheme", "make_stepper", "material_of", "scene_on"]
 
 
@@ -49,13 +52,17 @@ class Scene:
     balance: Balance
     solver: Solver | None
     stepper: Stepper
-    fracture: Any
+    fracture: EdgeBreaking | None
     probes: Probes
 
     def start(self) -> State:
         """The state at t = 0 (collective)."""
         motion = initial_motion(self.study, self.domain.dim)
         return self.stepper.start(None if motion is None else initial_velocity(self.balance, *motion))
+
+    def ended(self, state: State) -> bool:
+        """Whether the state is at the end of the study."""
+        return state.t >= self.study.time.end * (1 - 1e-12)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back (collective)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..mechanics.balance import Balance
 from ..mechanics.stress import Stress
@@ -13,8 +13,11 @@ from ..study.conditions import fibre_direction
 from .material import per_cell
 
 if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking
     from ..fracture.brittle.rules import SurfaceRules
+    from ..fracture.criterion import Criterion
     from ..fracture.strength import Strength
+    from ..mesh.edges import EdgeGraph
 
 
 def flow_of(study: Study, balance: Balance) -> Flow:
@@ -26,7 +29,7 @@ def flow_of(study: Study, balance: Balance) -> Flow:
     return ReturnMapping(balance.stress)
 
 
-def breaking_of(study: Study, balance: Balance) -> Any:
+def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     """What breaks; None without [fracture]."""
     if study.fracture is None:
         return None
@@ -40,7 +43,7 @@ def breaking_of(study: Study, balance: Balance) -> Any:
     return Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes)
 
 
-def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
+def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     """Which edges fail."""
     from ..fracture.criterion import OverloadedEdges
 
@@ -58,7 +61,7 @@ def _criterion(study: Study, stress: Stress, graph: Any) -> Any:
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
 
 
-def _strength(study: Study, domain: Domain, graph: Any) -> Strength:
+def _strength(study: Study, domain: Domain, graph: EdgeGraph) -> Strength:
     """Strength of edges by region, with scatter and a fibre."""
     from ..fracture.strength import Fibre, Scatter, Strength
 

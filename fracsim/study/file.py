@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from ..errors import InputError
+from ..studies import folder as packaged_studies
 from . import Study
 from .explain import explain
 from .mesh_source import find_builder
@@ -18,8 +20,21 @@ from .mesh_source import find_builder
 _TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or so"
 
 
-def load_study(path: Path, overrides: Sequence[str] = ()) -> Study:
-    """Read, override (`key.path=value`) and validate. Raises InputError with one message."""
+def find_study(name: str) -> Path:
+    """A path as it is, or the file of the packaged study of that name."""
+    path = Path(name)
+    if os.path.exists(path):  # unlike Path.exists it does not mind a name that is too long
+        return path
+    packaged = packaged_studies() / (name if name.endswith(".toml") else f"{name}.toml")
+    return packaged if os.path.exists(packaged) and path.parent == Path() else path
+
+
+def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:
+    """Read a study file, or the packaged study of that name, override (`key.path=value`) and validate.
+
+    Raises InputError with one message.
+    """
+    path = find_study(study) if isinstance(study, str) else study
     data = _parse(path)
     _anchor(data, path.parent)
     for override in overrides:

@@ -161,7 +161,6 @@ def cut_planes(run: Any, planes: list[Any]) -> None:
         side = (domain.nodes - point) @ normal >= 0
         flags |= side[fracture.graph.edge_nodes[:, 0]] != side[fracture.graph.edge_nodes[:, 1]]
     break_now(run, flags)
-    run._damage = run._count_damage()
 
 
 class VirtualNodes:
@@ -229,10 +228,10 @@ def _facet_nodes(domain: Any, facets: Any) -> Any:
 def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
     """Seconds per step of the loops, one step of each in turn."""
     from ...mesh.ranks import total
-    from ..bench import take_step, timed
+    from ..bench import timed
 
     loops = {"whole": whole.scene.stepper, "cut": cut.scene.stepper}
-    steps = {"whole": lambda: take_step(whole), "cut": lambda: take_step(cut)}
+    steps = {"whole": whole.step, "cut": cut.step}
     if other is not None:
         loops["baseline"], steps["baseline"] = other.stepper, other.step
     times: dict[str, list[float]] = {name: [] for name in loops}
@@ -243,7 +242,7 @@ def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
                 continue
             times[name].append(timed(cut.comm, step))
             krylov[name].append(int(loops[name].solver.snes.getLinearSolveIterations()))
-    broken, split, pieces = cut._figures()
+    broken, split, pieces = cut.breaks.figures
     dofs = int(total(cut.comm, len(cut.state.u))[0])
     ratios = {
         f"{name}_ratio": median(a / b for a, b in zip(times[name][WARM:], times["whole"][WARM:], strict=False))

@@ -22,7 +22,7 @@ from typing import Any
 
 from ...study import Study
 from ..bench import study as bench_study
-from ..bench import take_step, timed
+from ..bench import timed
 from .section import Cell, Claim, Plot, Section, Series, Table
 from .trial import Trial
 
@@ -164,7 +164,6 @@ def started(name: str, n: int, folder: Path) -> Any:
 
         # through the middle, askew and off the nodes of the lattice
         cut_planes(run, [((0.02, 0.03, 1.0), 0.5013 * (run.scene.domain.lower + run.scene.domain.upper))])
-        run._note_breaks()
     return run
 
 
@@ -175,11 +174,11 @@ def alone(name: str, n: int, began: float) -> dict[str, Any]:
     before = _memory("VmRSS")
     with tempfile.TemporaryDirectory() as folder:
         started_ = started(name, n, Path(folder))
-        take_step(started_)
+        started_.step()
         start_up = time.perf_counter() - began
         for _ in range(WARM):
-            take_step(started_)
-        frame = timed(started_.comm, started_._write_frame)
+            started_.step()
+        frame = timed(started_.comm, started_.write_frame)
         cells = started_.scene.domain.cell_count
         own = ("fracsim.studies", "fracsim.report")  # those of this script
         modules = sorted(name for name in sys.modules if name.startswith("fracsim.") and not name.startswith(own))
@@ -234,11 +233,11 @@ def _block(name: str, n: int) -> tuple[list[tuple[float, float]], str]:
     rung = rungs(n)[name]
     with tempfile.TemporaryDirectory() as folder:
         runs = [started(name, n, Path(folder, "rung"))]
-        runs[0]._write_frame()  # for its kernels
-        steps = [lambda: take_step(runs[0])]
+        runs[0].write_frame()  # for its kernels
+        steps = [runs[0].step]
         if rung.after in rungs(n):
             runs.append(started(rung.after, n, Path(folder, "other")))
-            steps.append(lambda: take_step(runs[1]))
+            steps.append(runs[1].step)
         else:
             from ..bench import Bare
 

@@ -1,0 +1,82 @@
+"""What is told of the edges that broke: when and where, how many there are, and the pieces that they leave."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mechanics.stress import Stress
+from ..mesh.bodies import bodies_of
+from ..mesh.domain import Domain
+from ..mesh.ranks import total
+
+if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking
+    from ..fracture.brittle.surfaces import BrittleSurfaces
+    from ..fracture.record import EdgeRecord
+    from ..mesh.pieces import Pieces
+
+
+class Breaks:
+    """The breaks of a run, and their figures.
+
+    Attributes:
+        record: time and place of each; None where nothing breaks.
+        surfaces: what starts surfaces, where the study has [brittle]; None elsewhere.
+        pieces: of the body as it is; None where nothing breaks.
+        figures: (broken edges, split cells, pieces) over all ranks.
+    """
+
+    def __init__(self, stress: Stress, breaking: Breaking | None, *, cut_by_forces: bool = False) -> None:
+        """`breaking`: what breaks; `cut_by_forces`: edges are cut where nodal forces say, not in the middle
+        (collective)."""
+        self._stress, self._domain, self._by_forces = stress, stress.domain, cut_by_forces
+        self.record: EdgeRecord | None = None
+        self.surfaces: BrittleSurfaces | None = None
+        self.pieces: Pieces | None = None
+        self.figures = (0, 0, _bodies(self._domain))
+        if breaking is not None:
+            from ..fracture.record import EdgeRecord
+
+            self.record = EdgeRecord(breaking.graph)
+            if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
+                self.surfaces = cast("BrittleSurfaces", breaking.criterion)
+            self.count()
+
+    def note(self, t: float) -> None:
+        """Edges that broke since the last call did so at t (s), and pieces are those of now (collective)."""
+        if self.record is None:
+            return
+        if self.surfaces is not None:  # a surface knows where it cuts
+            self.record.note(t, self.surfaces.cut)
+        else:
+            self.record.note(t, self._cuts() if self._by_forces else None)
+        self.count()
+
+    def count(self) -> None:
+        """Bring `pieces` and `figures` up to date, as after the damage of a checkpoint was read (collective)."""
+        if self.record is None:
+            return
+        from ..mesh.pieces import find_pieces
+
+        graph = self.record.graph
+        broken, split = total(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
+        self.pieces = find_pieces(graph)
+        self.figures = int(broken), int(split), self.pieces.count
+
+    def _cuts(self) -> npt.NDArray[np.float64]:
+        """(edges,) cuts in inverse proportion to the nodal forces of now (M22 fig. 12)."""
+        from ..fracture.record import cut_by_forces
+
+        assert self.record is not None
+        domain, ends = self._domain, self.record.graph.edge_nodes
+        force = domain.with_ghosts(self._stress.force()).reshape(-1, domain.dim)
+        swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
+        return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
+
+
+def _bodies(domain: Domain) -> int:
+    """Bodies of the mesh that share no node (collective)."""
+    return int(domain.comm.bcast(bodies_of(domain.source)[0] if domain.source is not None else None))

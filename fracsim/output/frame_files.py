@@ -1,0 +1,63 @@
+"""A frame of a run in all files that have frames: fields.xdmf, and the split surface where it is wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..mechanics.stress import Stress
+from ..stepping.state import State
+from .breaks import Breaks
+from .fields import Frames
+from .fields_file import Field, FieldsFile
+from .writing import written
+
+if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking
+    from .surface.output import SurfaceOutput
+
+
+class FrameFiles:
+    """Writes frames.
+
+    Attributes:
+        surface: the split surface; None where it is not wanted.    fields: fields.xdmf on rank 0, None elsewhere.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stress: Stress,
+        breaking: Breaking | None,
+        breaks: Breaks,
+        *,
+        fields: list[str],
+        surface: bool,
+        resume_at: float | None = None,
+    ) -> None:
+        """`fields`: by the names of output.fields; `resume_at`: keep the frames up to this time, s (collective).
+
+        Raises CannotWrite.
+        """
+        self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
+        self._values, source = Frames(stress, fields, breaking), stress.domain.source
+        self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
+        self.surface = _surface(folder, stress, breaks, resume_at) if surface else None
+
+    def write(self, state: State) -> None:
+        """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
+        fields = self._values(state, self._breaks.pieces)
+        written(self._comm, self._path, lambda: self._write_fields(state.t, fields))
+        if self.surface is not None:
+            self.surface.write(state, fields)
+
+    def _write_fields(self, t: float, fields: list[Field]) -> None:
+        if self.fields is not None and t not in self.fields.times:
+            self.fields.write(t, fields)
+
+
+def _surface(folder: Path, stress: Stress, breaks: Breaks, resume_at: float | None) -> SurfaceOutput:
+    """The split surface: imported, built and kept only where it is wanted."""
+    from .surface.output import SurfaceOutput
+
+    return SurfaceOutput(folder, stress.domain, stress.material.density, breaks.record, resume_at=resume_at)
