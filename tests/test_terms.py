@@ -14,8 +14,9 @@ import fracsim.scene as scene_module
 from fracsim.mechanics.kernels import CellForm
 from fracsim.scene import build_scene
 from support.oscillator import exact
-from support.scenes import DIRECT, each_step, make_scene, make_study, march
-from support.spring import Spring
+from support.reference import stiffness
+from support.scenes import DIRECT, each_step, make_scene, make_study, march, positions
+from support.spring import Spring, Tie
 
 
 @pytest.fixture
@@ -56,6 +57,43 @@ def test_a_toy_term_in_a_static_balance(springs: None) -> None:
     (report,) = march(scene, state)
     assert state.u.reshape(-1, 2)[:, 1].mean() == pytest.approx(-10.0 / (2.0 * 16), rel=1e-4)
     assert report.solve.newton == 1
+
+
+@pytest.mark.parametrize("solver", (DIRECT, {"snes_rtol": 1e-11, "ksp_rtol": 1e-12}), ids=("direct", "multigrid"))
+def test_a_term_couples_what_no_cell_does(monkeypatch: pytest.MonkeyPatch, solver: dict[str, Any]) -> None:
+    """A spring between the far corners of a plate that is pulled at one of them: K + k b b^T in dense NumPy, found in
+    steps that the term holds down to half of what Newton's method wants. The corner under load has a prescribed y."""
+    made: list[Tie] = []
+
+    def tie(parts: Any) -> Tie:
+        X = parts.domain.nodes[: parts.domain.node_count]
+        near, far = (int(np.argmin(np.linalg.norm(X - corner, axis=1))) for corner in ([1.0, 0.0], [0.0, 1.0]))
+        made.append(Tie(parts.u, parts.assembler.vector(), 2 * near, 2 * far + 1, 0.7))
+        return made[-1]
+
+    monkeypatch.setitem(scene_module.TERMS, "tie", tie)
+    place = {"box": [[1 - 1e-9, -1e-9], [1 + 1e-9, 1e-9]]}
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25, "pattern": "unstructured"},
+        material={"energy": "linear", "young": 1.0, "poisson": 0.3, "density": 1.0},
+        boundary=[
+            {"on": {"box": [[-1e-9, -1e-9], [1e-9, 1e-9]]}, "fix": "xy"}, {"on": place, "fix": "y"},
+            {"on": "right", "traction": [0.01, 0.0]},
+        ],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}, solver=solver,
+    )  # fmt: skip
+    (report,) = march(scene, state)
+    X, free = positions(scene), scene.balance.motion.free
+    K = stiffness(X, scene.domain.cell_nodes, 1 / 2.6, 0.3 / (1.3 * 0.4))
+    b = np.zeros(X.size)
+    i, j = made[0]._ends
+    b[i], b[j] = 1.0, -1.0
+    K = K + 0.7 * np.outer(b, b)
+    expected = np.zeros(X.size)
+    expected[free] = np.linalg.solve(K[np.ix_(free, free)], scene.balance.applied()[free])
+    np.testing.assert_allclose(state.u, expected, atol=1e-9)
+    assert made[0].steps > 5 and report.solve.newton > 5
+    assert state.work == pytest.approx(report.elastic, rel=1e-6)
 
 
 def test_no_toy_term_without_its_line() -> None:

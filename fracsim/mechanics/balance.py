@@ -40,6 +40,7 @@ class Balance:
         terms: what adds to the balance, in this order.    stress: the one among them that damage acts on.
         motion: dofs whose motion is prescribed.    mass: the mass matrix.
         scheme: where in a step forces balance, and the rates there.    c_a, c_v: those of the last step.
+        pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
 
@@ -62,7 +63,7 @@ class Balance:
         self.stress = next(term for term in terms if isinstance(term, Stress))
         self.motion, self.mass, self.scheme = motion, mass, scheme
         self.c_a, self.c_v = scheme.rates(step)
-        self._assembler = assembler
+        self._assembler, self._coupled, self.pattern_changed = assembler, False, False
         self.vector = assembler.vector()
         self._kept = assembler.vector()
         self.reactions: Values = np.zeros(self.owned)
@@ -197,11 +198,41 @@ class Balance:
 
     def assemble_tangent(self, K: PETSc.Mat) -> None:
         """K at the current u, rows and columns of prescribed dofs replaced by the identity's (collective)."""
+        if self._coupled:
+            K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
         self._tangent(self.motion.bcs)
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
         for term in self.terms:
             term.add_stiffness(K)
+            if (coupling := term.coupling()) is not None:
+                self._couple(K, coupling)
+
+    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat) -> None:
+        """K += a matrix of another pattern, but for prescribed dofs (collective)."""
+        before = K.getInfo()["nz_used"]
+        part = coupling.copy()
+        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        part.destroy()
+        self._coupled = True
+        self.pattern_changed |= bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+
+    @cached_property
+    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
+        """Global numbers of the prescribed dofs of this rank."""
+        first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
+        return np.asarray(self.motion.owned + first * d, PETSc.IntType)
+
+    @cached_property
+    def limits_steps(self) -> bool:
+        """Whether a term has a say in how long a step of Newton's method is."""
+        return any(type(term).longest_step is not Term.longest_step for term in self.terms)
+
+    def longest_step(self, change: Values) -> float:
+        """Largest share of a change of u (owned dofs,) that all terms allow (collective)."""
+        share = min(term.longest_step(change) for term in self.terms)
+        return float(self.domain.comm.allreduce(share, op=MPI.MIN))
 
     @property
     def symmetric(self) -> bool:

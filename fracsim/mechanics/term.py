@@ -79,10 +79,13 @@ class Term:
         """Add nodal forces at the current u to r, (owned dofs,) in N."""
 
     def add_stiffness(self, K: PETSc.Mat) -> None:
-        """Add the derivative of `add_force` to the assembled tangent; entries outside its pattern need `couples`."""
+        """Add the derivative of `add_force` to the assembled tangent, within the pattern of its cells."""
 
-    def couples(self) -> npt.NDArray[np.int64] | None:
-        """(n, 2) pairs of global nodes that it couples beyond those of a cell; None: none, or as the last time."""
+    def coupling(self) -> PETSc.Mat | None:
+        """The rest of that derivative, a matrix of any pattern over the dofs; None: there is none (collective).
+
+        The tangent takes its entries; the preconditioner is made anew where they are at other places than before.
+        """
         return None
 
     def stored(self) -> float:
@@ -102,7 +105,7 @@ class Term:
         return None
 
     def longest_step(self, change: Values) -> float:
-        """Largest share (0, 1] of a change of u (owned dofs,) that is allowed, on this rank."""
+        """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0
 
     def damage_changed(self) -> None:

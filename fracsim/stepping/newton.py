@@ -68,6 +68,8 @@ class Solver:
         self._x, self._correction = balance.vector.duplicate(), balance.vector.duplicate()
         self._configure(given)
         snes.setConvergenceTest(self._converged)
+        if balance.limits_steps:
+            snes.setLineSearchPreCheck(self._limit)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
@@ -233,11 +235,19 @@ class Solver:
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
         self._assemble(tangent)
+        if self.balance.pattern_changed:
+            self._preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
         self._preconditioner.refresh(tangent)
 
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
         self._preconditioner.damage_changed()
+
+    def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
+        share = self.balance.longest_step(-y.array_r)
+        if share < 1:
+            y.scale(share)
 
     # --- when it is done ---
 

@@ -42,3 +42,44 @@ class Spring(Term):
     def stored(self) -> float:
         """k u . u / 2, J."""
         return float(self._k * self._at @ self._at) / 2
+
+
+class Tie(Term):
+    """k (u_i - u_j) between two dofs that share no cell, and Newton steps of half their length (serial)."""
+
+    name = "tie"
+
+    def __init__(self, u: fem.Function, vector: PETSc.Vec, i: int, j: int, k: float) -> None:
+        self._u, self._ends, self._k = u, (i, j), k
+        self._matrix = PETSc.Mat().createAIJ((vector.getSizes(),) * 2, bsize=vector.getBlockSize(), comm=vector.comm)
+        self._matrix.setUp()
+        self.steps = 0
+
+    @property
+    def _force(self) -> float:
+        i, j = self._ends
+        return float(self._k * (self._u.x.array[i] - self._u.x.array[j]))
+
+    def add_force(self, rows: Values) -> None:
+        """Equal and opposite."""
+        i, j = self._ends
+        rows[i] += self._force
+        rows[j] -= self._force
+
+    def coupling(self) -> PETSc.Mat:
+        """k [[1, -1], [-1, 1]] on the two dofs."""
+        i, j = self._ends
+        values = self._k * np.array([1.0, -1.0, -1.0, 1.0])
+        self._matrix.setValues([i, j], [i, j], values)
+        self._matrix.assemble()
+        return self._matrix
+
+    def stored(self) -> float:
+        """k (u_i - u_j)^2 / 2, J."""
+        return self._force**2 / (2 * self._k)
+
+    def longest_step(self, change: Values) -> float:
+        """Half, while the two are pulled apart by more than a millionth in a step."""
+        i, j = self._ends
+        self.steps += 1
+        return 0.5 if abs(change[i] - change[j]) > 1e-6 else 1.0
