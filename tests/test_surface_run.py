@@ -44,7 +44,7 @@ def test_a_run_writes_its_surface(torn: Run) -> None:
     assert torn.frames.fields is not None
     assert [shot.t for shot in find_frames(torn.folder)] == pytest.approx(torn.frames.fields.times, rel=1e-11)
     grid = last(torn.folder)
-    assert len(np.unique(grid.point_data["piece"])) == torn._figures()[2] > 1
+    assert len(np.unique(grid.point_data["piece"])) == torn.breaks.figures[2] > 1
     assert {"von_mises", "strain", "origin", "age", "cell"} <= set(grid.cell_data)
     assert list(grid.field_data["origins"])[-1] == "crack" or "crack" in list(grid.field_data["origins"])
 

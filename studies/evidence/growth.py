@@ -243,7 +243,7 @@ def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
                 continue
             times[name].append(timed(cut.comm, step))
             krylov[name].append(int(loops[name].solver.snes.getLinearSolveIterations()))
-    broken, split, pieces = cut._figures()
+    broken, split, pieces = cut.breaks.figures
     dofs = int(total(cut.comm, len(cut.state.u))[0])
     ratios = {
         f"{name}_ratio": median(a / b for a, b in zip(times[name][WARM:], times["whole"][WARM:], strict=False))
