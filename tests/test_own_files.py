@@ -102,14 +102,23 @@ def test_a_run_that_ended_may_be_run_again_and_what_lies_beside_it_stays(tmp_pat
     assert not (out / "surface.pvd").exists() and not (out / "pieces.csv").exists()
 
 
-@pytest.mark.parametrize("where", ["make_folder", "Frames", "FieldsFile", "InvertedCells", "OutputClock"])
+@pytest.mark.parametrize(
+    "where",
+    [
+        "run.make_folder",
+        "run.InvertedCells",
+        "output.frame_files.Frames",
+        "output.frame_files.FieldsFile",
+        "run.OutputClock",
+    ],
+)
 def test_a_run_that_was_killed_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """At any moment of its set-up, in a new folder and in one of an earlier run."""
     for folder in (tmp_path / "new", tmp_path / "old"):
         if folder.name == "old":
             run(folder)
         with monkeypatch.context() as patch:
-            patch.setattr(f"fracsim.run.{where}", _killed)
+            patch.setattr(f"fracsim.{where}", _killed)
             with pytest.raises(SystemExit):
                 run(folder)
         run(folder)

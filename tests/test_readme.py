@@ -45,7 +45,7 @@ def test_the_lines_of_python_in_the_readme_step_as_the_command_does(tmp_path: Pa
     assert printed is not None
     names: dict[str, Any] = {}
     exec(printed.group(1), names)
-    assert len(printed.group(1).splitlines()) <= 10 + 1  # one of them empty
+    assert len(printed.group(1).splitlines()) <= 10
     result = fracsim(*printed.group(2).split(), "--set", "output.picture=false", "-o", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     with (tmp_path / "out" / "history.csv").open(newline="") as file:

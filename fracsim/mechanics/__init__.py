@@ -1,1 +1,18 @@
-"""The balance of forces, a sum of terms, and what the terms are made of."""
+"""The balance of forces, a sum of terms, and what the terms are made of.
+
+term                what a term is, and what it is told at the begin of a step
+balance             the sum: residual, tangent, reactions
+stress              the stress of a body as damage and flow leave it: a term
+inertia, damping    M a and its mass matrix; drag and viscosity: terms
+loads               dead loads and following pressure: terms
+prescribed_motion   dofs whose displacement is a function of time
+supports            whether a quasi-static study holds every body
+time_functions      constants and tables as functions of time
+material            Young's modulus, density, ... on the mesh
+plasticity          what cells remember of plastic flow
+flow_prediction     what flow takes off the stress while a step is solved
+return_mapping      flow at the end of a step
+rotation, spectrum  polar rotation of every cell; eigenvalues and powers of many tensors
+kernels             compiled forms and expressions
+vectors, tangent    assembling
+"""

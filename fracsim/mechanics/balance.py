@@ -18,9 +18,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..forms.schemes import Scheme
+from ..mesh.dolfinx_calls import apply_lifting
 from ..mesh.domain import Domain
 from ..mesh.ranks import total
-from .dolfinx_calls import apply_lifting
 from .inertia import Mass
 from .kernels import CellForm, cells_measure
 from .prescribed_motion import PrescribedMotion

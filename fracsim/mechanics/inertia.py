@@ -15,7 +15,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from .dolfinx_calls import assemble_matrix
+from ..mesh.dolfinx_calls import assemble_matrix
 from .kernels import compile_form
 from .term import Level, Term
 from .vectors import Assembler

@@ -15,9 +15,11 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.jit import get_options
+from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
+from ..mesh.dolfinx_calls import bind_to_cells, evaluate
 from ..mesh.domain import Domain
 from ..mesh.ranks import raise_together
 
@@ -66,17 +68,7 @@ class CellForm(fem.Form):
 
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
-        module: Any = self.module
-        whole, cell = self._whole, fem.IntegralType.cell
-        domains = {
-            kind: [(number, whole.domains(kind, number).reshape(-1)) for number in whole.integral_ids(kind)]
-            for kind in whole.integral_types
-        }
-        domains[cell] = [(number, cells[~dead[cells]]) for number, cells in domains.get(cell, [])]
-        kernels = module.ffi.cast("uintptr_t", module.ffi.addressof(self.ufcx_form))
-        fields = whole.coefficients, self._constants
-        bind = fem.form_cpp_class(self.dtype)
-        self._cpp_object = bind(kernels, whole.function_spaces, *fields, domains, {}, whole.mesh)
+        self._cpp_object = bind_to_cells(self, self._whole, self._constants, lambda cells: cells[~dead[cells]])
 
 
 def cells_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:
@@ -122,7 +114,7 @@ def _clear_abandoned() -> bool:
 class CellExpression:
     """A UFL expression that is constant in each cell, evaluated by a compiled kernel into an array that is kept."""
 
-    def __init__(self, comm: MPI.Comm, mesh: Any, expression: Expr, cells: int) -> None:
+    def __init__(self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int) -> None:
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
@@ -138,5 +130,5 @@ class CellExpression:
         if cells is None:
             if self._values is None:
                 self._values = np.empty((len(self._all), self.width))
-            return self._compiled.eval(self.mesh, self._all, self._values)
-        return self._compiled.eval(self.mesh, cells, np.empty((len(cells), self.width)))
+            return evaluate(self._compiled, self.mesh, self._all, self._values)
+        return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.width)))

@@ -11,6 +11,7 @@ import ufl
 from dolfinx import fem
 
 from ..forms.balance import pressure_work, traction_work
+from ..mesh.dolfinx_calls import exterior_facets
 from ..mesh.domain import Domain, Ints
 from .kernels import compile_form
 from .term import Level, Term
@@ -135,10 +136,6 @@ class Pressure(Term):
 
 def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:
     """A surface measure for each set of local exterior facets; they may overlap."""
-    kind, topology = fem.IntegralType.exterior_facet, domain.mesh.topology
-    entities = [
-        (number, fem.compute_integration_domains(kind, topology, facets, domain.dim - 1))
-        for number, facets in enumerate(parts)
-    ]
+    entities = [(number, exterior_facets(domain.mesh, facets)) for number, facets in enumerate(parts)]
     ds = ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
     return [ds(number) for number in range(len(parts))]

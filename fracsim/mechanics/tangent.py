@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem, la
-from dolfinx.cpp.la.petsc import create_matrix
+from dolfinx import fem
 from petsc4py import PETSc
 
+from ..mesh.dolfinx_calls import create_matrix, expanded_csr
 from ..mesh.ranks import total
 
 Flags = npt.NDArray[np.bool_]
@@ -41,7 +41,7 @@ class Assembly:
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._sum = la.matrix_csr(pattern, block_mode=la.BlockMode.expanded)  # type: ignore[attr-defined]
+        self._sum = expanded_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
         self._own = slice(int(starts[-1]))  # entries of owned rows; those of ghosts come after

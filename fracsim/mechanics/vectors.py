@@ -7,8 +7,8 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
+from ..mesh.dolfinx_calls import assemble_into, create_vector
 from ..mesh.domain import Domain
-from .dolfinx_calls import assemble_into, create_vector
 
 Values = npt.NDArray[np.float64]
 

@@ -9,14 +9,14 @@ import basix.ufl
 import dolfinx
 import numpy as np
 import numpy.typing as npt
-from dolfinx import cpp, fem
-from dolfinx.io import distribute_entity_data
+from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import format_point
+from .dolfinx_calls import create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
 from .ranks import Gather, total
@@ -210,8 +210,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
     points = data.points if data is not None else np.empty((0, dim))
     shape = "triangle" if dim == 2 else "tetrahedron"
     element = basix.ufl.element("Lagrange", shape, 1, shape=(dim,), dtype=np.float64)
-    partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
-    mesh = dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
+    mesh = create_mesh(comm, cells, points, element)
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim - 1, dim)
     facets = {name: _group_facets(mesh, data.facet_groups[name] if data is not None else None) for name in groups}
@@ -232,10 +231,4 @@ def _region_index(data: MeshData) -> npt.NDArray[np.int32] | None:
 def _group_facets(mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64] | None) -> Ints:
     """Local facets of a group given on rank 0 by the input nodes of each facet."""
     dim = mesh.topology.dim
-    facets = np.empty((0, dim), np.int64) if nodes is None else np.asarray(nodes, np.int64)
-    values = np.zeros(len(facets), np.int32)
-    local, values = distribute_entity_data(mesh, dim - 1, facets, values)
-    mesh.topology.create_connectivity(dim - 1, 0)
-    adjacency = cpp.graph.AdjacencyList_int32(local)
-    tags = dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, adjacency, values)
-    return tags.indices
+    return facets_of_nodes(mesh, np.empty((0, dim), np.int64) if nodes is None else np.asarray(nodes, np.int64))

@@ -1,1 +1,12 @@
-"""The report: what run folders and evidence hold, as one page that needs nothing else."""
+"""What is made of the folders of runs: pictures, sweeps, and one page that needs nothing else.
+
+runs                a run folder as it is read
+picture, colouring  `fracsim render`: the split surface off-screen, and which numbers colour it
+screen              a screen for VTK on machines that have none
+sweep, outcome      `fracsim sweep`: a run for each combination of values; how each ended
+make                `fracsim report`
+compare, pareto     sections about runs; which settings are worth their cost
+content             sections, tables, plots as plain data
+page, plots         sections to HTML; plots as SVG
+machine             machine and programs, for the foot of a page
+"""

@@ -1,4 +1,18 @@
-"""The study file: its tables, their defaults, units and limits (SI throughout). No DOLFINx here."""
+"""The study file: its tables, their defaults, units and limits (SI throughout). No DOLFINx here.
+
+body            [mesh], [material], [damping]
+breaking        [fracture], [plasticity], [brittle]
+loading         [[boundary]], [load], [initial]
+running         [time], [[probe]], [output]
+solver_options  [solver]
+whole           a study, and what its tables ask of one another
+values          what a key may hold
+file            a study read by path or name, overridden, and written with every default
+explain         what is wrong, in one sentence
+check           `fracsim check`
+mesh_source     from [mesh] to arrays
+catalogue       `fracsim list`
+"""
 
 from .body import Damping, Elastic, Material, Mesh, Region
 from .breaking import Brittle, Fibre, Fracture, Grains, Heterogeneity, Plasticity

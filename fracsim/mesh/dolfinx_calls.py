@@ -1,0 +1,123 @@
+"""Calls of DOLFINx that changed after 0.9, or that no version promises to keep: all that a newer version touches.
+
+Run with 0.9 alone; the rest is from the sources, release notes and pull requests of 0.10 and 0.11.
+
+0.10        create_vector       la.create_petsc_vector is la.petsc.create_vector.
+            create_mesh         The element comes before the points (pull request 3826).
+            exterior_facets     fem.compute_integration_domains takes no dimension.
+            facets_of_nodes     graph.AdjacencyList has a class in Python; graph.adjacencylist, as here, makes it.
+            bind_to_cells       The class of a form takes a list of kernels, and entity maps as a list (mesh.EntityMap).
+                                Whether integrals still have `integral_ids` is to be tried.
+            assemble_matrix     `bcs` and the diagonal are given by place: their names are not the same in all versions.
+0.11        evaluate            Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
+after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is gone (4403).
+
+Nothing was found of the others: assemble_into, apply_lifting, expanded_csr, create_matrix.
+`tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import dolfinx
+import numpy as np
+import numpy.typing as npt
+from basix.ufl import _ElementBase
+from dolfinx import fem, graph, la
+from dolfinx.cpp.la import SparsityPattern
+from dolfinx.cpp.la.petsc import create_matrix as create_petsc_matrix
+from dolfinx.fem import petsc as fem_petsc
+from dolfinx.io import distribute_entity_data
+from mpi4py import MPI
+from petsc4py import PETSc
+
+Ints = npt.NDArray[np.int32]
+
+# --- mesh -----------------------------------------------------------------------------------------------------------
+
+
+def create_mesh(
+    comm: MPI.Comm, cells: npt.NDArray[np.int64], points: npt.NDArray[np.float64], element: _ElementBase
+) -> dolfinx.mesh.Mesh:
+    """A mesh without ghost cells from (n, d + 1) nodes of cells and (m, d) points in m, each rank giving its share
+    (collective)."""
+    partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
+    return dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
+
+
+def facets_of_nodes(mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64]) -> Ints:
+    """Local facets of (n, d) input nodes, each rank giving its share (collective)."""
+    dim = mesh.topology.dim
+    local, values = distribute_entity_data(mesh, dim - 1, nodes, np.zeros(len(nodes), np.int32))
+    mesh.topology.create_connectivity(dim - 1, 0)
+    return dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, graph.adjacencylist(local), values).indices
+
+
+def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
+    """What a surface measure is given as subdomain data: pairs (cell, local facet) of local exterior facets."""
+    topology = mesh.topology
+    return fem.compute_integration_domains(fem.IntegralType.exterior_facet, topology, facets, topology.dim - 1)
+
+
+# --- forms ----------------------------------------------------------------------------------------------------------
+
+
+def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:
+    """The C++ form of `whole`, with the kernels of `form`, over the cells that `keep` leaves of each of its integrals.
+
+    `whole`: C++ form as it was compiled; its integrals over facets stay. `constants`: C++ constants of the form.
+    """
+    module: Any = form.module
+    cell = fem.IntegralType.cell
+    domains = {
+        kind: [(number, whole.domains(kind, number).reshape(-1)) for number in whole.integral_ids(kind)]
+        for kind in whole.integral_types
+    }
+    domains[cell] = [(number, keep(cells)) for number, cells in domains.get(cell, [])]
+    kernels = module.ffi.cast("uintptr_t", module.ffi.addressof(form.ufcx_form))
+    bind = fem.form_cpp_class(form.dtype)
+    return bind(kernels, whole.function_spaces, whole.coefficients, constants, domains, {}, whole.mesh)
+
+
+def evaluate(
+    expression: fem.Expression, mesh: dolfinx.mesh.Mesh, cells: Ints, values: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Evaluate an expression in cells into `values` (cells, points times components); returns them."""
+    return expression.eval(mesh, cells, values)
+
+
+# --- vectors and matrices -------------------------------------------------------------------------------------------
+
+
+def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:
+    """A vector over the dofs of a space, ghosts included."""
+    return la.create_petsc_vector(space.dofmap.index_map, space.dofmap.index_map_bs)
+
+
+def assemble_into(b: PETSc.Vec, form: fem.Form) -> None:
+    """Add this rank's part of a linear form to b."""
+    fem_petsc.assemble_vector(b, form)
+
+
+def apply_lifting(b: PETSc.Vec, form: fem.Form, bcs: list[fem.DirichletBC], u: fem.Function) -> None:
+    """b += A (g - u) of this rank, A the bilinear form's matrix, for prescribed values g that u does not have yet."""
+    fem_petsc.apply_lifting(b, [form], [bcs], x0=[u.x.petsc_vec], alpha=-1.0)
+
+
+def assemble_matrix(form: fem.Form, bcs: list[fem.DirichletBC] | None = None, diagonal: float = 1.0) -> PETSc.Mat:
+    """A new matrix of a bilinear form; rows and columns of prescribed dofs are empty but for `diagonal`."""
+    matrix = fem_petsc.assemble_matrix(form, bcs or [], diagonal)
+    matrix.assemble()
+    return matrix
+
+
+def expanded_csr(pattern: SparsityPattern) -> la.MatrixCSR:
+    """DOLFINx's own sparse matrix of a pattern, with an entry for every dof, not for every block of them."""
+    return la.matrix_csr(pattern, block_mode=la.BlockMode.expanded)  # type: ignore[attr-defined]
+
+
+def create_matrix(comm: MPI.Comm, pattern: SparsityPattern) -> PETSc.Mat:
+    """PETSc's matrix of a pattern, empty (collective)."""
+    return create_petsc_matrix(comm, pattern)
