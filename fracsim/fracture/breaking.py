@@ -106,9 +106,14 @@ class Breaking:
 
         Returns how many broke, and how many lost anything (collective).
         """
+        kept = self.law(load)
+        if self.law.all_or_nothing:
+            flags = np.zeros(len(self.graph.broken), bool)
+            flags[edges[kept == 0]] = True
+            return (self.graph.break_edges(flags),) * 2
         left = np.ones(len(self.graph.broken))
-        np.minimum.at(left, edges, self.law(load))
-        return (self.graph.break_edges(left == 0),) * 2 if self.law.all_or_nothing else self.graph.weaken(left)
+        np.minimum.at(left, edges, kept)
+        return self.graph.weaken(left)
 
     # --- what it remembers ---
 
