@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +46,7 @@ class Damage:
 
     integrity: Values
     fields: list[Values]
-    criterion: Any
+    criterion: object
 
 
 class Breaking:
@@ -125,8 +124,9 @@ class Breaking:
             self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
         return self._memory
 
-    def recall(self, memory: Damage) -> bool:
+    def recall(self, memory: object) -> bool:
         """Be damaged as `memory` says; whether that is anything else than now."""
+        assert isinstance(memory, Damage)
         if memory is self._memory:
             return False
         self.graph.set_integrity(memory.integrity)

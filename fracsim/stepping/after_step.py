@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -80,11 +80,11 @@ class NoFlow:
         """Nothing is lost."""
         return 0.0
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: Any) -> bool:
+    def recall(self, memory: object) -> bool:
         """Nothing."""
         return False
 
@@ -116,11 +116,11 @@ class Unbreakable:
         stored = self._flow.stored
         return _Whole(self._balance.stress.stored() if stored is None else stored)
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: Any) -> bool:
+    def recall(self, memory: object) -> bool:
         """Nothing."""
         return False
 
