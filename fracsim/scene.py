@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dolfinx import fem
 from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from .forms.schemes import Scheme
 from .mechanics.balance import Balance
 from .mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
-from .mechanics.loads import DeadLoads, Pressure
+from .mechanics.loads import DeadLoads, OnFacets, Pressure
 from .mechanics.material import MaterialFields, coefficient, material_fields
-from .mechanics.prescribed_motion import PrescribedMotion
+from .mechanics.prescribed_motion import Entry, PrescribedMotion
 from .mechanics.stress import RESIDUAL_STIFFNESS, Stress, Weakening
 from .mechanics.supports import check_supports
 from .mechanics.term import Term
@@ -52,7 +53,7 @@ class Parts:
     scheme: Scheme
     assembler: Assembler
     u: fem.Function
-    density: Any
+    density: Expr
     stress: Stress
     mass: Mass
     motion: PrescribedMotion
@@ -180,7 +181,7 @@ def _balance(study: Study, domain: Domain, scheme: Scheme, material: MaterialFie
     return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.step)
 
 
-def _motions(study: Study, domain: Domain) -> list[Any]:
+def _motions(study: Study, domain: Domain) -> list[Entry]:
     """Entries of PrescribedMotion."""
     entries = []
     for i, boundary in enumerate(study.boundary):
@@ -190,7 +191,7 @@ def _motions(study: Study, domain: Domain) -> list[Any]:
     return entries
 
 
-def _on_facets(parts: Parts, kind: str, size: int) -> list[Any]:
+def _on_facets(parts: Parts, kind: str, size: int) -> list[OnFacets]:
     """Facets and function of time of each [[boundary]] entry of a kind."""
     return [
         (

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +15,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
 from ..mesh.dolfinx_calls import apply_lifting
@@ -82,7 +82,7 @@ class Balance:
             self._forms.append(tangent)
             self._tangent = Assembly(tangent)
 
-    def _sum_of_works(self, w: Any, dx: ufl.Measure) -> Form:
+    def _sum_of_works(self, w: Expr, dx: ufl.Measure) -> Form:
         return _sum([term.work(w, dx) for term in self.terms])
 
     def _cells_at_supports(self) -> npt.NDArray[np.int32]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.balance import viscous_work
 from .inertia import Mass
@@ -72,13 +71,13 @@ class Viscosity(Term):
             field.x.scatter_forward()
         self._c_v.value = level.c_v
 
-    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work."""
         stress, rate = self._stress, self._c_v * (self._u - self._u_v)
         chi = stress.remaining_stiffness
         return viscous_work(stress.material.energy, rate, self._u_n, w, dx, b=self.b, chi=chi)
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Its derivative."""
         return ufl.derivative(self.work(w, dx), self._u, v)
 

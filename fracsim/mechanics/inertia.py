@@ -7,13 +7,14 @@ As a term of the form it would be integrated anew in every tangent.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from ..mesh.dolfinx_calls import assemble_matrix
 from .kernels import compile_form
@@ -79,7 +80,7 @@ class LumpedMass:
 
     diagonal = True
 
-    def __init__(self, assembler: Assembler, density: Any) -> None:
+    def __init__(self, assembler: Assembler, density: Expr) -> None:
         """`density`: kg/m^3, a UFL coefficient."""
         self.lumped = lumped_mass(assembler, density)
         self._diagonal = assembler.vector()
@@ -107,7 +108,7 @@ class ConsistentMass:
 
     diagonal = False
 
-    def __init__(self, assembler: Assembler, density: Any, bcs: list[fem.DirichletBC]) -> None:
+    def __init__(self, assembler: Assembler, density: Expr, bcs: list[fem.DirichletBC]) -> None:
         """`density`: kg/m^3, a UFL coefficient; `bcs`: on the dofs that the balance prescribes."""
         self.lumped, domain = lumped_mass(assembler, density), assembler.domain
         u, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
@@ -148,7 +149,7 @@ class ConsistentMass:
             kept.destroy()
 
 
-def lumped_mass(assembler: Assembler, density: Any) -> Values:
+def lumped_mass(assembler: Assembler, density: Expr) -> Values:
     """(owned dofs,) share of each node in the mass of its cells, for each component, kg."""
     domain = assembler.domain
     w, ones = ufl.TestFunction(domain.space), fem.Constant(domain.mesh, np.ones(domain.dim))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.balance import pressure_work, traction_work
 from ..mesh.dolfinx_calls import exterior_facets
@@ -58,7 +58,7 @@ class DeadLoads(Term):
         assembler: Assembler,
         *,
         tractions: Sequence[OnFacets] = (),
-        gravity: tuple[Any, TimeFunction] | None = None,
+        gravity: tuple[Expr, TimeFunction] | None = None,
         body_force: TimeFunction | None = None,
     ) -> None:
         """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
@@ -113,7 +113,7 @@ class Pressure(Term):
         self._works, self._normal = works, ufl.FacetNormal(domain.mesh)
         self._form = compile_form(self._work(ufl.TestFunction(domain.space)))
 
-    def _work(self, w: Any) -> ufl.Form:
+    def _work(self, w: Expr) -> ufl.Form:
         linear = self.symmetric
         return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
 
@@ -121,11 +121,11 @@ class Pressure(Term):
         """The pressures at the time of the balance."""
         self._moving.set_time(level.t)
 
-    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work, whatever cells `dx` has."""
         return self._work(w)
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Its derivative."""
         return ufl.derivative(self._work(w), self._u, v)
 

@@ -6,7 +6,6 @@ What the pattern of a cell's broken edges means is looked up in `simplices`.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -142,7 +141,9 @@ class EdgeGraph:
         """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
         return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
 
-    def gather_broken(self, values: npt.NDArray[np.float64] | None = None) -> Any:
+    def gather_broken(
+        self, values: npt.NDArray[np.float64] | None = None
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         """(n, 2) sorted keys of all broken edges on rank 0 and, of (edges, m) values of local ones, their (n, m) rows.
 
         None on the other ranks (collective).
