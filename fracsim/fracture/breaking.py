@@ -109,16 +109,16 @@ class Breaking:
     # --- what it remembers ---
 
     def changed(self) -> None:
-        """Damage is not what `memory` gave."""
+        """Damage is not what `memory` gave last: edges were weakened from elsewhere."""
         self._memory = None
 
     def restored(self) -> None:
-        """Edges and chi were read from a checkpoint."""
+        """Edges and chi were read from a checkpoint: bring the other fields of damage to them."""
         self.degradation.restore()
         self.changed()
 
     def memory(self) -> Damage:
-        """The damage of now."""
+        """Copies of the damage of now, on this rank; the same object until something changes."""
         if self._memory is None:
             fields = [each.x.array.copy() for each in self.stress.fields]
             self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())

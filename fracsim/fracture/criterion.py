@@ -102,7 +102,7 @@ class OverloadedEdges:
         self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
 
     def __call__(self, stress: Values) -> tuple[Edges, Values]:
-        """Edges and loads."""
+        """(n,) local edges over their strength and their loads, at most `cap` of all edges in one pass (collective)."""
         carried, active = self._carried(stress)
         edges, load = self.overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
         return (edges, load) if self._most is None else self._strongest(edges, load, self._most)

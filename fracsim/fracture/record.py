@@ -37,7 +37,7 @@ class EdgeRecord:
         return self.graph.gather_broken(np.column_stack([self.at, self.cut]))
 
     def restore(self, keys: Ints, values: Values) -> None:
-        """Take up what `gathered` gave, on every rank."""
+        """Take up what `gathered` gave, (n, 2) keys and (n, 2) values, on every rank."""
         local, place = self.graph.find_keys(keys)
         self.at[local], self.cut[local] = values[place].T
 

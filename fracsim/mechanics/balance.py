@@ -137,14 +137,14 @@ class Balance:
         self.displace(u)
 
     def rates(self) -> tuple[Values, Values]:
-        """(v, a) of the owned dofs at the current u."""
+        """(v, a) of the owned dofs at the current u, by the rates of the scheme; m/s and m/s^2."""
         u, level = self.u.x.array[: self.owned], self.level
         return level.c_v * (u - level.u_v), level.c_a * (u - level.u_a)
 
     # --- residual ---
 
     def residual(self, b: PETSc.Vec) -> PETSc.Vec:
-        """r at the current u into b (collective)."""
+        """r at the current u into b, N; rows of prescribed dofs hold their reactions (collective)."""
         return self._add_nodal(self._assembler.into(b, self._work))
 
     def _add_nodal(self, b: PETSc.Vec) -> PETSc.Vec:
@@ -205,7 +205,7 @@ class Balance:
 
     @property
     def symmetric(self) -> bool:
-        """Whether K is."""
+        """Whether K is symmetric, as all terms say of their share."""
         return all(term.symmetric for term in self.terms)
 
     def damage_changed(self) -> None:

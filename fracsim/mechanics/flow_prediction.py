@@ -90,7 +90,7 @@ class Extrapolated:
         self._inverse[self._cells] = times(self._held, UNIT + longest * self._rate).T
 
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
-        """The rate of the step."""
+        """Remember D of the step, by which the next one is predicted to flow."""
         self._cells, self._rate = cells, (power - UNIT) / dt
 
     @property

@@ -80,20 +80,20 @@ class DeadLoads(Term):
         self.force: Values = np.zeros(assembler.owned)
 
     def begin(self, level: Level) -> None:
-        """The loads at the time of the balance."""
+        """Take the loads of the time at which forces balance."""
         if self._moving.set_time(level.t):
             self.force = self._assembler(self._form)
 
     def add_force(self, rows: Values) -> None:
-        """r -= f."""
+        """r -= f, the nodal forces (owned dofs,) of all loads at the level, N."""
         rows -= self.force
 
     def applied(self) -> Values:
-        """f."""
+        """(owned dofs,) f, N."""
         return self.force
 
     def scale(self) -> Values:
-        """f."""
+        """(owned dofs,) f, N: what the residual is the balance of."""
         return self.force
 
 
@@ -118,15 +118,15 @@ class Pressure(Term):
         return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
 
     def begin(self, level: Level) -> None:
-        """The pressures at the time of the balance."""
+        """Take the pressures of the time at which forces balance."""
         self._moving.set_time(level.t)
 
     def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
-        """Virtual work, whatever cells `dx` has."""
+        """Virtual work of the pressures, N m; their facets do not depend on the cells of `dx`."""
         return self._work(w)
 
     def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
-        """Its derivative."""
+        """Derivative of the virtual work in the direction v; 0 where the pressure does not follow the surface."""
         return ufl.derivative(self._work(w), self._u, v)
 
     def applied(self) -> Values:

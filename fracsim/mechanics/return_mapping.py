@@ -86,7 +86,7 @@ class ReturnMapping:
         return lost
 
     def memory(self) -> Values:
-        """What the cells remember of their flow."""
+        """(cells, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
         return self.plastic.memory()
 
     def recall(self, memory: object) -> bool:

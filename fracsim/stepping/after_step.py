@@ -49,7 +49,7 @@ class Breaking(Remembers, Protocol):
         """A pass on the current displacement (collective)."""
 
     def restored(self) -> None:
-        """Damage was read from a checkpoint."""
+        """Damage was read from a checkpoint: what follows from it is brought to it."""
 
 
 class Flow(Remembers, Protocol):
@@ -62,7 +62,7 @@ class Flow(Remembers, Protocol):
     stored: float | None
 
     def begin(self, dt: float) -> None:
-        """The flow to come is that of a step of dt."""
+        """The flow to come is that of a step of dt (s)."""
 
     def __call__(self) -> float:
         """Let the body flow; returns the energy lost to it on this rank, J."""

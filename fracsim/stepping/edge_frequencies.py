@@ -32,7 +32,7 @@ class EdgeFrequencies:
 
 
 def edge_frequencies(stress: Stress) -> EdgeFrequencies:
-    """Those of the current integrity."""
+    """The frequencies that belong to the current integrity of the edges."""
     domain, integrity = stress.domain, stress.integrity
     assert integrity is not None
     intact = integrity.x.array.reshape(-1, len(local_edges(domain.dim)))[: domain.cell_count] > 0
