@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +46,7 @@ class Damage:
 
     integrity: Values
     fields: list[Values]
-    criterion: Any
+    criterion: object
 
 
 class Breaking:
@@ -118,23 +117,24 @@ class Breaking:
     # --- what it remembers ---
 
     def changed(self) -> None:
-        """Damage is not what `memory` gave."""
+        """Damage is not what `memory` gave last: edges were weakened from elsewhere."""
         self._memory = None
 
     def restored(self) -> None:
-        """Edges and chi were read from a checkpoint."""
+        """Edges and chi were read from a checkpoint: bring the other fields of damage to them."""
         self.degradation.restore()
         self.changed()
 
     def memory(self) -> Damage:
-        """The damage of now."""
+        """Copies of the damage of now, on this rank; the same object until something changes."""
         if self._memory is None:
             fields = [each.x.array.copy() for each in self.stress.fields]
             self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
         return self._memory
 
-    def recall(self, memory: Damage) -> bool:
+    def recall(self, memory: object) -> bool:
         """Be damaged as `memory` says; whether that is anything else than now."""
+        assert isinstance(memory, Damage)
         if memory is self._memory:
             return False
         self.graph.set_integrity(memory.integrity)

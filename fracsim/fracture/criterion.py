@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,10 @@ class Criterion(Protocol):
         The same edges on all ranks once what each has found is joined (collective).
         """
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """What it remembers of earlier passes, never to be written to again."""
 
-    def recall(self, memory: Any) -> None:
+    def recall(self, memory: object) -> None:
         """Remember no more than that."""
 
 
@@ -102,7 +102,7 @@ class OverloadedEdges:
         self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
 
     def __call__(self, stress: Values) -> tuple[Edges, Values]:
-        """Edges and loads."""
+        """(n,) local edges over their strength and their loads, at most `cap` of all edges in one pass (collective)."""
         carried, active = self._carried(stress)
         edges, load = self.overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
         return (edges, load) if self._most is None else self._strongest(edges, load, self._most)
@@ -125,9 +125,9 @@ class OverloadedEdges:
         wanted = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
         return edges[wanted[edges]], load[wanted[edges]]
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """Nothing."""
         return None
 
-    def recall(self, memory: Any) -> None:
+    def recall(self, memory: object) -> None:
         """Nothing."""

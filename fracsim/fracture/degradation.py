@@ -155,7 +155,7 @@ class ClosingChi(Chi):
 
 
 def make_degradation(stress: Stress, graph: EdgeGraph) -> Degradation:
-    """The approach that the stress has fields for."""
+    """The approach that the stress has fields for: chi alone, integrity alone, or both where cracks close."""
     if stress.chi is None:
         return Projection(stress, graph)
     return Chi(stress, graph) if stress.integrity is None else ClosingChi(stress, graph)

@@ -25,5 +25,5 @@ class Brittle:
     all_or_nothing = True
 
     def __call__(self, load: Values) -> Values:
-        """(n,) integrity."""
+        """(n,) integrity, 0 or 1, under loads (n,) in units of the strength."""
         return np.where(load >= 1, 0.0, 1.0)

@@ -34,11 +34,10 @@ class EdgeRecord:
 
     def gathered(self) -> tuple[Ints, Values] | None:
         """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
-        gathered: tuple[Ints, Values] | None = self.graph.gather_broken(np.column_stack([self.at, self.cut]))
-        return gathered
+        return self.graph.gather_broken(np.column_stack([self.at, self.cut]))
 
     def restore(self, keys: Ints, values: Values) -> None:
-        """Take up what `gathered` gave, on every rank."""
+        """Take up what `gathered` gave, (n, 2) keys and (n, 2) values, on every rank."""
         local, place = self.graph.find_keys(keys)
         self.at[local], self.cut[local] = values[place].T
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +15,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
 from ..mesh.dolfinx_calls import apply_lifting
@@ -83,7 +83,7 @@ class Balance:
             self._forms.append(tangent)
             self._tangent = Assembly(tangent)
 
-    def _sum_of_works(self, w: Any, dx: ufl.Measure) -> Form:
+    def _sum_of_works(self, w: Expr, dx: ufl.Measure) -> Form:
         return _sum([term.work(w, dx) for term in self.terms])
 
     def _cells_at_supports(self) -> npt.NDArray[np.int32]:
@@ -138,14 +138,14 @@ class Balance:
         self.displace(u)
 
     def rates(self) -> tuple[Values, Values]:
-        """(v, a) of the owned dofs at the current u."""
+        """(v, a) of the owned dofs at the current u, by the rates of the scheme; m/s and m/s^2."""
         u, level = self.u.x.array[: self.owned], self.level
         return level.c_v * (u - level.u_v), level.c_a * (u - level.u_a)
 
     # --- residual ---
 
     def residual(self, b: PETSc.Vec) -> PETSc.Vec:
-        """r at the current u into b (collective)."""
+        """r at the current u into b, N; rows of prescribed dofs hold their reactions (collective)."""
         return self._add_nodal(self._assembler.into(b, self._work))
 
     def _add_nodal(self, b: PETSc.Vec) -> PETSc.Vec:
@@ -236,7 +236,7 @@ class Balance:
 
     @property
     def symmetric(self) -> bool:
-        """Whether K is."""
+        """Whether K is symmetric, as all terms say of their share."""
         return all(term.symmetric for term in self.terms)
 
     def damage_changed(self) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.balance import viscous_work
 from .inertia import Mass
@@ -30,23 +29,23 @@ class Drag(Term):
         self._level: Level | None = None
 
     def begin(self, level: Level) -> None:
-        """The scheme's velocity."""
+        """Take up the scheme's velocity v = c_v (u - u_v) of the level."""
         self._level = level
 
     @property
     def mass_factor(self) -> float:
-        """a c_v."""
+        """a c_v, 1/s^2: M is multiplied with it in the tangent."""
         assert self._level is not None
         return self.a * self._level.c_v
 
     def acceleration(self) -> Values:
-        """a c_v (u - u_v)."""
+        """(owned dofs,) a c_v (u - u_v), m/s^2: M is multiplied with it in the residual."""
         assert self._level is not None
         u_v = self._level.u_v
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_v)] - u_v))
 
     def drag(self) -> Values:
-        """a M v."""
+        """(owned dofs,) a M v, N."""
         assert self._level is not None
         level, u = self._level, self._u.x.array[: len(self._level.u_v)]
         return self.a * self._mass.times(level.c_v * (u - level.u_v))
@@ -72,18 +71,18 @@ class Viscosity(Term):
             field.x.scatter_forward()
         self._c_v.value = level.c_v
 
-    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
-        """Virtual work."""
+    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
+        """Virtual work of the viscous stress, N m."""
         stress, rate = self._stress, self._c_v * (self._u - self._u_v)
         chi = stress.remaining_stiffness
         return viscous_work(stress.material.energy, rate, self._u_n, w, dx, b=self.b, chi=chi)
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
-        """Its derivative."""
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
+        """Derivative of the virtual work in the direction v."""
         return ufl.derivative(self.work(w, dx), self._u, v)
 
     def drag(self) -> Values:
-        """Forces of the viscosity (collective)."""
+        """(owned dofs,) forces of the viscosity, N (collective)."""
         return self._assembler(self._form)
 
     def damage_changed(self) -> None:

@@ -10,7 +10,7 @@ Without any the stress of a yielding bar is too high by 3 mu times the strain of
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,9 @@ UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]  # I
 class FlowPrediction(Protocol):
     """What is done about the flow of a step before it is known."""
 
-    form: Any  # of forms.plasticity: virtual work and tangent; None where the energy of F_e says it all
+    @property
+    def form(self) -> ImplicitFlow | None:
+        """Virtual work and tangent; None where the energy of F_e says it all."""
 
     def begin(self, dt: float, fraction: float) -> None:
         """A step of dt is to be solved whose flow makes `fraction` of the return; zeros: it is done."""
@@ -88,7 +90,7 @@ class Extrapolated:
         self._inverse[self._cells] = times(self._held, UNIT + longest * self._rate).T
 
     def flowed(self, cells: Cells, power: Values, dt: float) -> None:
-        """The rate of the step."""
+        """Remember D of the step, by which the next one is predicted to flow."""
         self._cells, self._rate = cells, (power - UNIT) / dt
 
     @property

@@ -7,13 +7,14 @@ As a term of the form it would be integrated anew in every tangent.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 from ..mesh.dolfinx_calls import assemble_matrix
 from .kernels import compile_form
@@ -30,10 +31,10 @@ class Mass(Protocol):
     diagonal: bool  # whether it is the lumped one; the other also couples the nodes of dead cells
 
     def times(self, values: Values) -> Values:
-        """M a."""
+        """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
 
     def solve(self, force: Values, free: npt.NDArray[np.bool_]) -> Values:
-        """a with M a = force on free dofs and a = 0 on the others."""
+        """(owned dofs,) a with M a = force (N) on free dofs and a = 0 on the others, m/s^2 (collective)."""
 
     def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
         """tangent += factor M, leaving rows and columns of prescribed dofs decoupled."""
@@ -43,7 +44,7 @@ class Mass(Protocol):
 
 
 class Inertia(Term):
-    """M a."""
+    """M a, a the acceleration c_a (u - u_a) of the scheme."""
 
     name = "inertia"
 
@@ -52,23 +53,23 @@ class Inertia(Term):
         self._level: Level | None = None
 
     def begin(self, level: Level) -> None:
-        """The scheme's acceleration."""
+        """Take up the scheme's acceleration a = c_a (u - u_a) of the level."""
         self._level = level
 
     @property
     def mass_factor(self) -> float:
-        """c_a."""
+        """c_a, 1/s^2: M is multiplied with it in the tangent."""
         assert self._level is not None
         return self._level.c_a
 
     def acceleration(self) -> Values | None:
-        """c_a (u - u_a); None where the scheme keeps inertia out of the balance."""
+        """(owned dofs,) c_a (u - u_a), m/s^2; None where the scheme keeps inertia out of the balance."""
         assert self._level is not None
         u_a = self._level.u_a
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_a)] - u_a)) if self.mass_factor else None
 
     def scale(self) -> Values | None:
-        """M c_a (u - u_a), M lumped."""
+        """(owned dofs,) M c_a (u - u_a), M lumped, N."""
         assert self._level is not None
         u_a, factor = self._level.u_a, self.mass_factor
         return np.asarray(factor * self._mass.lumped * (self._u.x.array[: len(u_a)] - u_a)) if factor else None
@@ -79,17 +80,17 @@ class LumpedMass:
 
     diagonal = True
 
-    def __init__(self, assembler: Assembler, density: Any) -> None:
+    def __init__(self, assembler: Assembler, density: Expr) -> None:
         """`density`: kg/m^3, a UFL coefficient."""
         self.lumped = lumped_mass(assembler, density)
         self._diagonal = assembler.vector()
 
     def times(self, values: Values) -> Values:
-        """M a."""
+        """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
         return self.lumped * values
 
     def solve(self, force: Values, free: npt.NDArray[np.bool_]) -> Values:
-        """a = force / m on free dofs."""
+        """(owned dofs,) a = force / m on free dofs, 0 elsewhere, m/s^2."""
         return np.where(free, force / self.lumped, 0.0)
 
     def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
@@ -98,7 +99,7 @@ class LumpedMass:
         tangent.setDiagonal(self._diagonal, PETSc.InsertMode.ADD)
 
     def destroy(self) -> None:
-        """Give the memory back."""
+        """Give the memory of PETSc's objects back, where there are any."""
         self._diagonal.destroy()
 
 
@@ -107,7 +108,7 @@ class ConsistentMass:
 
     diagonal = False
 
-    def __init__(self, assembler: Assembler, density: Any, bcs: list[fem.DirichletBC]) -> None:
+    def __init__(self, assembler: Assembler, density: Expr, bcs: list[fem.DirichletBC]) -> None:
         """`density`: kg/m^3, a UFL coefficient; `bcs`: on the dofs that the balance prescribes."""
         self.lumped, domain = lumped_mass(assembler, density), assembler.domain
         u, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
@@ -117,7 +118,7 @@ class ConsistentMass:
         self._x, self._y = assembler.vector(), assembler.vector()
 
     def times(self, values: Values) -> Values:
-        """M a."""
+        """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
         self._x.array_w[:] = values
         self._whole.mult(self._x, self._y)
         return self._y.array_r.copy()
@@ -143,12 +144,12 @@ class ConsistentMass:
         tangent.axpy(factor, self._free, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
 
     def destroy(self) -> None:
-        """Give the memory back."""
+        """Give the memory of PETSc's objects back, where there are any."""
         for kept in (self._whole, self._free, self._x, self._y):
             kept.destroy()
 
 
-def lumped_mass(assembler: Assembler, density: Any) -> Values:
+def lumped_mass(assembler: Assembler, density: Expr) -> Values:
     """(owned dofs,) share of each node in the mass of its cells, for each component, kg."""
     domain = assembler.domain
     w, ones = ufl.TestFunction(domain.space), fem.Constant(domain.mesh, np.ones(domain.dim))

@@ -27,7 +27,7 @@ _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
 
 @cache
-def jit_options() -> dict[str, Any]:
+def jit_options() -> dict[str, list[str] | int]:
     """Flags for the machine's own instructions: 1.6 x faster tangents of the neo-Hookean energy than -O2.
 
     FFCx caches kernels by source and flags. The CPU's name goes into the flags, so that a home directory shared by

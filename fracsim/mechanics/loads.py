@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.balance import pressure_work, traction_work
 from ..mesh.dolfinx_calls import exterior_facets
@@ -58,7 +58,7 @@ class DeadLoads(Term):
         assembler: Assembler,
         *,
         tractions: Sequence[OnFacets] = (),
-        gravity: tuple[Any, TimeFunction] | None = None,
+        gravity: tuple[Expr, TimeFunction] | None = None,
         body_force: TimeFunction | None = None,
     ) -> None:
         """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
@@ -80,20 +80,20 @@ class DeadLoads(Term):
         self.force: Values = np.zeros(assembler.owned)
 
     def begin(self, level: Level) -> None:
-        """The loads at the time of the balance."""
+        """Take the loads of the time at which forces balance."""
         if self._moving.set_time(level.t):
             self.force = self._assembler(self._form)
 
     def add_force(self, rows: Values) -> None:
-        """r -= f."""
+        """r -= f, the nodal forces (owned dofs,) of all loads at the level, N."""
         rows -= self.force
 
     def applied(self) -> Values:
-        """f."""
+        """(owned dofs,) f, N."""
         return self.force
 
     def scale(self) -> Values:
-        """f."""
+        """(owned dofs,) f, N: what the residual is the balance of."""
         return self.force
 
 
@@ -113,20 +113,20 @@ class Pressure(Term):
         self._works, self._normal = works, ufl.FacetNormal(domain.mesh)
         self._form = compile_form(self._work(ufl.TestFunction(domain.space)))
 
-    def _work(self, w: Any) -> ufl.Form:
+    def _work(self, w: Expr) -> ufl.Form:
         linear = self.symmetric
         return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
 
     def begin(self, level: Level) -> None:
-        """The pressures at the time of the balance."""
+        """Take the pressures of the time at which forces balance."""
         self._moving.set_time(level.t)
 
-    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
-        """Virtual work, whatever cells `dx` has."""
+    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
+        """Virtual work of the pressures, N m; their facets do not depend on the cells of `dx`."""
         return self._work(w)
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
-        """Its derivative."""
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
+        """Derivative of the virtual work in the direction v; 0 where the pressure does not follow the surface."""
         return ufl.derivative(self._work(w), self._u, v)
 
     def applied(self) -> Values:

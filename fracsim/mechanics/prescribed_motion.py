@@ -50,13 +50,13 @@ class PrescribedMotion:
         return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type]
 
     def at(self, t: float) -> Values:
-        """Displacement in m of each of `dofs` at time t."""
+        """(dofs,) displacement of each of `dofs` at time t (s), m."""
         if not self._functions:
             return np.empty(0)
         return np.concatenate([function(t) for function in self._functions])[self._row]
 
     def set(self, values: Values) -> None:
-        """What each of `dofs` shall be at, m."""
+        """Prescribe (dofs,) displacements, m: what `bcs` and `values` have from here on."""
         self._values.x.array[self.dofs] = values
 
     @property

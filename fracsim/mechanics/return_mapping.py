@@ -18,7 +18,6 @@ root without hardening (with nu for 1 - exp(-nu dt), so that halving the step wo
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +30,7 @@ from .stress import Stress
 
 Values = npt.NDArray[np.float64]
 Cells = npt.NDArray[np.int32]
+Chosen = slice | npt.NDArray[np.intp]  # some of an array, or all of it without a copy
 
 CLOSE = 1e-6  # of the stress: how near the root is found
 ITERATIONS = 12  # of the secant; one does for small elastic strains
@@ -86,11 +86,12 @@ class ReturnMapping:
         return lost
 
     def memory(self) -> Values:
-        """What the cells remember of their flow."""
+        """(cells, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
         return self.plastic.memory()
 
-    def recall(self, memory: Values) -> bool:
+    def recall(self, memory: object) -> bool:
         """The cells remember no more than that."""
+        assert isinstance(memory, np.ndarray)
         return self.plastic.recall(memory)
 
     def _put_back(self) -> None:
@@ -154,7 +155,7 @@ class _Return:
         plastic, q = self._flow.plastic, self._measure
         before, g_before = np.zeros(len(q)), plastic.fraction * self._excess
         self.beta = np.clip(g_before / (q + np.maximum(plastic.hardening, 0.0) * self.size), 0.0, 1.0)
-        live: Any = slice(None)  # those whose root is not found
+        live: Chosen = slice(None)  # those whose root is not found
         for last in (False,) * (ITERATIONS - 1) + (True,):
             now, g = self.beta[live].copy(), self._left(live)
             # the step that led here, once more
@@ -169,7 +170,7 @@ class _Return:
             live = _among(live, ~sure)
         return self._power
 
-    def _left(self, live: Any) -> Values:
+    def _left(self, live: Chosen) -> Values:
         """What the excess of cells is above exp(-nu dt) of the old one, Pa, at their beta."""
         plastic, cells = self._flow.plastic, self.cells[live]
         self._return(live)
@@ -177,7 +178,7 @@ class _Return:
         Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], cells)
         return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
 
-    def _settle(self, cells: Any, before: Values) -> None:
+    def _settle(self, cells: Chosen, before: Values) -> None:
         """A last step from the beta `before`: small, so that the measures go along straight lines."""
         self._return(cells)
         step, now = self.beta[cells] - before, self.after[cells]
@@ -186,14 +187,14 @@ class _Return:
         now[:, 2] -= self.J[cells] * now[:, 0] * self.size[cells] * step  # s : e of a von Mises stress along e
         self.after[cells] = now
 
-    def _return(self, cells: Any) -> None:
+    def _return(self, cells: Chosen) -> None:
         """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
         power = deviatoric_power(self._C[:, cells], self._values[:, cells], self._logs[:, cells], -self.beta[cells] / 2)
         self._flow.plastic.rows[self.cells[cells]] = times(self._start[:, cells], power).T
         self._power[:, cells] = power
 
 
-def _among(cells: Any, mask: npt.NDArray[np.bool_]) -> Any:
+def _among(cells: Chosen, mask: npt.NDArray[np.bool_]) -> Chosen:
     """`cells` narrowed to those of the mask; where that is all of them, without a copy."""
     if mask.all():
         return cells

@@ -21,6 +21,6 @@ class RotationField:
         self._d = d
 
     def update(self) -> None:
-        """R from the current displacement."""
+        """Bring R (d x d, DG0) to the current displacement; ghosts need none, for cells are not ghosted."""
         F = self._gradient().reshape(-1, self._d, self._d)
         self.field.x.array[:] = polar_rotation(F).reshape(-1)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
@@ -26,6 +27,9 @@ from .material import MaterialFields
 from .rotation import RotationField
 from .term import Form, Level, Term
 from .vectors import Assembler
+
+if TYPE_CHECKING:
+    from ..forms.plasticity import ImplicitFlow
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -88,17 +92,17 @@ class Stress(Term):
 
     def _weakened(self, weakening: Weakening) -> Energy:
         """The energy with the fields of damage that the approach needs."""
-        whole: Any = self.material.energy
+        whole: Energy = self.material.energy
         if weakening.approach == "chi":
             self.chi = self._whole_cells("chi", 1)
             if not weakening.closes:
                 return self.material.energy
-        edges: list[Any] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
+        edges: list[list[int]] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
         self.integrity = self._whole_cells("integrity", len(edges))
         if weakening.approach == "edge":
-            from ..forms.damage import EdgeProjected
+            from ..forms.damage import EdgeProjected, Strained
 
-            whole = EdgeProjected(whole, self.integrity, edges, self._floor)
+            whole = EdgeProjected(cast(Strained, whole), self.integrity, edges, self._floor)
         if not weakening.closes:
             return whole
         from ..forms.closing import Closing
@@ -125,7 +129,7 @@ class Stress(Term):
             field.x.array[:] = value
         return found
 
-    def _elastic_part(self) -> Any:
+    def _elastic_part(self) -> Expr:
         """What the energy takes of F: all of it, or what plastic flow left (d x d)."""
         F = deformation_gradient(self.u)
         if self.material.plastic is None:
@@ -146,11 +150,11 @@ class Stress(Term):
         return np.asarray(self.multiplier.x.array[: self.domain.cell_count] == 0)
 
     @property
-    def remaining_stiffness(self) -> Any:
+    def remaining_stiffness(self) -> Expr | float:
         """chi, 1 where there is none; in a quasi-static study with a floor, so that the tangent stays regular."""
         return self._floored(self.chi)
 
-    def _floored(self, chi: Any) -> Any:
+    def _floored(self, chi: Expr | None) -> Expr | float:
         if chi is None:
             return 1.0
         return self._floor + (1 - self._floor) * chi if self._floor else chi
@@ -173,7 +177,7 @@ class Stress(Term):
             self.rotation.update()
 
     @property
-    def _flow_form(self) -> Any:
+    def _flow_form(self) -> ImplicitFlow | None:
         """Virtual work and tangent of a step that is solved with its own flow; None for all others."""
         plastic = self.material.plastic
         return plastic.prediction.form if plastic is not None and plastic.prediction is not None else None
@@ -181,14 +185,14 @@ class Stress(Term):
     def _stored_energy(self, dx: ufl.Measure) -> ufl.Form:
         return elastic_energy(self.energy, self.u, dx, chi=self._floored(self.multiplier), rotation=self.R)
 
-    def work(self, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, as flow within the step leaves it."""
         flow = self._flow_form
         if flow is None:
             return internal_work(self.energy, self.u, w, dx, chi=self._floored(self.multiplier), rotation=self.R)
         return flow.work(self.u, w, dx, chi=self.remaining_stiffness, rotation=self.R) + self._springs(w, dx)
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> ufl.Form:
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
         flow = self._flow_form
         if flow is None:
@@ -197,11 +201,11 @@ class Stress(Term):
         springs = self._springs(w, dx)
         return tangent + (ufl.derivative(springs, self.u, v) if springs else 0)
 
-    def _springs(self, w: Any, dx: ufl.Measure) -> Form:
+    def _springs(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work of closing cracks in a body that flows."""
         if not self.closes:
             return 0
-        alone: Any = replace(self.energy, chi=0)  # type: ignore[type-var]
+        alone: Energy = replace(self.energy, chi=0)  # type: ignore[type-var]
         return internal_work(alone, self.u, w, dx)
 
     def stored(self) -> float:

@@ -10,12 +10,13 @@ contact). Residual, tangent, reactions, the residual's scale and the energy book
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from petsc4py import PETSc
+from ufl.core.expr import Expr
 
 Values = npt.NDArray[np.float64]
 type Form = ufl.Form | int  # 0: none
@@ -58,11 +59,11 @@ class Term:
     def displaced(self) -> None:
         """u has moved. Collective."""
 
-    def work(self, w: Any, dx: ufl.Measure) -> Form:
+    def work(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work in N m over the cells of `dx`, a form linear in the test function w. Asked once, at set-up."""
         return 0
 
-    def tangent(self, v: Any, w: Any, dx: ufl.Measure) -> Form:
+    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> Form:
         """Derivative of `work` in the direction v, as far as Newton's method shall know it."""
         return 0
 

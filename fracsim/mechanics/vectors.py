@@ -38,7 +38,7 @@ class Assembler:
         return self.summed(self.into_unsummed(b, form))
 
     def into_unsummed(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
-        """This rank's part alone."""
+        """This rank's part alone into b; returns b."""
         with b.localForm() as local:
             local.set(0.0)
         assemble_into(b, form)

@@ -6,7 +6,6 @@ What the pattern of a cell's broken edges means is looked up in `simplices`.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -147,14 +146,16 @@ class EdgeGraph:
         """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
         return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
 
-    def gather_broken(self, values: npt.NDArray[np.float64] | None = None) -> Any:
+    def gather_broken(
+        self, values: npt.NDArray[np.float64] | None = None
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         """(n, 2) sorted keys of all broken edges on rank 0 and, of (edges, m) values of local ones, their (n, m) rows.
 
         None on the other ranks (collective).
         """
         return self._gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
 
-    def gather_weakened(self) -> Any:
+    def gather_weakened(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         """(n, 2) sorted keys of all edges that are not whole on rank 0, and their (n, 1) integrity; None on the other
         ranks (collective)."""
         return self._gather(self.integrity < 1, self.integrity[:, None])
@@ -166,7 +167,9 @@ class EdgeGraph:
         values[local] = integrity[place, 0]
         self.set_integrity(values)
 
-    def _gather(self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]) -> Any:
+    def _gather(
+        self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         own = np.flatnonzero(flags[: self.edge_count])
         parts = self.domain.comm.gather((self.edge_keys(own), values[own]))
         if parts is None:

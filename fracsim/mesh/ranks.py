@@ -90,7 +90,7 @@ def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late:
     comm.Abort(code or 1)
 
 
-def total(comm: MPI.Comm, values: Any) -> npt.NDArray[Any]:
+def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
     """Sum over the ranks, element by element."""
     local = np.atleast_1d(np.asarray(values))
     result = np.empty_like(local)

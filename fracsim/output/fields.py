@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from ufl.core.expr import Expr
 
-from ..forms.energies import full_cauchy_stress, von_mises
+from ..forms.energies import Energy, full_cauchy_stress, von_mises
 from ..forms.kinematics import deformation_gradient, embed, green_strain
 from ..mechanics.kernels import CellExpression
 from ..mechanics.stress import Stress
@@ -18,9 +18,10 @@ from ..stepping.state import State
 from .fields_file import Field
 
 if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking
     from ..mesh.pieces import Pieces
 
-Values = npt.NDArray[Any]
+Values = npt.NDArray[np.generic]
 # XDMF's order of a symmetric tensor
 _TENSOR6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -28,7 +29,7 @@ _TENSOR6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class Frames:
     """Gathers the fields of a frame to rank 0. Expressions are compiled at the first frame that needs them."""
 
-    def __init__(self, stress: Stress, names: list[str], fracture: Any = None) -> None:
+    def __init__(self, stress: Stress, names: list[str], fracture: Breaking | None = None) -> None:
         self._stress, self._domain, self._fracture = stress, stress.domain, fracture
         self._names = names
         self._compiled: dict[str, CellExpression] = {}
@@ -66,6 +67,7 @@ class Frames:
 
     def _broken_share(self) -> Values:
         """Broken edges of a cell over all its edges, 0 to 1."""
+        assert self._fracture is not None
         graph = self._fracture.graph
         return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
 
@@ -84,7 +86,7 @@ class Frames:
         return np.nan_to_num(values)
 
 
-def _kinematics(stress: Stress) -> tuple[Any, Expr, Expr | None]:
+def _kinematics(stress: Stress) -> tuple[Energy, Expr, Expr | None]:
     return stress.energy, deformation_gradient(stress.u), stress.R
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,9 @@ from mpi4py import MPI
 
 from ..mechanics.stress import Stress
 from ..mesh.ranks import total
+
+if TYPE_CHECKING:
+    from ..fracture.breaking import Breaking
 
 FLAT = 1e-6  # a cell with no more than this share of its volume left is none
 
@@ -27,7 +30,7 @@ class InvertedCells:
         since: s of the first such frame.
     """
 
-    def __init__(self, stress: Stress, fracture: Any = None) -> None:
+    def __init__(self, stress: Stress, fracture: Breaking | None = None) -> None:
         """`fracture`: what breaks, which knows the damaged cells."""
         self._stress, self._domain = stress, stress.domain
         self._graph = fracture.graph if fracture is not None else None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
@@ -35,7 +35,7 @@ class Parts:
     scheme: Scheme
     assembler: Assembler
     u: fem.Function
-    density: Any
+    density: Expr
     stress: Stress
     mass: Mass
     motion: PrescribedMotion

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -49,7 +49,7 @@ class Breaking(Remembers, Protocol):
         """A pass on the current displacement (collective)."""
 
     def restored(self) -> None:
-        """Damage was read from a checkpoint."""
+        """Damage was read from a checkpoint: what follows from it is brought to it."""
 
 
 class Flow(Remembers, Protocol):
@@ -62,7 +62,7 @@ class Flow(Remembers, Protocol):
     stored: float | None
 
     def begin(self, dt: float) -> None:
-        """The flow to come is that of a step of dt."""
+        """The flow to come is that of a step of dt (s)."""
 
     def __call__(self) -> float:
         """Let the body flow; returns the energy lost to it on this rank, J."""
@@ -80,11 +80,11 @@ class NoFlow:
         """Nothing is lost."""
         return 0.0
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: Any) -> bool:
+    def recall(self, memory: object) -> bool:
         """Nothing."""
         return False
 
@@ -116,11 +116,11 @@ class Unbreakable:
         stored = self._flow.stored
         return _Whole(self._balance.stress.stored() if stored is None else stored)
 
-    def memory(self) -> Any:
+    def memory(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: Any) -> bool:
+    def recall(self, memory: object) -> bool:
         """Nothing."""
         return False
 

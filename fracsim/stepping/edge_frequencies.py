@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..fracture.edge_stress import edge_vectors
+from ..mechanics.material import PerCell
 from ..mechanics.stress import Stress
 from ..mesh.simplices import local_edges
 from ..mesh.small_matrices import barycentric_gradients
@@ -32,7 +32,7 @@ class EdgeFrequencies:
 
 
 def edge_frequencies(stress: Stress) -> EdgeFrequencies:
-    """Those of the current integrity."""
+    """The frequencies that belong to the current integrity of the edges."""
     domain, integrity = stress.domain, stress.integrity
     assert integrity is not None
     intact = integrity.x.array.reshape(-1, len(local_edges(domain.dim)))[: domain.cell_count] > 0
@@ -95,6 +95,6 @@ def _elongation_stiffness(corners: Values, length: Values, mu: Values, lmbda: Va
     return np.asarray(A + lmbda[:, None, None] * trace[:, :, None] * trace[:, None, :])
 
 
-def _of(cells: npt.NDArray[np.int64], value: Any) -> Values:
+def _of(cells: npt.NDArray[np.int64], value: PerCell) -> Values:
     """A parameter, uniform or per cell, on some of the cells."""
-    return np.broadcast_to(value, len(cells)) if np.ndim(value) == 0 else value[cells]
+    return np.broadcast_to(value, len(cells)) if np.ndim(value) == 0 else np.asarray(value)[cells]

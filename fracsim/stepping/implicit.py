@@ -25,7 +25,7 @@ class ImplicitStepper(BalanceStepper):
         self.solver = solver
 
     def troubles(self) -> dict[str, int]:
-        """Counts of what failed on the way."""
+        """Counts by name of what failed on the way, over all ranks (collective)."""
         return super().troubles() | {"linear_failures": self.solver.linear_failures}
 
     def _recalled(self) -> None:

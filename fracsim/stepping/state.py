@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +38,6 @@ class State:
     elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))
     drag: Values | None = None
-    memory: dict[str, Any] = field(default_factory=dict)
+    memory: dict[str, object] = field(default_factory=dict)
     out_of_balance: Values | None = None
     before: tuple[Values, float] | None = None

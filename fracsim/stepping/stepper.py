@@ -109,7 +109,7 @@ class BalanceStepper:
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
 
     def troubles(self) -> dict[str, int]:
-        """Counts of what failed on the way."""
+        """Counts by name of what failed on the way, over all ranks (collective)."""
         crushed = int(total(self.comm, self.breaking.not_finite)[0])
         return asdict(self.trouble) | {"cells_not_finite": crushed}
 
