@@ -1,4 +1,4 @@
-"""history.csv of ten scenes before and after a redesign, compared to the last digit that is written.
+"""history.csv of a dozen scenes before and after a redesign, compared to the last digit that is written.
 
     git worktree add ../before HEAD
     (cd ../before && ./env python3 <this file> record ../recorded)      with the code as it was
@@ -104,6 +104,8 @@ SCENES: dict[str, tuple[str, list[str], int]] = {
     "strip-passes": (STRIP, ["fracture.passes=4", "fracture.cap=0.02", "time.scheme=generalized-alpha", *DUCTILE], 1),
     "strip-closing": (STRIP, ["fracture.unilateral=true", "time.scheme=explicit", "time.step=1e-3"], 1),
     "block-loads": (BLOCK, [], 1),
+    "jelly-figure": ("jelly-figure", ["mesh.h=0.015", "time.end=0.1"], 1),
+    "bar-chi": ("bar-2d", ["mesh.h=0.016", "time.end=0.2"], 1),
     "bar-quasi-static": ("notched-bar", ["mesh.h=2e-3", "mesh.h_notch=2e-4"], 1),
 }  # fmt: skip
 
