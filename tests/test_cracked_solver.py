@@ -14,45 +14,65 @@ from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 
 
+SOLVER: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
+
+
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
 def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
-    """A plane of broken edges through 9k tetrahedra: CG takes about as many iterations as before, for multigrid's
-    aggregates do not reach across the crack (where they did, twice as many)."""
-    data = study(
-        BAR,
-        mesh={"size": [0.6, 0.2, 0.2], "h": 0.025},
-        fracture={"strength": 1e12},
-        time={"end": 1.0, "scheme": scheme},
-        solver={"snes_type": "ksponly", "ksp_rtol": 1e-6},
-    )
-    scene = build_scene(MPI.COMM_SELF, data)
-    state = Walk(scene)
-    before = [state.advance().solve.krylov for _ in range(3)][-1]
-    cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])
-    after = [state.advance().solve.krylov for _ in range(3)][-1]
-    assert scene.fracture.graph.split.any()
-    assert after <= 1.25 * before + 2, f"{before} iterations before the crack, {after} after"
-
-
-def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
-    """Ten planes through a bar: CG takes a fifth less in the end than with the aggregates of the whole body, which a
-    user who asks for them keeps."""
-    krylov = []
-    for given in ({}, {"pc_gamg_agg_nsmooths": 1}):
+    """A plane of broken edges through 2k tetrahedra: multigrid's aggregates do not reach across the crack. Where they
+    do (PETSc's own threshold) CG takes twice the iterations of the whole body; less than half of that remains."""
+    more = []
+    for given in ({}, {"pc_gamg_threshold": -1.0}):
         data = study(
             BAR,
-            mesh={"size": [0.6, 0.2, 0.2], "h": 0.016},
-            material={"energy": "neo-hookean"},
+            mesh={"size": [0.6, 0.2, 0.2], "h": 0.04},
             fracture={"strength": 1e12},
-            time={"end": 1.0, "scheme": "backward-euler"},
-            solver={"snes_type": "ksponly", "ksp_rtol": 1e-6, **given},
+            time={"end": 1.0, "scheme": scheme},
+            solver=SOLVER | given,
         )
         scene = build_scene(MPI.COMM_SELF, data)
         state = Walk(scene)
-        state.advance()
-        cut(scene, random_planes(10, scene.domain.lower, scene.domain.upper))
-        krylov.append([state.advance().solve.krylov for _ in range(12)][-1])
-    assert krylov[0] < 0.85 * krylov[1], krylov
+        before = [state.advance().solve.krylov for _ in range(2)][-1]
+        cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])
+        more.append([state.advance().solve.krylov for _ in range(3)][-1] - before)
+        assert scene.fracture.graph.split.any()
+    assert more[0] < more[1] / 2, f"{more[0]} iterations more than before the crack, {more[1]} with such aggregates"
+
+
+def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
+    """Ten planes through a bar, and none: a user who asks for a kind keeps it."""
+    assert [smoother(planes, {}) for planes in (0, 10)] == ["chebyshev", "richardson"]
+    assert smoother(10, {"pc_gamg_agg_nsmooths": 1}) == "chebyshev"
+
+
+def smoother(planes: int, given: dict[str, Any]) -> str:
+    """PETSc's name of the smoother after some steps of a bar with that many cracks."""
+    scene, _ = shattered(0.025, planes, given, 4)
+    return str(scene.solver.snes.ksp.pc.getMGSmoother(1).getType())  # type: ignore[union-attr]
+
+
+@pytest.mark.slow
+def test_multigrid_of_pieces_pays() -> None:
+    """CG takes fewer iterations in the end than with the aggregates of the whole body."""
+    ours, asked = (sum(shattered(0.016, 10, given, 12)[1][-4:]) for given in ({}, {"pc_gamg_agg_nsmooths": 1}))
+    assert ours < asked
+
+
+def shattered(h: float, planes: int, given: dict[str, Any], steps: int) -> tuple[Scene, list[int]]:
+    """A bar after a step as a whole and some in pieces, and the iterations of these."""
+    data = study(
+        BAR,
+        mesh={"size": [0.6, 0.2, 0.2], "h": h},
+        material={"energy": "neo-hookean"},
+        fracture={"strength": 1e12},
+        time={"end": 1.0, "scheme": "backward-euler"},
+        solver=SOLVER | given,
+    )
+    scene = build_scene(MPI.COMM_SELF, data)
+    state = Walk(scene)
+    state.advance()
+    cut(scene, random_planes(planes, scene.domain.lower, scene.domain.upper))
+    return scene, [state.advance().solve.krylov for _ in range(steps)]
 
 
 def cut(scene: Scene, planes: list[Any]) -> None:

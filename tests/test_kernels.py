@@ -1,4 +1,4 @@
-"""Kernels: what a killed compilation leaves behind does not stop later runs."""
+"""Kernels: compiled once; what a killed compilation leaves behind does not stop later runs."""
 
 from __future__ import annotations
 
@@ -39,3 +39,16 @@ def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest
     (tmp_path / "libffcx_forms_0.c").touch()
     assert not kernels._clear_abandoned()
     assert (tmp_path / "libffcx_forms_0.c").exists()
+
+
+def test_an_expression_is_known_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Whatever labels ufl.variable has given since: one library for all scenes of a process, and the same slope."""
+    monkeypatch.setattr(kernels, "jit_options", lambda: {"cache_dir": tmp_path, "cffi_extra_compile_args": ["-O0"]})
+    square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
+    x = ufl.SpatialCoordinate(square)
+    for _ in range(2):
+        variable = ufl.variable(x)
+        slope = ufl.diff(ufl.inner(variable, variable), variable)
+        values = kernels.CellExpression(MPI.COMM_SELF, square, slope, 2)()
+        assert sorted(values.ravel()) == pytest.approx([2 / 3, 2 / 3, 4 / 3, 4 / 3])  # 2 x of two thirds of the square
+    assert len(list(tmp_path.glob("*.c"))) == 1

@@ -17,6 +17,9 @@ from dolfinx import fem
 from dolfinx.jit import get_options
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+from ufl.algorithms.transformer import strip_variables
 from ufl.core.expr import Expr
 
 from ..mesh.dolfinx_calls import bind_to_cells, evaluate
@@ -111,6 +114,15 @@ def _clear_abandoned() -> bool:
     return bool(abandoned)
 
 
+def without_labels(expression: Expr) -> Expr:
+    """An expression with its derivatives carried out and ufl.variable's labels gone.
+
+    FFCx knows a kernel again by its signature, and UFL 2024.2 puts into that of an expression how many labels there
+    have been in this process: each scene after the first would compile its own.
+    """
+    return strip_variables(apply_derivatives(apply_algebra_lowering(expression)))
+
+
 class CellExpression:
     """A UFL expression that is constant in each cell, evaluated by a compiled kernel into an array that is kept."""
 
@@ -120,7 +132,9 @@ class CellExpression:
         self.width = int(np.prod(shape, dtype=int))
         self._compiled = compile_together(
             comm,
-            lambda: fem.Expression(expression, _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()),
+            lambda: fem.Expression(
+                without_labels(expression), _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()
+            ),
         )
         self._all = np.arange(cells, dtype=np.int32)
         self._values: npt.NDArray[np.float64] | None = None
