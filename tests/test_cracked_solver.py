@@ -13,7 +13,6 @@ from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 
-
 SOLVER: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
 
