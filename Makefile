@@ -13,10 +13,10 @@ demo:
 	@echo "In ParaView open out/loaf/surface.pvd: the torn loaf in time, to be coloured by piece, origin or age."
 
 test: readers
-	./env pytest -n 2 --dist loadfile -m "not slow"
+	./env pytest -n 2 --dist loadgroup -m "not slow"
 
 test-all: readers
-	./env pytest -n 2 --dist loadfile
+	./env pytest -n 2 --dist loadgroup
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:

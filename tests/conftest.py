@@ -1,9 +1,42 @@
-"""Settings that every test shares."""
+"""Settings that every test shares, and who runs which: `make test` starts several workers."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import pytest
 from hypothesis import settings
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=40, database=None)
 settings.load_profile("fracsim")
+
+# Files whose tests start mpirun with up to three ranks: by one worker one after another, not beside each other.
+RANKS = ("test_parallel", "test_brittle_parallel", "test_extremes")
+# The longest first, so that no worker is left alone with one of them at the end.
+FIRST = (
+    "ranks", "test_plasticity", "test_restart", "test_studies", "test_surface_run", "test_meshes_builders",
+    "test_fracture", "test_closing", "test_meshes_fill", "test_sweep", "test_own_files", "test_cannot_write",
+)  # fmt: skip
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of a file stay together, for they share what its fixtures made (`--dist loadgroup`)."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group("ranks" if item.path.stem in RANKS else item.path.stem))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """pytest-xdist starts the groups of the most tests first: here those of `FIRST`."""
+    from xdist.scheduler import LoadGroupScheduling
+
+    class Longest(LoadGroupScheduling):  # type: ignore[misc]
+        def _assign_work_unit(self, node: Any) -> None:
+            place = {group: number for number, group in enumerate(FIRST)}
+            self.workqueue.move_to_end(min(self.workqueue, key=lambda group: place.get(group, len(FIRST))), last=False)
+            super()._assign_work_unit(node)
+
+    return Longest(config, log) if config.getoption("dist") == "loadgroup" else None

@@ -17,10 +17,10 @@ from dolfinx import fem
 from dolfinx.jit import get_options
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.apply_derivatives import apply_derivatives
-from ufl.algorithms.transformer import strip_variables
 from ufl.core.expr import Expr
+from ufl.corealg.map_dag import map_expr_dag
+from ufl.corealg.multifunction import MultiFunction
+from ufl.variable import Label
 
 from ..mesh.dolfinx_calls import bind_to_cells, evaluate
 from ..mesh.domain import Domain
@@ -114,13 +114,26 @@ def _clear_abandoned() -> bool:
     return bool(abandoned)
 
 
-def without_labels(expression: Expr) -> Expr:
-    """An expression with its derivatives carried out and ufl.variable's labels gone.
+class _Labels(MultiFunction):  # type: ignore[misc]
+    """Numbers the labels of an expression's variables from 0, in the order in which they are met."""
 
-    FFCx knows a kernel again by its signature, and UFL 2024.2 puts into that of an expression how many labels there
-    have been in this process: each scene after the first would compile its own.
+    def __init__(self) -> None:
+        super().__init__()
+        self._given: dict[Label, Label] = {}
+
+    expr = MultiFunction.reuse_if_untouched
+
+    def label(self, label: Label) -> Label:
+        return self._given.setdefault(label, Label(len(self._given)))
+
+
+def labelled_anew(expression: Expr) -> Expr:
+    """An expression whose labels (of ufl.variable) do not tell how many there have been before it.
+
+    FFCx knows a kernel again by its signature. UFL 2024.2 puts the number of a label into that of an expression: each
+    scene of a process would compile its own.
     """
-    return strip_variables(apply_derivatives(apply_algebra_lowering(expression)))
+    return map_expr_dag(_Labels(), expression)
 
 
 class CellExpression:
@@ -133,7 +146,7 @@ class CellExpression:
         self._compiled = compile_together(
             comm,
             lambda: fem.Expression(
-                without_labels(expression), _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()
+                labelled_anew(expression), _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()
             ),
         )
         self._all = np.arange(cells, dtype=np.int32)
