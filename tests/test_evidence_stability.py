@@ -34,11 +34,23 @@ def test_trials_have_places_of_their_own() -> None:
     for trial in TRIALS:
         assert json.loads(json.dumps(trial.settings)) == trial.settings
         assert trial.limit <= 600 and (trial.study is None) != (not trial.script)
-    pairs = {(t.case, t.name[:-3]) for t in stability.trials() if t.case != "failed"}
+    pairs = {(t.case, t.name.rpartition("-r")[0]) for t in stability.trials() if t.case != "failed"}
     assert all((case, f"{name}-r{n}") in {p[1:] for p in places} for case, name in pairs for n in (1, 2))
 
 
-@pytest.mark.parametrize("trial", [t for t in TRIALS if t.study and t.ranks == 1], ids=lambda t: f"{t.case}-{t.name}")
+def test_each_case_is_run_five_times_in_full() -> None:
+    """On 1 and on 2 ranks; once of them always, and all of them are compared."""
+    runs = [t for t in stability.trials() if t.case == "dt-5e-2" and t.name.startswith("cylinder-neo-hookean")]
+    assert len(runs) == 10 and sorted(t.name for t in runs if not t.full) == [
+        "cylinder-neo-hookean-r1", "cylinder-neo-hookean-r2",
+    ]  # fmt: skip
+    assert len({str(t.study) for t in runs}) == 1 and len({stability._place({"name": t.name}) for t in runs}) == 1
+
+
+ONCE = [t for t in TRIALS if t.study and t.ranks == 1 and "." not in t.name.rpartition("-r")[2]]
+
+
+@pytest.mark.parametrize("trial", ONCE, ids=lambda t: f"{t.case}-{t.name}")
 def test_studies_are_valid(trial: Trial) -> None:
     """All but those that are there to be refused: a strength of zero, or none that is a number."""
     assert trial.study is not None

@@ -14,7 +14,7 @@ TESTS = Path(__file__).resolve().parents[1]
 Arrays = dict[str, npt.NDArray[np.generic]]
 
 
-def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 100) -> Arrays:
+def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> Arrays:
     """Run `module` under mpirun; returns the arrays that its rank 0 saved. AssertionError with its output where it
     fails.
 
