@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import time
@@ -40,9 +41,10 @@ from fracsim.cli import main
 try: main()
 finally: print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])
 """
-    began = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert time.monotonic() - began < 2
+    # Processor seconds, not the clock's: the other test process and the machine's other users do not count.
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 2
     assert result.stdout.splitlines()[-1] == "heavy: []"
     assert "mesh        loaf: 3D, about" in result.stdout
 
