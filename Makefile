@@ -12,11 +12,18 @@ demo:
 	@ls -1 out/loaf
 	@echo "In ParaView open out/loaf/surface.pvd: the torn loaf in time, to be coloured by piece, origin or age."
 
+# One worker a core, two at least; tests of a file stay together (tests/conftest.py). More than eight wait for the longest.
+workers := $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 2 ? 2 : n > 8 ? 8 : n)))
+parallel := -n $(workers) --dist loadgroup
+
+# Three ranks on two cores wait for one another at every message: beside other tests for minutes, alone for seconds.
 test: readers
-	./env pytest -n 2 --dist loadgroup -m "not slow"
+	./env pytest $(parallel) -m "not slow and not ranks"
+	./env pytest -m "not slow and ranks"
 
 test-all: readers
-	./env pytest -n 2 --dist loadgroup
+	./env pytest $(parallel) -m "not ranks"
+	./env pytest -m ranks
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import copy
+import io
 import shutil
 import subprocess
 import tomllib
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import pytest
+
+from fracsim import cli
 from fracsim.study import Study
 from fracsim.study.file import study_text, validate
 
@@ -110,10 +116,25 @@ def fracsim(
     env: dict[str, str] | None = None,
     cwd: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command line in a process of its own, under mpirun where `ranks` are given."""
+    """Run the command line: under mpirun where `ranks` are given, in a process of its own where it needs one.
+
+    A sweep starts processes, which would inherit what MPI has told this one.
+    """
+    if not ranks and env is None and cwd is None and ("sweep" not in arguments or "--list" in arguments):
+        return fracsim_here(*arguments)
     return subprocess.run(
         command(*arguments, ranks=ranks), capture_output=True, text=True, timeout=timeout, env=env, cwd=cwd, check=False
     )
+
+
+def fracsim_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Call the entry point in this process, which has imported what it needs: what it does not catch is raised."""
+    said, warned = io.StringIO(), io.StringIO()
+    words = ["fracsim", *map(str, arguments)]
+    with mock.patch("sys.argv", words), redirect_stdout(said), redirect_stderr(warned):
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+    return subprocess.CompletedProcess(words, int(end.value.code or 0), said.getvalue(), warned.getvalue())
 
 
 def mpirun(ranks: int) -> list[str]:

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
+from support.ranks import TornOnRanks, run_on_ranks
+
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=40, database=None)
 settings.load_profile("fracsim")
 
-# Files whose tests start mpirun with up to three ranks: by one worker one after another, not beside each other.
-RANKS = ("test_parallel", "test_brittle_parallel", "test_extremes")
+
+@pytest.fixture(scope="session")
+def torn_on_ranks(tmp_path_factory: pytest.TempPathFactory) -> TornOnRanks:
+    """Arrays that support/torn.py saves on a rank count and the folder of its surfaces; run when first asked for."""
+    folder = tmp_path_factory.mktemp("torn")
+    return cache(lambda ranks: (run_on_ranks("support.torn", ranks, folder), folder / f"torn-{ranks}"))
+
+
 # The longest first, so that no worker is left alone with one of them at the end.
 FIRST = (
-    "ranks", "test_plasticity", "test_restart", "test_studies", "test_surface_run", "test_meshes_builders",
+    "test_restart", "test_plasticity", "test_studies", "test_surface_run", "test_meshes_builders",
     "test_fracture", "test_closing", "test_meshes_fill", "test_sweep", "test_own_files", "test_cannot_write",
 )  # fmt: skip
 
@@ -25,7 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests of a file stay together, for they share what its fixtures made (`--dist loadgroup`)."""
     for item in items:
         if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group("ranks" if item.path.stem in RANKS else item.path.stem))
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.hookimpl(optionalhook=True)

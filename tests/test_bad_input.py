@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, STRIP, changed, fracsim, study, write_study
+from cases import BAR, STRIP, changed, command, fracsim, study, write_study
 from fracsim.cli import check_folder
 from fracsim.errors import InputError
 from fracsim.study.check import check_study
@@ -470,16 +471,31 @@ DEEP = {
 }
 
 
-@pytest.mark.parametrize("case", DEEP)
-def test_no_traceback(tmp_path: Path, case: str) -> None:
+def told(folder: Path, case: str) -> list[str]:
+    """Arguments of `fracsim check` of such a study."""
     text, options = DEEP[case]
-    path = write_study(tmp_path / "bar.toml", BAR)
+    path = write_study(folder / "bar.toml", BAR)
     if text:
         path.write_text(text)
-    result = fracsim("check", path if text is not None else "x" * 5000, *options)
-    assert result.returncode == 2
-    assert "Traceback" not in result.stderr and result.stderr.startswith("fracsim: ")
-    assert result.stderr.count("\n") == 1 and len(result.stderr) < 1100
+    return ["check", str(path) if text is not None else "x" * 5000, *options]
+
+
+@pytest.mark.parametrize("case", DEEP)
+def test_no_traceback(tmp_path: Path, case: str) -> None:
+    assert_one_message(fracsim(*told(tmp_path, case)))
+
+
+@pytest.mark.parametrize("case", ("study", "a path"))
+def test_no_traceback_of_a_process(tmp_path: Path, case: str) -> None:
+    """Two of them with what the interpreter says when it ends: one of parsing, one of what follows."""
+    done = subprocess.run(command(*told(tmp_path, case)), capture_output=True, text=True, timeout=60, check=False)
+    assert_one_message(done)
+
+
+def assert_one_message(done: subprocess.CompletedProcess[str]) -> None:
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr and done.stderr.startswith("fracsim: ")
+    assert done.stderr.count("\n") == 1 and len(done.stderr) < 1100
 
 
 def test_a_missing_study() -> None:

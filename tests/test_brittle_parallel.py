@@ -11,6 +11,7 @@ import pytest
 from support.ranks import Arrays, run_on_ranks
 from support.shattered import RUNS
 
+pytestmark = pytest.mark.ranks
 Results = Callable[[int], Arrays]
 
 

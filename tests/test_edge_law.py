@@ -72,6 +72,7 @@ def weakened(comm: MPI.Comm) -> tuple[Values, int]:
     return (np.column_stack(found) if found is not None else np.empty(0)), count
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (2, 3))
 def test_the_least_of_all_ranks_counts(tmp_path: Path, ranks: int) -> None:
     """What an edge keeps is the least that any cell says, on whichever rank it is."""

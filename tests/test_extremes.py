@@ -90,6 +90,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Arrays]
     return cache(lambda ranks: run_on_ranks("support.driven", ranks, folder))
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 def test_extremes_on_ranks(ranks: int, results: Callable[[int], Arrays]) -> None:
     """At nu = 0.4999 tangents are indefinite on the way; CG and GMRES gave up on some numbers of ranks, and the steps

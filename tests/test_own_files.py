@@ -114,14 +114,15 @@ def test_a_run_that_ended_may_be_run_again_and_what_lies_beside_it_stays(tmp_pat
 )
 def test_a_run_that_was_killed_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """At any moment of its set-up, in a new folder and in one of an earlier run."""
+    short = changed(TEARING, time={"end": 0.005})
     for folder in (tmp_path / "new", tmp_path / "old"):
         if folder.name == "old":
-            run(folder)
+            run(folder, short)
         with monkeypatch.context() as patch:
             patch.setattr(f"fracsim.{where}", _killed)
             with pytest.raises(SystemExit):
-                run(folder)
-        run(folder)
+                run(folder, short)
+        run(folder, short)
         assert json.loads((folder / "summary.json").read_text())["outcome"] == "done"
 
 

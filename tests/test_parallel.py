@@ -20,20 +20,20 @@ from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import edges_of
 from fracsim.study import Mesh
 from fracsim.study.mesh_source import build_mesh
-from support.ranks import Arrays, run_on_ranks
+from support.ranks import Arrays, TornOnRanks, run_on_ranks
 from support.reference import gradients, lumped_mass
 from support.torn import KERNELS, LABELS, MESHES, RADIUS, RUNS, cell_field, is_active
 
 EPS = np.finfo(float).eps
 RANKS = (1, 2, 3)
+pytestmark = pytest.mark.ranks
 Results = Callable[[int], Arrays]
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """Arrays of a rank count; run when they are first asked for."""
-    folder = tmp_path_factory.mktemp("torn")
-    return cache(lambda ranks: run_on_ranks("support.torn", ranks, folder))
+def results(torn_on_ranks: TornOnRanks) -> Results:
+    """Arrays of a rank count."""
+    return lambda ranks: torn_on_ranks(ranks)[0]
 
 
 @cache

@@ -553,7 +553,7 @@ def signalled(folder: Path, name: str, ranks: int) -> tuple[int, str]:
 # --- any number of ranks --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ranks", [0, 3])
+@pytest.mark.parametrize("ranks", [0, pytest.param(3, marks=pytest.mark.ranks)])
 def test_a_checkpoint_of_two_ranks_goes_on_with_others(tmp_path: Path, whole: Path, ranks: int) -> None:
     """Two ranks up to the first step that breaks edges, with a checkpoint after every step; then to the end."""
     strip, out = write_study(tmp_path / "strip.toml", TEARING), tmp_path / "out"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,39 +18,36 @@ from fracsim.output.fields_file import Field
 from fracsim.output.surface.files import SurfaceFiles, columns
 from fracsim.output.surface.fragments import PieceNames, fragments
 from fracsim.output.surface.frame import FARTHEST, Frame, Surface
-from support.ranks import Arrays, run_on_ranks
+from support.ranks import TornOnRanks
 from support.solids import Values, lattice, patterns, separated
+from support.torn import SURFACES
 
 RANKS = (1, 2, 3)
-Results = Callable[[int], tuple[Arrays, Path]]
 
 
 # --- ranks ---
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """Arrays and the folder of files of a rank count."""
-    folder = tmp_path_factory.mktemp("ranks")
-    return cache(lambda ranks: (run_on_ranks("support.surface_run", ranks, folder), folder / f"surface_run-{ranks}"))
-
-
+@pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS)
-def test_pieces_are_those_of_the_distributed_graph(results: Results, ranks: int) -> None:
-    found, _ = results(ranks)
-    for name in ("plate", "block"):
-        assert found[f"{name}-piece"].max() > 0
-        assert np.array_equal(found[f"{name}-piece"], found[f"{name}-graph-piece"])
+def test_pieces_are_those_of_the_distributed_graph(torn_on_ranks: TornOnRanks, ranks: int) -> None:
+    found, _ = torn_on_ranks(ranks)
+    for name in SURFACES:
+        assert found[f"surface-{name}-piece"].max() > 0
+        assert np.array_equal(found[f"surface-{name}-piece"], found[f"surface-{name}-graph-piece"])
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS[1:])
-def test_the_same_surface_at_any_number_of_ranks(results: Results, ranks: int) -> None:
+def test_the_same_surface_at_any_number_of_ranks(torn_on_ranks: TornOnRanks, ranks: int) -> None:
     """Topology, reference places, parents and names to the last bit; places to what tearing makes of the solver's
     1e-10."""
-    (serial, one), (found, other) = results(1), results(ranks)
-    for name, values in serial.items():
-        assert np.array_equal(found[name], values), name
-    for name in ("plate", "block"):
+    (serial, one), (found, other) = torn_on_ranks(1), torn_on_ranks(ranks)
+    compared = [name for name in serial if name.startswith("surface-")]
+    assert len(compared) == 11 * len(SURFACES)
+    for name in compared:
+        assert np.array_equal(found[name], serial[name]), name
+    for name in SURFACES:
         last = sorted((one / name / "surface").iterdir())[-1]
         expected, read = (pyvista.read(path) for path in (last, other / name / "surface" / last.name))
         assert np.array_equal(read.cells, expected.cells)

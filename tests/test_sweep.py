@@ -77,18 +77,19 @@ def test_what_is_no_sweep(sets: list[str], words: str, tmp_path: Path) -> None:
 
 def test_a_sweep_runs_every_case_and_then_none_again(tmp_path: Path) -> None:
     bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
-    done = fracsim("sweep", bar, *KEYS, "-o", out)
+    keys = ("--set", "mesh.h=0.25", "--set", "time.step=0.01,0.015")
+    done = fracsim("sweep", bar, *keys, "-o", out)
     assert done.returncode == 0, done.stderr
     table = rows(out)
     assert [(row["mesh.h"], row["time.step"], row["steps"]) for row in table] == [
-        ("0.25", "0.01", "3"), ("0.25", "0.015", "2"), ("0.125", "0.01", "3"), ("0.125", "0.015", "2"),
+        ("0.25", "0.01", "3"), ("0.25", "0.015", "2"),
     ]  # fmt: skip
     for row in table:
         summary = json.loads((out / row["case"] / "summary.json").read_text())
         assert float(row["peak_reaction_grip_x"]) == summary["peak_reactions"]["reaction_grip_x"] > 0
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
-    again = fracsim("sweep", bar, *KEYS, "-o", out)
-    assert again.returncode == 0 and again.stdout.count("done before") == 4
+    again = fracsim("sweep", bar, *keys, "-o", out)
+    assert again.returncode == 0 and again.stdout.count("done before") == 2
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
 
 
@@ -145,11 +146,11 @@ def test_the_list_has_a_whole_command_a_line(tmp_path: Path) -> None:
 
 def test_a_stopped_sweep_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     """SIGTERM ends the running case with a checkpoint; the same command goes on from it, not from the start."""
-    bar = write_study(tmp_path / "bar.toml", BAR, time={"step": 1e-4, "end": 0.3}, output={"every": 1000})
+    bar = write_study(tmp_path / "bar.toml", BAR, time={"step": 1e-4, "end": 0.1}, output={"every": 1000})
     out = tmp_path / "out"
-    arguments = ("sweep", bar, "--set", "material.young=1e6,2e6", "-o", out)
+    arguments = ("sweep", bar, "--set", "time.end=0.1,0.001", "-o", out)
     process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    history = out / "young-1e6" / "history.csv"
+    history = out / "end-0.1" / "history.csv"
     deadline = time.monotonic() + 40
     while not (history.exists() and len(history.read_text().splitlines()) > 20) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -157,14 +158,16 @@ def test_a_stopped_sweep_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     _, said = process.communicate(timeout=30)
     assert process.returncode == 4 and "interrupted after 0 of 2 runs" in said
     steps = len(history.read_text().splitlines()) - 1
-    assert 20 <= steps < 3000, "the run must have been stopped on its way"
+    assert 20 <= steps < 1000, "the run must have been stopped on its way"
     line = fracsim(*arguments, "--list").stdout.splitlines()[0]
     assert line.endswith("--restart")
     first = history.read_text().splitlines()[: steps + 1]
-    assert fracsim(*arguments, "--set", "time.end=0.3").returncode == 0  # the same study by another name: new folders
+    assert (
+        fracsim(*arguments, "--set", "material.young=1e6").returncode == 0
+    )  # the same study by another name: new folders
     assert fracsim(*arguments).returncode == 0
     assert history.read_text().splitlines()[: steps + 1] == first, "the rows before the stop are those of that run"
-    assert json.loads((out / "young-1e6" / "summary.json").read_text())["steps"] == 3000
+    assert json.loads((out / "end-0.1" / "summary.json").read_text())["steps"] == 1000
 
 
 def test_runs_on_two_ranks(tmp_path: Path) -> None:

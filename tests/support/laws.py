@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import basix.ufl
@@ -29,11 +29,23 @@ class Law:
         mesh = ufl.Mesh(basix.ufl.element("Lagrange", {2: "triangle", 3: "tetrahedron"}[dim], 1, shape=(dim,)))
         self._F, self._R = ufl.Constant(mesh, (dim, dim)), ufl.Constant(mesh, (dim, dim))
         self._rotates = energy.needs_rotation
-        arguments = (energy, self._F, self._R if energy.needs_rotation else None)
-        self._psi = _plain(energy.psi(*arguments[1:]))
-        self._P = _entries(first_piola_kirchhoff(*arguments))
-        self._cauchy = _entries(cauchy_stress(*arguments))
-        self._full = _entries(full_cauchy_stress(*arguments))
+        self._arguments = (energy, self._F, self._R if energy.needs_rotation else None)
+
+    @cached_property
+    def _psi(self) -> Any:
+        return _plain(self._arguments[0].psi(*self._arguments[1:]))
+
+    @cached_property
+    def _P(self) -> list[list[Any]]:
+        return _entries(first_piola_kirchhoff(*self._arguments))
+
+    @cached_property
+    def _cauchy(self) -> list[list[Any]]:
+        return _entries(cauchy_stress(*self._arguments))
+
+    @cached_property
+    def _full(self) -> list[list[Any]]:
+        return _entries(full_cauchy_stress(*self._arguments))
 
     def psi(self, F: Tensor) -> float:
         return float(self._psi((), self._values(F)))

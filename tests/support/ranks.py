@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy.typing as npt
 
 TESTS = Path(__file__).resolve().parents[1]
 Arrays = dict[str, npt.NDArray[np.generic]]
+TornOnRanks = Callable[[int], tuple[Arrays, Path]]
 
 
 def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> Arrays:

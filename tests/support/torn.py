@@ -1,4 +1,4 @@
-"""What test_parallel compares: run on any number of ranks, it saves arrays in the order of the input mesh.
+"""What test_parallel and test_surface_output compare: arrays in the order of the input mesh, on any number of ranks.
 
 `mpirun -n 2 python -m mpi4py -m support.torn OUT.npz`
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from fracsim.scene import Scene
 from fracsim.stepping.state import State
 
 from .scenes import Values, each_step, make_scene
+from .surface_run import WrittenSurface
 
 Found = dict[str, npt.NDArray[Any]]
 
@@ -233,15 +235,21 @@ RUNS: dict[str, dict[str, Any]] = {
         "probe": [{"name": "grip", "on": "right"}],
     },
 }  # fmt: skip
+SURFACES = ("plate", "block")  # whose split surface is written
 # the same, each step solved with its own flow
 RUNS["ductile-implicit"] = RUNS["ductile"] | {"plasticity": RUNS["ductile"]["plasticity"] | {"update": "implicit"}}
 
 
-def run(name: str) -> Found:
-    """A study to its end; rows of (broken, kinetic, elastic, probes)."""
+def run(name: str, folder: Path | None = None) -> Found:
+    """A study to its end; rows of (broken, kinetic, elastic, probes), and its split surface where a folder is given."""
     scene, state = make_scene(**{"solver": TIGHT} | RUNS[name])
-    rows = [[r.broken, r.kinetic, r.elastic, *scene.probes()] for r in each_step(scene, state)]
-    return result_of(name, scene, state, rows)
+    surface = None if folder is None else WrittenSurface(scene, state, folder / name)
+    rows = []
+    for report in each_step(scene, state):
+        rows.append([report.broken, report.kinetic, report.elastic, *scene.probes()])
+        if surface is not None:
+            surface.step(state, report.broken)
+    return result_of(name, scene, state, rows) | ({} if surface is None else surface.result(name))
 
 
 def by_rows() -> Found:
@@ -253,7 +261,7 @@ def by_rows() -> Found:
 
 
 def main(path: str) -> None:
-    """All checks; rank 0 saves."""
+    """All checks; rank 0 saves. Files of surfaces lie beside the arrays."""
     found: Found = {}
     for name in ("2d", "3d"):
         scene, _ = make_scene(mesh=MESHES[name])
@@ -263,7 +271,7 @@ def main(path: str) -> None:
     for label in LABELS:
         found |= pieces(label)
     for name in RUNS:
-        found |= run(name)
+        found |= run(name, Path(path).with_suffix("") if name in SURFACES else None)
     found |= dead_cells() | by_rows()
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, **found)
