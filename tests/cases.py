@@ -131,9 +131,9 @@ def fracsim_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Call the entry point in this process, which has imported what it needs: what it does not catch is raised."""
     said, warned = io.StringIO(), io.StringIO()
     words = ["fracsim", *map(str, arguments)]
-    with mock.patch("sys.argv", words), redirect_stdout(said), redirect_stderr(warned):
-        with pytest.raises(SystemExit) as end:
-            cli.main()
+    output = redirect_stdout(said), redirect_stderr(warned)
+    with mock.patch("sys.argv", words), output[0], output[1], pytest.raises(SystemExit) as end:
+        cli.main()
     return subprocess.CompletedProcess(words, int(end.value.code or 0), said.getvalue(), warned.getvalue())
 
 

@@ -325,9 +325,9 @@ def test_a_refused_option_runs_no_file(tmp_path: Path) -> None:
     evil = tmp_path / "evil.py"
     evil.write_text("open('was-here', 'w').close()\nclass PC: pass\n")
     path = write_study(tmp_path / "bar.toml", BAR)
-    for command in ("check", "run"):
+    for name in ("check", "run"):
         options = ["--set", "solver.pc_type=python", "--set", "solver.pc_python_type=evil.PC"]
-        result = fracsim(command, path, *options, env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path)
+        result = fracsim(name, path, *options, env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path)
         assert result.returncode == 2
         assert result.stderr.count("fracsim: ") == 1 and 'solver.pc_type = "python"' in result.stderr
     assert sorted(each.name for each in tmp_path.iterdir() if each.name != "__pycache__") == ["bar.toml", "evil.py"]
