@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from support.ranks import TornOnRanks, run_on_ranks
+from support.ranks import OnRanks, run_on_ranks
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=40, database=None)
@@ -16,10 +16,10 @@ settings.load_profile("fracsim")
 
 
 @pytest.fixture(scope="session")
-def torn_on_ranks(tmp_path_factory: pytest.TempPathFactory) -> TornOnRanks:
-    """Arrays that support/torn.py saves on a rank count and the folder of its surfaces; run when first asked for."""
-    folder = tmp_path_factory.mktemp("torn")
-    return cache(lambda ranks: (run_on_ranks("support.torn", ranks, folder), folder / f"torn-{ranks}"))
+def on_ranks(tmp_path_factory: pytest.TempPathFactory) -> OnRanks:
+    """What support/every.py saves on a rank count, and the folder of its surfaces; run when first asked for."""
+    folder = tmp_path_factory.mktemp("ranks")
+    return cache(lambda ranks: (run_on_ranks("support.every", ranks, folder), folder / f"every-{ranks}"))
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

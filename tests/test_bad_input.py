@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from pathlib import Path
@@ -16,6 +17,7 @@ from fracsim.cli import check_folder
 from fracsim.errors import InputError
 from fracsim.study.check import check_study
 from fracsim.study.file import load_study, validate
+from support.ranks import Arrays, run_on_ranks
 
 Data = dict[str, Any]
 LEFT: Data = {"on": "left", "fix": "xyz"}
@@ -532,14 +534,34 @@ TWO_RANKS: dict[str, tuple[list[str], str]] = {
 }
 
 
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory: pytest.TempPathFactory) -> tuple[Arrays, Path]:
+    """Exit codes and words of all cases on two ranks, and the folder of what they would have written."""
+    folder = tmp_path_factory.mktemp("refused")
+    bar = write_study(folder / "bar.toml", BAR)
+    lines = [["run", str(bar), "-o", str(folder / name), *options] for name, (options, _) in TWO_RANKS.items()]
+    (folder / "lines.json").write_text(json.dumps(lines))
+    return run_on_ranks("support.refused", 2, folder, seconds=60), folder
+
+
 @pytest.mark.parametrize("case", TWO_RANKS)
-def test_one_message_on_two_ranks_and_nothing_written(tmp_path: Path, case: str) -> None:
-    options, message = TWO_RANKS[case]
+def test_one_message_on_two_ranks_and_nothing_written(refused: tuple[Arrays, Path], case: str) -> None:
+    found, folder = refused
+    place = list(TWO_RANKS).index(case)
+    assert found["codes"][place].tolist() == [2, 2]
+    root, other = found["said"][place]
+    assert root.startswith("fracsim: ") and root.count("\n") == 1
+    assert TWO_RANKS[case][1] in root and other == ""
+    assert not (folder / case).exists()
+
+
+def test_one_message_of_two_processes(tmp_path: Path) -> None:
+    """One of them with what mpirun makes of it."""
+    options, message = TWO_RANKS["scene"]
     bar = write_study(tmp_path / "bar.toml", BAR)
     result = fracsim("run", bar, "-o", tmp_path / "out", *options, ranks=2)
     assert result.returncode == 2
-    assert result.stderr.count("fracsim: ") == 1
-    assert message in result.stderr
+    assert result.stderr.count("fracsim: ") == 1 and message in result.stderr
     assert "Traceback" not in result.stderr + result.stdout
     assert result.stdout == "" or result.stdout.startswith("-----")  # what mpirun says of the exit code
     assert not (tmp_path / "out").exists()

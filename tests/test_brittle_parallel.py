@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 import pytest
 
-from support.ranks import Arrays, run_on_ranks
+from support.ranks import Arrays, OnRanks
 from support.shattered import RUNS
 
 pytestmark = pytest.mark.ranks
@@ -16,10 +15,12 @@ Results = Callable[[int], Arrays]
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """Arrays of a rank count; run when they are first asked for."""
-    folder = tmp_path_factory.mktemp("shattered")
-    return cache(lambda ranks: run_on_ranks("support.shattered", ranks, folder))
+def results(on_ranks: OnRanks) -> Results:
+    """Arrays of a rank count."""
+    prefix = "brittle-"
+    return lambda ranks: {
+        key.removeprefix(prefix): each for key, each in on_ranks(ranks)[0].items() if key.startswith(prefix)
+    }
 
 
 @pytest.mark.parametrize("name", RUNS)

@@ -196,7 +196,9 @@ def test_a_fault_on_one_rank_ends_all(tmp_path: Path) -> None:
     script.write_text(f"""
 import sys
 from mpi4py import MPI
+from fracsim.mesh import ranks
 from fracsim.stepping.newton import Solver
+ranks.PATIENCE = 1.0
 solve = Solver.solve
 def faulty(self, guess):
     if MPI.COMM_WORLD.rank == 1:

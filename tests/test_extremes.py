@@ -1,7 +1,6 @@
 """What once failed at an extreme, and must not again. The whole table: studies/evidence/stability.py."""
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from fracsim.run import run_study
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import extremes
 from fracsim.study.file import validate
-from support.ranks import Arrays, run_on_ranks
+from support.ranks import Arrays, OnRanks
 from support.scenes import Walk
 
 
@@ -85,9 +84,8 @@ def test_factors_where_iterations_fail() -> None:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Arrays]:
-    folder = tmp_path_factory.mktemp("driven")
-    return cache(lambda ranks: run_on_ranks("support.driven", ranks, folder))
+def results(on_ranks: OnRanks) -> Callable[[int], Arrays]:
+    return lambda ranks: on_ranks(ranks)[0]
 
 
 @pytest.mark.ranks

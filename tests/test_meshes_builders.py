@@ -30,7 +30,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("disk", {}),
     ("disk", {"arc": 10.0}),
     ("figure", {}),
-    ("figure", {"height": 0.4, "wall": 0.008, "h": 0.009}),
+    ("figure", {"height": 0.4, "wall": 0.0095, "h": 0.0115}),
     ("loaf", {"h": 0.012}),
     ("notched-bar", {"h": 0.002, "h_notch": 0.0004}),
     ("notched-bar", {"thickness": 0.0}),
@@ -383,12 +383,12 @@ def test_a_hollow_figure_is_nowhere_thinner_than_its_wall() -> None:
     """The least distance between nodes of the inside and of the outside is the wall, less what facets cut off."""
     from scipy.spatial import cKDTree
 
-    mesh = BUILDERS["figure"](wall=0.006, h=0.006).build()
+    mesh = BUILDERS["figure"](wall=0.007, h=0.008).build()
     inside = mesh.points[np.unique(mesh.facet_groups["inside"])]
     outside = mesh.points[np.setdiff1d(np.unique(boundary_facets(mesh.cells)), np.unique(mesh.facet_groups["inside"]))]
     distance = cKDTree(outside).query(inside)[0]
-    assert distance.min() > 0.006 * (1 - 1e-6)
-    assert np.median(distance) < 0.006 + 0.5 * 0.006
+    assert distance.min() > 0.007 * (1 - 1e-6)
+    assert np.median(distance) < 0.007 + 0.5 * 0.008
 
 
 # --- behaviour ------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The same body at 1, 2 and 3 ranks: averages, edges, pieces and whole runs, against serial references and each other.
 
-One start of mpirun a rank count does all checks (support/torn.py) and saves arrays in the order of the input mesh.
+One start of mpirun a rank count does all checks (support/every.py) and saves arrays in the order of the input mesh.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import edges_of
 from fracsim.study import Mesh
 from fracsim.study.mesh_source import build_mesh
-from support.ranks import Arrays, TornOnRanks, run_on_ranks
+from support.ranks import Arrays, OnRanks, run_on_ranks
 from support.reference import gradients, lumped_mass
 from support.torn import KERNELS, LABELS, MESHES, RADIUS, RUNS, cell_field, is_active
 
@@ -31,9 +31,9 @@ Results = Callable[[int], Arrays]
 
 
 @pytest.fixture(scope="module")
-def results(torn_on_ranks: TornOnRanks) -> Results:
+def results(on_ranks: OnRanks) -> Results:
     """Arrays of a rank count."""
-    return lambda ranks: torn_on_ranks(ranks)[0]
+    return lambda ranks: on_ranks(ranks)[0]
 
 
 @cache

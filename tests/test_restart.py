@@ -424,7 +424,7 @@ import fracsim.run
 build = fracsim.run.build_scene
 def slowly(*arguments):
     open({str(tmp_path)!r} + f"/ready-{{os.getpid()}}", "w").close()
-    time.sleep(3.0)
+    time.sleep(1.5)
     return build(*arguments)
 fracsim.run.build_scene = slowly
 sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]

@@ -18,7 +18,7 @@ from fracsim.output.fields_file import Field
 from fracsim.output.surface.files import SurfaceFiles, columns
 from fracsim.output.surface.fragments import PieceNames, fragments
 from fracsim.output.surface.frame import FARTHEST, Frame, Surface
-from support.ranks import TornOnRanks
+from support.ranks import OnRanks
 from support.solids import Values, lattice, patterns, separated
 from support.torn import SURFACES
 
@@ -30,8 +30,8 @@ RANKS = (1, 2, 3)
 
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS)
-def test_pieces_are_those_of_the_distributed_graph(torn_on_ranks: TornOnRanks, ranks: int) -> None:
-    found, _ = torn_on_ranks(ranks)
+def test_pieces_are_those_of_the_distributed_graph(on_ranks: OnRanks, ranks: int) -> None:
+    found, _ = on_ranks(ranks)
     for name in SURFACES:
         assert found[f"surface-{name}-piece"].max() > 0
         assert np.array_equal(found[f"surface-{name}-piece"], found[f"surface-{name}-graph-piece"])
@@ -39,10 +39,10 @@ def test_pieces_are_those_of_the_distributed_graph(torn_on_ranks: TornOnRanks, r
 
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS[1:])
-def test_the_same_surface_at_any_number_of_ranks(torn_on_ranks: TornOnRanks, ranks: int) -> None:
+def test_the_same_surface_at_any_number_of_ranks(on_ranks: OnRanks, ranks: int) -> None:
     """Topology, reference places, parents and names to the last bit; places to what tearing makes of the solver's
     1e-10."""
-    (serial, one), (found, other) = torn_on_ranks(1), torn_on_ranks(ranks)
+    (serial, one), (found, other) = on_ranks(1), on_ranks(ranks)
     compared = [name for name in serial if name.startswith("surface-")]
     assert len(compared) == 11 * len(SURFACES)
     for name in compared:

@@ -1,6 +1,5 @@
-"""Extremes on the ranks of this process: python -m support.driven TARGET.npz (under mpirun)."""
+"""What test_extremes compares: extremes on any number of ranks."""
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from fracsim.studies.evidence import extremes
 from fracsim.study.file import validate
 
 from .scenes import Walk
+from .torn import Found
 
 
 def stepped(study: dict[str, Any], steps: int) -> tuple[Scene, Any, Any]:
@@ -57,8 +57,8 @@ def flown() -> list[float]:
     return [scene.stepper.trouble.steps_failed, report.kinetic]
 
 
-if __name__ == "__main__":
+def compared() -> Found:
+    """All of them, by name."""
     found = {name: nearly_incompressible(name) for name in ("backward-euler", "generalized-alpha")}
     found |= {"crushed": crushed(), "flown": flown()}
-    if MPI.COMM_WORLD.rank == 0:
-        np.savez(sys.argv[1], **{name: np.array(values) for name, values in found.items()})
+    return {name: np.array(values) for name, values in found.items()}

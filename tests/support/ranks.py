@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,19 @@ import numpy.typing as npt
 
 TESTS = Path(__file__).resolve().parents[1]
 Arrays = dict[str, npt.NDArray[np.generic]]
-TornOnRanks = Callable[[int], tuple[Arrays, Path]]
+OnRanks = Callable[[int], tuple[Arrays, Path]]
 
 
 def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> Arrays:
-    """Run `module` under mpirun; returns the arrays that its rank 0 saved. AssertionError with its output where it
-    fails.
+    """Run `main(path)` of a module on ranks, one in this process; returns the arrays that its rank 0 saved.
+    AssertionError with its output where it fails.
 
     mpi4py's runner ends all ranks where one raises. `timeout` ends mpirun in a way that lets it end its children.
     """
     target = folder / f"{module.rpartition('.')[2]}-{ranks}.npz"
+    if ranks == 1:
+        import_module(module).main(str(target))
+        return loaded(target)
     command = [
         "timeout", "--kill-after=10", str(seconds), "mpirun", "--oversubscribe", "-n", str(ranks),
         sys.executable, "-m", "mpi4py", "-m", module, str(target),
@@ -31,5 +35,9 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> A
     done = subprocess.run(command, cwd=TESTS, env=dict(os.environ), capture_output=True, text=True)
     output = (done.stdout + done.stderr)[-4000:]
     assert done.returncode == 0, f"{module} on {ranks} ranks ended with {done.returncode}:\n{output}"
+    return loaded(target)
+
+
+def loaded(target: Path) -> Arrays:
     with np.load(target) as arrays:
         return dict(arrays)

@@ -1,15 +1,8 @@
-"""What test_brittle_parallel compares: studies with brittle surfaces run on any number of ranks, in input order.
-
-`mpirun -n 2 python -m mpi4py -m support.shattered OUT.npz`
-"""
+"""What test_brittle_parallel compares: studies with brittle surfaces run on any number of ranks, in input order."""
 
 from __future__ import annotations
 
-import sys
 from typing import Any
-
-import numpy as np
-from mpi4py import MPI
 
 from fracsim.fracture.record import EdgeRecord
 from fracsim.scene import Scene
@@ -77,14 +70,6 @@ def surfaces_of(name: str, scene: Scene) -> Found:
     return found
 
 
-def main(path: str) -> None:
-    """All runs; rank 0 saves."""
-    found: Found = {}
-    for name in RUNS:
-        found |= run(name)
-    if MPI.COMM_WORLD.rank == 0:
-        np.savez(path, **found)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+def compared() -> Found:
+    """All runs, each array under the name of its run, with "brittle-" before it."""
+    return {f"brittle-{key}": values for name in RUNS for key, values in run(name).items()}

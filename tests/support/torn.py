@@ -1,11 +1,7 @@
-"""What test_parallel and test_surface_output compare: arrays in the order of the input mesh, on any number of ranks.
-
-`mpirun -n 2 python -m mpi4py -m support.torn OUT.npz`
-"""
+"""What test_parallel and test_surface_output compare: arrays in the order of the input mesh, on any number of ranks."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx.fem import IntegralType
-from mpi4py import MPI
 
 from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.nonlocal_average import NonlocalAverage
@@ -260,8 +255,8 @@ def by_rows() -> Found:
     return {"broken-by-rows": found["block-broken"], "u-by-rows": found["block-u"]}
 
 
-def main(path: str) -> None:
-    """All checks; rank 0 saves. Files of surfaces lie beside the arrays."""
+def compared(folder: Path) -> Found:
+    """All checks, with the files of surfaces in a folder."""
     found: Found = {}
     for name in ("2d", "3d"):
         scene, _ = make_scene(mesh=MESHES[name])
@@ -271,11 +266,5 @@ def main(path: str) -> None:
     for label in LABELS:
         found |= pieces(label)
     for name in RUNS:
-        found |= run(name, Path(path).with_suffix("") if name in SURFACES else None)
-    found |= dead_cells() | by_rows()
-    if MPI.COMM_WORLD.rank == 0:
-        np.savez(path, **found)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+        found |= run(name, folder if name in SURFACES else None)
+    return found | dead_cells() | by_rows()
