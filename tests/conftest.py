@@ -11,7 +11,7 @@ from hypothesis import settings
 from support.ranks import OnRanks, run_on_ranks
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
-settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=40, database=None)
+settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=25, database=None)
 settings.load_profile("fracsim")
 
 

@@ -25,10 +25,10 @@ COARSE = {
     "bar-2d": ["mesh.h=0.02"],
     "cylinder": ["mesh.h=0.01"],
     "doormat": ["mesh.h=0.02"],
-    "jelly-figure": ["mesh.h=0.018"],
+    "jelly-figure": ["mesh.h=0.015"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
-    "struck-figure": ["mesh.h=0.018"],
+    "struck-figure": ["mesh.h=0.015"],
     "struck-vase": ["mesh.h=0.012"],
     "wall": ["mesh.h=0.12"],
 }
@@ -90,8 +90,8 @@ def test_the_strip_by_both_approaches(approach: str, tmp_path: Path) -> None:
 
 def test_the_blow_lands_on_a_surface_of_ones_own(tmp_path: Path) -> None:
     """The [mesh] of a study is replaced as a whole, and the box of the blow finds the facets of the new body."""
-    mesh = BUILDERS["figure"](h=0.016).build()
+    mesh = BUILDERS["figure"](h=0.014).build()
     meshio.Mesh(mesh.points, [("triangle", boundary_facets(mesh.cells))]).write(tmp_path / "own.stl")
-    own = f'mesh={{surface="{tmp_path}/own.stl", h=0.018}}'
+    own = f'mesh={{surface="{tmp_path}/own.stl", h=0.015}}'
     summary = steps(folder() / "struck-figure.toml", [own], 4, tmp_path / "out")
     assert summary["outcome"] == "done" and summary["external_work"] > 0
