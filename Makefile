@@ -1,5 +1,7 @@
 # Every target runs inside the environment, which ./env makes on first use.
 ranks := 2
+# Modules are compiled once, not by each process of the tests, whatever the machine says.
+export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
 .PHONY: demo test test-all readers bench report report-full lint format clean

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
-from support.ranks import OnRanks, run_on_ranks
+from support.ranks import Arrays, OnRanks, run_on_ranks
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=25, database=None)
@@ -17,9 +18,16 @@ settings.load_profile("fracsim")
 
 @pytest.fixture(scope="session")
 def on_ranks(tmp_path_factory: pytest.TempPathFactory) -> OnRanks:
-    """What support/every.py saves on a rank count, and the folder of its surfaces; run when first asked for."""
-    folder = tmp_path_factory.mktemp("ranks")
-    return cache(lambda ranks: (run_on_ranks("support.every", ranks, folder), folder / f"every-{ranks}"))
+    """What support/every.py saves on a rank count, and the folder of its surfaces; run once, when first asked for."""
+    folder, begun = tmp_path_factory.mktemp("ranks"), set()
+
+    @cache
+    def run(ranks: int) -> tuple[Arrays, Path]:
+        assert ranks not in begun, f"the run on {ranks} ranks has failed before"
+        begun.add(ranks)
+        return run_on_ranks("support.every", ranks, folder), folder / f"every-{ranks}"
+
+    return run
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import subprocess
 import sys
 import tomllib
@@ -12,6 +13,7 @@ import pytest
 
 from cases import STRIP, changed, write_study
 from fracsim.study.file import validate
+from support.ranks import TESTS
 
 THETA = '''
 from __future__ import annotations
@@ -41,6 +43,19 @@ class Theta(AtTheEnd):
 # the line of the registry, before anything of the study is imported
 PROGRAM = "from fracsim.forms.schemes import SCHEMES; from theta import Theta; SCHEMES['toy'] = Theta; {more}"
 COMMAND = "import sys; from fracsim.cli import main; sys.argv[0] = 'fracsim'; main()"
+# lines of a file, each with what is set of the scheme first
+COMMANDS = """
+import json
+import sys
+sys.path.insert(0, sys.argv[1])
+from cases import fracsim_here
+for changed, line in json.load(open("lines.json")):
+    for name in changed:
+        setattr(Theta, name, False)
+    print(json.dumps(vars(fracsim_here(*line))))
+    for name in changed:
+        setattr(Theta, name, True)
+"""
 STEPS, DT, G = 20, 0.01, 9.81
 
 
@@ -58,6 +73,14 @@ def folder(tmp_path: Path) -> Path:
 def command(folder: Path, *arguments: str, more: str = COMMAND) -> subprocess.CompletedProcess[str]:
     program = [sys.executable, "-c", PROGRAM.format(more=more), *arguments]
     return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
+
+
+def commands(folder: Path, *lines: tuple[list[str], list[str]]) -> list[dict[str, str]]:
+    """What a process answers to command lines, one after another, each with things that the scheme is not."""
+    (folder / "lines.json").write_text(json.dumps(lines))
+    done = command(folder, str(TESTS), more="exec(" + repr(COMMANDS) + ")")
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 @pytest.mark.parametrize("theta", (0.5, 0.75))
@@ -81,26 +104,29 @@ def test_a_toy_scheme_runs(folder: Path, theta: float) -> None:
 
 
 def test_a_toy_scheme_is_checked_and_listed(folder: Path) -> None:
-    listed = command(folder, "list").stdout
-    assert "  toy                a toy\n" in listed
-    assert "(default)" in next(line for line in listed.splitlines() if "generalized-alpha" in line)
-    assert "toy, 20 steps of 0.01 s" in command(folder, "check", "fall.toml").stdout
-    refused = command(folder, "check", "fall.toml", "--set", "time.theta=2.0")
-    assert refused.returncode == 2
-    assert "time.theta = 2.0: must be less than or equal to 1" in refused.stderr
+    check = ["check", "fall.toml"]
+    listed, checked, refused = commands(folder, ([], ["list"]), ([], check), ([], [*check, "--set", "time.theta=2.0"]))
+    assert "  toy                a toy\n" in listed["stdout"]
+    assert "(default)" in next(line for line in listed["stdout"].splitlines() if "generalized-alpha" in line)
+    assert "toy, 20 steps of 0.01 s" in checked["stdout"]
+    assert refused["returncode"] == 2
+    assert "time.theta = 2.0: must be less than or equal to 1" in refused["stderr"]
 
 
 def test_rules_follow_from_what_a_scheme_is(folder: Path) -> None:
     """Not from its name: without inertia no initial velocity and every body held; explicit: lumped, and no passes."""
-    still = "Theta.inertia = False; " + COMMAND
-    assert "nothing holds the body" in command(folder, "check", "fall.toml", more=still).stderr
-    moving = ["--set", "initial.velocity=[1, 0]"]
-    assert "[initial] sets a velocity" in command(folder, "check", "fall.toml", *moving, more=still).stderr
-    explicit = "Theta.implicit = False; " + COMMAND
-    consistent = ["--set", "time.mass=consistent"]
-    assert "explicit steps need mass" in command(folder, "check", "fall.toml", *consistent, more=explicit).stderr
-    passes = ["--set", "fracture={strength=1e9, passes=2}"]
-    assert "set passes = 1" in command(folder, "check", "fall.toml", *passes, more=explicit).stderr
+    check = ["check", "fall.toml"]
+    still, moving, consistent, passes = commands(
+        folder,
+        (["inertia"], check),
+        (["inertia"], [*check, "--set", "initial.velocity=[1, 0]"]),
+        (["implicit"], [*check, "--set", "time.mass=consistent"]),
+        (["implicit"], [*check, "--set", "fracture={strength=1e9, passes=2}"]),
+    )
+    assert "nothing holds the body" in still["stderr"]
+    assert "[initial] sets a velocity" in moving["stderr"]
+    assert "explicit steps need mass" in consistent["stderr"]
+    assert "set passes = 1" in passes["stderr"]
 
 
 def test_two_schemes_cannot_disagree_about_a_key(folder: Path) -> None:

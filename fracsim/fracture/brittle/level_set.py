@@ -93,7 +93,7 @@ class Curved:
         """Complete the cells around new nodes that lack one node; returns those nodes."""
         cells, missing, known = self._to_complete(new)
         node = self._body.cells[cells][missing]
-        others = self._body.cells[cells][~missing].reshape(len(cells), -1)[known]
+        others = self._body.cells[cells][~missing].reshape(len(cells), self._body.dim)[known]
         node = node[known]
         if not len(node):
             return node
