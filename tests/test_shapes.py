@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import LinearConstraint, minimize
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.shapes import SHAPES, Box, Capsule, Cylinder, Plane, Shape, Sphere
-from support.shapes import ALL, BODIES, HOLLOW, differences, enclosed, facing, points
+from support.shapes import ALL, BODIES, HOLLOW, differences, enclosed, facing, points, sampled
 
 EPS = np.finfo(float).eps
 all_shapes = pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
@@ -22,41 +23,45 @@ closed = pytest.mark.parametrize("shape", (BODIES | HOLLOW).values(), ids=(BODIE
 
 @closed
 def test_distance_is_that_to_the_closest_point_of_the_surface(shape: Shape) -> None:
-    """Brute force: the outline lies on the surface, no further than its elements are long from any of its points."""
+    """Brute force over 200000 random points of the outline.
+
+    They lie up to r (1 - cos 3.75 degrees) < 2e-3 below arcs of radius r < 0.7, and about 0.02 apart, which adds 0.02^2 /
+    (2 d) < 2e-3 at distances d > 0.1.
+    """
     at, elements = shape.outline()
-    x = points(shape, 400)
-    brute = np.linalg.norm(x[:, None] - at[None], axis=2).min(axis=1)
+    x = points(shape, 2000)
     exact = shape.distance(x)
-    corners = at[elements]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    assert np.abs(shape.distance(at)).max() < 20 * EPS
-    # the foot of x is within `longest` of a corner, and off the foot the way is sqrt(d^2 + longest^2) at most
-    assert (brute >= abs(exact) - 20 * EPS).all()
-    assert (brute <= np.hypot(exact, longest) + 20 * EPS).all() or "box" in type(shape).__name__.lower()
+    clear = abs(exact) > 0.1
+    brute, _ = cKDTree(sampled(at, elements, 200_000)).query(x[clear])
+    assert clear.sum() > 1000 and abs(shape.distance(at)).max() < 20 * EPS
+    np.testing.assert_allclose(abs(exact[clear]), brute, atol=4e-3)
+    filled = -exact if shape in HOLLOW.values() else exact
+    within = (abs(x) < 0.1).all(axis=1)
+    assert (filled[within] < 0).all() and (filled[np.linalg.norm(x, axis=1) > 1.1] > 0).all()
 
 
-CORES = {  # the sharp core as |component along a direction| <= limit, and what it is grown by: written down by hand
-    "rectangle": (np.eye(2), [0.45, 0.25], 0.15),
-    "box": (np.eye(3), [0.45, 0.25, 0.35], 0.15),
-    "capsule": (np.eye(3), [0, 0, 0.55], 0.3),
-    "sphere": (np.eye(3), [0, 0, 0], 0.7),
-    "stadium": (np.eye(2), [0, 0.55], 0.3),
+CORES = {  # the sharp core |x_i| <= limit_i, and what it is grown by: written down by hand
+    "rectangle": ([0.45, 0.25], 0.15),
+    "box": ([0.45, 0.25, 0.35], 0.15),
+    "capsule": ([0, 0, 0.55], 0.3),
+    "sphere": ([0, 0, 0], 0.7),
+    "stadium": ([0, 0.55], 0.3),
 }
 
 
 @pytest.mark.parametrize("name", CORES)
 def test_distance_from_outside_is_the_least_over_the_body(name: str) -> None:
     """min |x - y| over the core by SciPy, less the rounding."""
-    directions, limits, grown = CORES[name]
+    limits, grown = CORES[name]
     shape = BODIES[name]
     if isinstance(shape, Capsule):  # the same along the last axis
-        shape = Capsule(shape.radius, shape.length, axis=tuple(directions[-1]))
+        shape = Capsule(shape.radius, shape.length, axis=tuple(np.eye(len(limits))[-1]))
     x = points(shape, 40, seed=3)
     x = x[shape.distance(x) > 0.05]
     assert len(x) > 5
-    within = LinearConstraint(directions, -np.array(limits), np.array(limits))
+    within = [(-limit, limit) for limit in limits]
     for each, distance in zip(x, shape.distance(x), strict=True):
-        found = minimize(lambda y, at=each: ((y - at) ** 2).sum(), 0 * each, constraints=within, tol=1e-14)
+        found = minimize(lambda y, at=each: ((y - at) ** 2).sum(), 0 * each, bounds=within, tol=1e-14)
         assert distance == pytest.approx(np.sqrt(found.fun) - grown, abs=1e-6)
 
 

@@ -58,3 +58,14 @@ def facing(at: Values, elements: npt.NDArray[np.int32]) -> tuple[Values, Values]
     size = np.linalg.norm(normals, axis=1)
     real = size > 1e-12
     return normals[real] / size[real, None], corners.mean(axis=1)[real]
+
+
+def sampled(at: Values, elements: npt.NDArray[np.int32], count: int, seed: int = 0) -> Values:
+    """(count, d) random points of an outline, evenly over its area."""
+    rng = np.random.default_rng(seed)
+    corners = at[elements]
+    edges = corners[:, 1:] - corners[:, :1]
+    size = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]) if at.shape[1] == 3 else edges[:, 0], axis=1)
+    chosen = rng.choice(len(elements), count, p=size / size.sum())
+    shares = rng.dirichlet(np.ones(elements.shape[1]), count)
+    return np.einsum("nk,nkd->nd", shares, corners[chosen])
