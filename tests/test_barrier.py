@@ -12,7 +12,7 @@ from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
 from fracsim.mechanics.contact.friction import Friction, tangential
 from fracsim.mechanics.contact.placed import Placed
 from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
+from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Sphere
 from support.shapes import Values, differences
 
 EPS = np.finfo(float).eps
@@ -27,9 +27,9 @@ def test_barrier_by_hand() -> None:
     assert BARRIER.curvature(g)[0] == pytest.approx(2e6 / 1e-3 * (2 * np.log(2) + 5))
 
 
-@given(share=st.floats(1e-6, 1.5))
+@given(share=st.floats(1e-6, 1.5).filter(lambda share: abs(share - 1) > 2e-4))
 def test_slope_and_curvature_are_derivatives(share: float) -> None:
-    """By complex-free central differences with a step that suits the gap."""
+    """By central differences with a step that suits the gap; not across g = d, where the third derivative jumps."""
     g, h = np.array([[share * BARRIER.width]]), 1e-4 * share * BARRIER.width
     scale = BARRIER.stiffness * max(1.0, 1 / share)
     by = [differences(lambda x, f=f: f(x[:, 0]), g, h)[0, 0] for f in (BARRIER.energy, BARRIER.slope)]
@@ -75,16 +75,6 @@ def test_bad_numbers_are_said(wrong: object) -> None:
         wrong()
 
 
-def advance(shape: Shape, pose: Pose, x: Values, moved: Values, q: Values) -> Values:
-    """Shares of a motion of points by `moved` and of the pose by q; a pose for each share, one point at a time."""
-
-    def gap(shares: Values) -> Values:
-        each = zip(shares, x, moved, strict=True)
-        return np.array([Placed(shape, pose.moved(s * q)).distance((a + s * by)[None])[0] for s, a, by in each])
-
-    return longest_step(gap, Placed(shape, pose).speed(x, moved, q))
-
-
 @pytest.mark.parametrize("dim", (2, 3))
 @given(seed=st.integers(0, 10**6))
 def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
@@ -96,15 +86,13 @@ def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
     target = rng.uniform(-0.5, 0.5, len(x))[:, None] * np.eye(dim)[-1]
     moved = 10 * (target - x)  # aimed at the wire, and far beyond
     q = rng.normal(size=3 if dim == 2 else 6) * rng.choice([0.0, 1.0])
-    share = advance(wire, pose, x, moved, q)
+    placed = Placed(wire, pose)
+    gap = placed.along(x, moved, q)
+    share = longest_step(gap, placed.speed(x, moved, q))
     assert ((share > 0) & (share <= 1)).all()
     now = wire.distance(x)
     for part in np.linspace(0, 1, 300):
-        gaps = [
-            Placed(wire, pose.moved(part * s * q)).distance((a + part * s * by)[None])[0]
-            for s, a, by in zip(share, x, moved, strict=True)
-        ]
-        assert (np.array(gaps) >= KEPT * now * (1 - 1e-9)).all()
+        assert (gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
 
 
 def test_a_point_straight_at_a_plane_goes_nine_tenths() -> None:

@@ -25,8 +25,8 @@ closed = pytest.mark.parametrize("shape", (BODIES | HOLLOW).values(), ids=(BODIE
 def test_distance_is_that_to_the_closest_point_of_the_surface(shape: Shape) -> None:
     """Brute force over 200000 random points of the outline.
 
-    They lie up to r (1 - cos 3.75 degrees) < 2e-3 below arcs of radius r < 0.7, and about 0.02 apart, which adds 0.02^2 /
-    (2 d) < 2e-3 at distances d > 0.1.
+    They lie up to r (1 - cos 3.75 degrees) < 2e-3 below arcs of radius r < 0.7, and about 0.02 apart, which adds
+    0.02^2 / (2 d) < 2e-3 at distances d > 0.1.
     """
     at, elements = shape.outline()
     x = points(shape, 2000)

@@ -78,7 +78,7 @@ class Sphere(_Swept):
 
 @dataclass(frozen=True)
 class Capsule(_Swept):
-    """All within `radius` of a segment of `length` along `axis`: from end to end length + 2 radius, m; 2D: a stadium."""
+    """All within `radius` of a segment of `length` along `axis`, m: from end to end length + 2 radius. 2D: stadium."""
 
     radius: float
     length: float

@@ -61,9 +61,9 @@ class Barrier:
 def longest_step(gap: Callable[[Values], Values], speed: Values) -> Values:
     """(n,) shares in (0, 1] of a motion that leave every gap at least KEPT of what it is now, all along the way.
 
-    `gap`: shares (n,) of the motion -> distances (n,) of the points there, obstacles having moved by the same shares;
-    `speed` (n,): bounds of the distance's rate, m per whole motion. As the distance is 1-Lipschitz, the way a point
-    goes against an obstacle that moves by v is one: |dx| + |v| (Placed.speed). Conservative advancement: from a gap g a
+    `gap`: shares (n,) of the motion -> distances (n,) of the points there, obstacles having moved by the same shares
+    (Placed.along); `speed` (n,): bounds of the distance's rate, m per whole motion. As the distance is 1-Lipschitz, the
+    way a point goes as seen from the obstacle is one (Placed.speed). Conservative advancement: from a gap g a
     point may go on by (g - g_kept) / speed, then looks again. ITERATIONS bounds the looks, and every share on the way
     is safe, so that the least of all points (and ranks) is safe for all.
     """

@@ -70,7 +70,7 @@ class Cylinder(Body):
         return corner.slope[:, :1] * away + corner.slope[:, 1:] * up
 
     def _curvature(self, x: Values) -> Values:
-        """The corner's Hessian in the half plane, and f_rho / rho around the axis (0 on it: there a face is nearest)."""
+        """The corner's Hessian in the half plane, and f_rho / rho around the axis (0 on it: an end is nearest)."""
         corner, rho, away, up = self._polar(x)
         plane = np.stack([away, up], axis=1)
         around = np.cross(away, up)

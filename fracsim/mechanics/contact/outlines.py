@@ -16,7 +16,7 @@ def profile(core_radius: float, half: float, rounding: float) -> Values:
     """(k, 2) half a meridian of a rectangle grown by the rounding: (distance from the axis, height), from below."""
     turn = np.linspace(0, np.pi / 2, ARC + 1)
     arc = rounding * np.column_stack([np.cos(turn), np.sin(turn)])
-    upper = arc + [core_radius, half]
+    upper = arc + np.array([core_radius, half])
     upper[-1, 0] = core_radius  # not cos(pi/2)
     lower = upper[::-1] * [1, -1]
     return np.concatenate([lower[:-1] if half == 0 else lower, upper])

@@ -15,11 +15,12 @@ last terms, those of the second-order turn, Newton would not be quadratic for a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from .pose import Pose, Values, turning
+from .pose import Pose, Values, turned, turning
 from .shape import Shape
 
 
@@ -63,11 +64,19 @@ class Placed:
         lower = np.concatenate([mixed.transpose(0, 2, 1), twice], axis=2)
         return np.concatenate([upper, lower], axis=1)
 
-    def speed(self, x: Values, moved: Values, q: Values) -> Values:
-        """(n,) a bound of how far gaps close, m, while points go straight by `moved` (n, d) and the pose by q.
+    def along(self, x: Values, moved: Values, q: Values) -> Callable[[Values], Values]:
+        """Distances (n,), m, after shares (n,) of a motion: points straight by `moved` (n, d), pose by share * q."""
+        d = self.pose.dim
+        y, relative, w = x - self.pose.centre, moved - q[:d], q[d:]
 
-        The pose goes by shares of q: the centre straight, the turn about one axis.
-        """
+        def gap(share: Values) -> Values:
+            seen = turned(y + share[:, None] * relative, -share[:, None] * w)
+            return self.shape.distance(seen @ self.pose.rotation)
+
+        return gap
+
+    def speed(self, x: Values, moved: Values, q: Values) -> Values:
+        """(n,) a bound of how fast gaps close in the motion `along`, m per whole motion."""
         d = self.pose.dim
         y, t, w = x - self.pose.centre, q[:d], q[d:]
         relative = moved - t

@@ -59,6 +59,14 @@ class Pose:
         return Pose(self.centre + t, np.array([[cos, -sin], [sin, cos]]))
 
 
+def turned(y: Values, w: Values) -> Values:
+    """(n, d) exp(w) y of vectors y (n, d), each turned by its own angle w (n, 1) or rotation vector w (n, 3), rad."""
+    if y.shape[1] == 3:
+        return np.asarray(Rotation.from_rotvec(w).apply(y)) if len(y) else y
+    cos, sin = np.cos(w[:, 0]), np.sin(w[:, 0])
+    return np.stack([cos * y[:, 0] - sin * y[:, 1], sin * y[:, 0] + cos * y[:, 1]], axis=1)
+
+
 def turning(y: Values) -> Values:
     """(n, d, p) G(y): a body that turns by w sees the fixed points y (n, d) move by G(y) w = -w x y; p = 1 or 3."""
     if y.shape[1] == 2:

@@ -80,7 +80,9 @@ class Body(ABC):
     def inertia(self, density: float) -> Values:
         """rho (tr S 1 - S), S = int x x^T dV (METHOD section 9: free rigid bodies); in 2D rho tr S."""
         if self.hollow:
-            raise InputError(f"a hollow {type(self).__name__.lower()} has walls without thickness, so no inertia: hold it")
+            raise InputError(
+                f"a hollow {type(self).__name__.lower()} has walls without thickness, so no inertia: hold it"
+            )
         S = self._moments()[1]
         return density * (np.trace(S) * np.eye(3) - S if self.dim == 3 else np.asarray(np.trace(S)))
 
