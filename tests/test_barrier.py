@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
 from fracsim.mechanics.contact.friction import Friction, tangential
+from fracsim.mechanics.contact.motion import Motion
 from fracsim.mechanics.contact.placed import Placed
 from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Sphere
-from support.shapes import Values, differences
+from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
+from support.laws import rotation
+from support.shapes import ALL, Values, differences, points
 
 EPS = np.finfo(float).eps
 BARRIER = Barrier(stiffness=2e6, width=1e-3)
@@ -86,54 +88,75 @@ def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
     target = rng.uniform(-0.5, 0.5, len(x))[:, None] * np.eye(dim)[-1]
     moved = 10 * (target - x)  # aimed at the wire, and far beyond
     q = rng.normal(size=3 if dim == 2 else 6) * rng.choice([0.0, 1.0])
-    placed = Placed(wire, pose)
-    gap = placed.along(x, moved, q)
-    share = longest_step(gap, placed.speed(x, moved, q))
+    motion = Motion(Placed(wire, pose), x, moved, q)
+    share = longest_step(motion.gap, motion.speed, len(x))
     assert ((share > 0) & (share <= 1)).all()
+    assert q.any() or (share < 1).all()  # the wire at rest is hit by all
     now = wire.distance(x)
     for part in np.linspace(0, 1, 300):
-        assert (gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
+        assert (motion.gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
+
+
+def still(shape: Shape, x: Values, moved: Values) -> Motion:
+    """Points that move past an obstacle at rest."""
+    return Motion(Placed(shape, Pose.at(np.zeros(shape.dim))), x, moved, np.zeros(3 if shape.dim == 2 else 6))
 
 
 def test_a_point_straight_at_a_plane_goes_nine_tenths() -> None:
     """Gap 1, way 4 down: 0.9 / 4. Away, along, or not at all: the whole."""
     plane, x = Plane((0.0, 1.0)), np.array([[0.0, 1.0]] * 4)
-    moved = np.array([[0.0, -4.0], [0.0, 5.0], [7.0, 0.0], [0.0, 0.0]])
-    share = longest_step(lambda s: plane.distance(x + s[:, None] * moved), np.linalg.norm(moved, axis=1))
-    np.testing.assert_allclose(share[[0, 1, 3]], [0.225, 1, 1], rtol=1e-12)
-    assert share[2] == 1
+    motion = still(plane, x, np.array([[0.0, -4.0], [0.0, 5.0], [7.0, 0.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(longest_step(motion.gap, motion.speed, 4), [0.225, 1, 1, 1], rtol=1e-12)
 
 
 def test_a_free_way_past_a_sphere_is_taken() -> None:
     """A near miss costs looks, not the step; a hit stops short, not far short: the gap is closed to 10 %, up to 1 %."""
     sphere = Sphere(1.0)
-    x = np.array([[-2.0, 1.3, 0.0], [-2.0, 0.9, 0.0]])
-    moved = np.array([[4.0, 0.0, 0.0]] * 2)
-    share = longest_step(lambda s: sphere.distance(x + s[:, None] * moved), np.linalg.norm(moved, axis=1))
-    gaps = sphere.distance(x + share[:, None] * moved)
-    assert share[0] == 1 and share[1] < 1
-    assert gaps[1] == pytest.approx(KEPT * sphere.distance(x)[1], rel=0.01)
+    x, moved = np.array([[-2.0, 1.3, 0.0], [-2.0, 0.9, 0.0]]), np.array([[4.0, 0.0, 0.0]] * 2)
+    motion = still(sphere, x, moved)
+    for speed in (motion.speed, lambda share: np.linalg.norm(moved, axis=1)):  # tangents; 1-Lipschitz alone
+        share = longest_step(motion.gap, speed, 2)
+        assert share[0] == 1 and share[1] < 1
+        assert motion.gap(share)[1] == pytest.approx(KEPT * sphere.distance(x)[1], rel=0.01)
 
 
-def test_sliding_close_along_a_wall_goes_on() -> None:
-    """What slides 1 mm above a floor by 10 mm looks often, and gets there or as far as ITERATIONS looks at 0.9 mm."""
+@pytest.mark.parametrize("gap", (1e-3, 1e-6, 1e-9))
+def test_what_slides_close_over_a_floor_goes_on(gap: float) -> None:
+    """10 mm along the floor, however close: only what comes nearer counts."""
     floor = Plane((0.0, 0.0, 1.0))
-    x, moved = np.array([[0.0, 0.0, 1e-3]]), np.array([[1e-2, 0.0, 0.0]])
-    assert longest_step(lambda s: floor.distance(x + s[:, None] * moved), np.array([1e-2]))[0] == 1
+    motion = still(floor, np.array([[0.0, 0.0, gap]]), np.array([[1e-2, 0.0, 0.0]]))
+    assert longest_step(motion.gap, motion.speed, 1)[0] == 1
+
+
+@pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
+@given(seed=st.integers(0, 10**6))
+def test_no_gap_closes_faster_than_its_bound(shape: Shape, seed: int) -> None:
+    """d(s') >= d(s) - speed(s) (s' - s) for s' > s while points and obstacle move, the latter turning a lot or not."""
+    rng, d = np.random.default_rng(seed), shape.dim
+    pose = Pose(rng.uniform(-1, 1, d), rotation(d, seed))
+    q = rng.normal(size=3 if d == 2 else 6)
+    q[d:] *= seed % 2
+    x, moved = points(shape, 30, seed), rng.normal(size=(30, d))
+    motion, shares = Motion(Placed(shape, pose), x, moved, q), np.linspace(0, 1, 11)
+    gaps = np.array([Placed(shape, pose.moved(s * q)).distance(x + s * moved) for s in shares])
+    np.testing.assert_allclose([motion.gap(np.full(30, s)) for s in shares], gaps, atol=1e-13)
+    for at, s in enumerate(shares):
+        least = gaps[at] - motion.speed(np.full(30, s)) * (shares[at:, None] - s)
+        assert (gaps[at:] >= least - 1e-12).all()
 
 
 def test_closed_gaps_have_no_safe_share() -> None:
     with pytest.raises(ValueError, match="1 gaps are closed before the motion"):
-        longest_step(lambda s: np.array([1.0, 0.0]), np.ones(2))
-    assert longest_step(lambda s: s, np.empty(0)).shape == (0,)
+        longest_step(lambda s: np.array([1.0, 0.0]), np.ones_like, 2)
+    assert longest_step(lambda s: s, np.ones_like, 0).shape == (0,)
 
 
 def test_a_container_keeps_what_is_in_it() -> None:
     """Points flung in a closed box stay in it."""
     room, rng = Box((1.0, 1.0, 1.0), hollow=True), np.random.default_rng(0)
-    x, moved = rng.uniform(-0.45, 0.45, (200, 3)), rng.normal(size=(200, 3)) * 5
-    share = longest_step(lambda s: room.distance(x + s[:, None] * moved), np.linalg.norm(moved, axis=1))
-    assert (room.distance(x + share[:, None] * moved) >= KEPT * room.distance(x) * (1 - 1e-9)).all()
+    motion = still(room, rng.uniform(-0.45, 0.45, (200, 3)), rng.normal(size=(200, 3)) * 5)
+    share = longest_step(motion.gap, motion.speed, 200)
+    assert (motion.gap(share) >= KEPT * room.distance(motion.x) * (1 - 1e-9)).all()
 
 
 FRICTION = Friction(coefficient=0.4, sticking=1e-3)

@@ -113,18 +113,3 @@ def test_the_sign_of_the_moment() -> None:
     """
     placed = Placed(ALL["rectangle"], Pose.at(np.array([5.0, 2.0])))
     np.testing.assert_allclose(placed.by_pose(np.array([[5.3, 3.0]])), [[0, -1, -0.3]], atol=10 * EPS)
-
-
-@all_shapes
-@given(seed=st.integers(0, 10**6))
-def test_no_gap_closes_faster_than_its_bound(shape: Shape, seed: int) -> None:
-    """|d(share) - d(share')| <= speed |share - share'| while points and obstacle move, the latter turning a lot."""
-    rng, d = np.random.default_rng(seed), shape.dim
-    pose = somewhere(d, seed)
-    x, moved = points(shape, 30, seed), rng.normal(size=(30, d))
-    q = rng.normal(size=3 if d == 2 else 6)
-    placed, shares = Placed(shape, pose), np.linspace(0, 1, 21)
-    bound, along = placed.speed(x, moved, q), placed.along(x, moved, q)
-    gaps = np.array([Placed(shape, pose.moved(s * q)).distance(x + s * moved) for s in shares])
-    np.testing.assert_allclose([along(np.full(30, s)) for s in shares], gaps, atol=1e-13)
-    assert (np.abs(np.diff(gaps, axis=0)) <= bound / 20 * (1 + 1e-9) + 20 * EPS).all()

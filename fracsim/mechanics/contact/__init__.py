@@ -8,6 +8,7 @@ corner            distance to a quadrant or octant: what boxes and cylinders sha
 moments           volume and second moments of rounded bodies, by slices
 outlines, axes    triangles and segments to draw a shape with; frames about an axis
 pose, placed      where a rigid obstacle is, and derivatives of the distance to it with respect to its pose
+motion            points and obstacle on their way: gaps, and bounds of how fast they close
 barrier           energy that keeps gaps open (IPC), and how far points may move without passing through
 friction          Coulomb friction as a lagged, smoothed potential (IPC)
 

@@ -58,16 +58,15 @@ class Barrier:
         return np.where(g > 0, inside, closed) + 0.0  # no -0.0
 
 
-def longest_step(gap: Callable[[Values], Values], speed: Values) -> Values:
-    """(n,) shares in (0, 1] of a motion that leave every gap at least KEPT of what it is now, all along the way.
+def longest_step(gap: Callable[[Values], Values], speed: Callable[[Values], Values], count: int) -> Values:
+    """(count,) shares in (0, 1] of a motion that leave every gap at least KEPT of what it is now, all along the way.
 
-    `gap`: shares (n,) of the motion -> distances (n,) of the points there, obstacles having moved by the same shares
-    (Placed.along); `speed` (n,): bounds of the distance's rate, m per whole motion. As the distance is 1-Lipschitz, the
-    way a point goes as seen from the obstacle is one (Placed.speed). Conservative advancement: from a gap g a
-    point may go on by (g - g_kept) / speed, then looks again. ITERATIONS bounds the looks, and every share on the way
-    is safe, so that the least of all points (and ranks) is safe for all.
+    `gap`: shares (n,) of the motion -> distances (n,) of the points there, obstacles having moved by the same shares;
+    `speed`: shares -> bounds (n,) of how fast the gaps close from there to the end, m per whole motion (see Motion).
+    Conservative advancement: from a gap g a point may go on by (g - g_kept) / speed, then looks again. ITERATIONS
+    bounds the looks, and every share on the way is safe, so that the least of all points (and ranks) is safe for all.
     """
-    share = np.zeros(len(speed))
+    share = np.zeros(count)
     now = gap(share)
     if not (now > 0).all():
         raise ValueError(f"{int((~(now > 0)).sum())} gaps are closed before the motion: no share of it is safe")
@@ -75,7 +74,7 @@ def longest_step(gap: Callable[[Values], Values], speed: Values) -> Values:
     for _ in range(ITERATIONS):
         # round-off may put a gap just below what is kept: no step back
         room = np.maximum(now - kept, 0)
-        ahead = room / np.maximum(np.maximum(speed, room), np.finfo(float).tiny)
+        ahead = room / np.maximum(np.maximum(speed(share), room), np.finfo(float).tiny)
         share = np.minimum(share + ahead, 1.0)
         if ((share == 1) | (ahead < 1e-3 * share)).all():
             break

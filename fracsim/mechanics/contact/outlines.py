@@ -64,10 +64,10 @@ def _faces_of_cube(count: int) -> Ints:
         low, high = lattice.take(0, axis), lattice.take(-1, axis)
         # the two other axes, in ascending order, are right-handed about axes 0 and 2
         faces += [low, high.T] if axis == 1 else [low.T, high]
-    return np.concatenate([_triangles(face.T) for face in faces])
+    return np.concatenate([_triangles(np.asarray(face.T)) for face in faces])
 
 
-def _triangles(grid: npt.NDArray[np.int64]) -> Ints:
+def _triangles(grid: npt.NDArray[np.integer]) -> Ints:
     """Two triangles a cell of a grid of point numbers, columns x rows right-handed; none where points coincide."""
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     triangles = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)]).reshape(-1, 3)

@@ -15,12 +15,11 @@ last terms, those of the second-order turn, Newton would not be quadratic for a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from .pose import Pose, Values, turned, turning
+from .pose import Pose, Values, turning
 from .shape import Shape
 
 
@@ -63,26 +62,6 @@ class Placed:
         upper = np.concatenate([H, mixed], axis=2)
         lower = np.concatenate([mixed.transpose(0, 2, 1), twice], axis=2)
         return np.concatenate([upper, lower], axis=1)
-
-    def along(self, x: Values, moved: Values, q: Values) -> Callable[[Values], Values]:
-        """Distances (n,), m, after shares (n,) of a motion: points straight by `moved` (n, d), pose by share * q."""
-        d = self.pose.dim
-        y, relative, w = x - self.pose.centre, moved - q[:d], q[d:]
-
-        def gap(share: Values) -> Values:
-            seen = turned(y + share[:, None] * relative, -share[:, None] * w)
-            return self.shape.distance(seen @ self.pose.rotation)
-
-        return gap
-
-    def speed(self, x: Values, moved: Values, q: Values) -> Values:
-        """(n,) a bound of how fast gaps close in the motion `along`, m per whole motion."""
-        d = self.pose.dim
-        y, t, w = x - self.pose.centre, q[:d], q[d:]
-        relative = moved - t
-        # from the moving centre the point is never further away than at one of the ends of its path
-        reach = np.maximum(np.linalg.norm(y, axis=1), np.linalg.norm(y + relative, axis=1))
-        return np.asarray(np.linalg.norm(relative, axis=1) + np.linalg.norm(w) * reach)
 
 
 def _second_order_turn(n: Values, y: Values) -> Values:

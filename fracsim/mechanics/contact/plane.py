@@ -30,6 +30,11 @@ class Plane:
         return len(self.direction)
 
     @property
+    def convex(self) -> bool:
+        """A half space is."""
+        return True
+
+    @property
     def volume(self) -> float:
         """Infinite."""
         return float("inf")

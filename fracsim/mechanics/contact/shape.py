@@ -25,6 +25,10 @@ class Shape(Protocol):
         """d."""
 
     @property
+    def convex(self) -> bool:
+        """Whether the obstacle is convex, and so the distance a convex function."""
+
+    @property
     def volume(self) -> float:
         """m^3, in 2D m^2; of a hollow body the room inside."""
 
@@ -54,6 +58,11 @@ class Body(ABC):
     @abstractmethod
     def dim(self) -> int:
         """2 or 3."""
+
+    @property
+    def convex(self) -> bool:
+        """Unless it is hollow."""
+        return not self.hollow
 
     def distance(self, x: Values) -> Values:
         """(n,) signed distance of points x (n, d), m."""
