@@ -4,6 +4,7 @@ term                what a term is, and what it is told at the begin of a step
 balance             the sum: residual, tangent, reactions
 stress              the stress of a body as damage and flow leave it: a term
 inertia, damping    M a and its mass matrix; drag and viscosity: terms
+contact             analytic obstacles, the gaps to them, barrier and friction
 loads               dead loads and following pressure: terms
 prescribed_motion   dofs whose displacement is a function of time
 supports            whether a quasi-static study holds every body

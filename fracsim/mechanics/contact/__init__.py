@@ -1,0 +1,19 @@
+"""Contact with analytic obstacles, which need no mesh: a signed distance says how far a point is outside.
+
+shapes            the register of shapes, by the name that a user writes
+shape             what a shape is: distance, normal, curvature, outline, inertia
+plane, ball       half space; sphere and capsule (in 2D disk and stadium)
+box, cylinder     with rounded edges, so that the distance is C1 outside
+corner            distance to a quadrant or octant: what boxes and cylinders share
+moments           volume and second moments of rounded bodies, by slices
+outlines, axes    triangles and segments to draw a shape with; frames about an axis
+pose, placed      where a rigid obstacle is, and derivatives of the distance to it with respect to its pose
+motion            points and obstacle on their way: gaps, and bounds of how fast they close
+barrier           energy that keeps gaps open (IPC), and how far points may move without passing through
+friction          Coulomb friction as a lagged, smoothed potential (IPC)
+
+NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
+
+IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
+distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.
+"""

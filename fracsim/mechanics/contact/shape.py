@@ -1,0 +1,132 @@
+"""What a shape is, and what filled and hollow bodies have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import InputError
+from .outlines import Outline
+
+Values = npt.NDArray[np.float64]
+
+FILLET = 0.05  # default radius of rounded edges, as a share of the smallest radius or half size
+
+
+class Shape(Protocol):
+    """A shape in its own frame, centred at its reference point; d = 2 or 3, lengths in m."""
+
+    @property
+    def dim(self) -> int:
+        """d."""
+
+    @property
+    def convex(self) -> bool:
+        """Whether the obstacle is convex, and so the distance a convex function."""
+
+    @property
+    def volume(self) -> float:
+        """m^3, in 2D m^2; of a hollow body the room inside."""
+
+    def distance(self, x: Values) -> Values:
+        """(n,) signed distance of points x (n, d), m: positive outside the obstacle."""
+
+    def normal(self, x: Values) -> Values:
+        """(n, d) gradient of the distance, of length 1: it points out of the obstacle."""
+
+    def curvature(self, x: Values) -> Values:
+        """(n, d, d) Hessian of the distance, 1/m."""
+
+    def outline(self) -> Outline:
+        """Points (n, d) and triangles (k, 3), in 2D segments (k, 2), that face where `normal` points."""
+
+    def inertia(self, density: float) -> Values:
+        """(3, 3) about the centre, kg m^2 for kg/m^3; in 2D () the polar moment for a mass per area."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body(ABC):
+    """A convex body; `hollow`: the obstacle is all that is outside it, as for what lies in a bowl or a container."""
+
+    hollow: bool = False
+
+    @property
+    @abstractmethod
+    def dim(self) -> int:
+        """2 or 3."""
+
+    @property
+    def convex(self) -> bool:
+        """Unless it is hollow."""
+        return not self.hollow
+
+    def distance(self, x: Values) -> Values:
+        """(n,) signed distance of points x (n, d), m."""
+        return self._sign * self._distance(x)
+
+    def normal(self, x: Values) -> Values:
+        """(n, d) gradient of the distance."""
+        return self._sign * self._normal(x)
+
+    def curvature(self, x: Values) -> Values:
+        """(n, d, d) Hessian of the distance, 1/m."""
+        return self._sign * self._curvature(x)
+
+    def outline(self) -> Outline:
+        """Closed surface or polygon; that of a hollow body faces inwards."""
+        points, elements = self._outline()
+        return points, np.ascontiguousarray(elements[:, ::-1]) if self.hollow else elements
+
+    @property
+    def volume(self) -> float:
+        """m^3, in 2D m^2, of what is enclosed."""
+        return self._moments()[0]
+
+    def inertia(self, density: float) -> Values:
+        """rho (tr S 1 - S), S = int x x^T dV (METHOD section 9: free rigid bodies); in 2D rho tr S."""
+        if self.hollow:
+            raise InputError(
+                f"a hollow {type(self).__name__.lower()} has walls without thickness, so no inertia: hold it"
+            )
+        S = self._moments()[1]
+        return density * (np.trace(S) * np.eye(3) - S if self.dim == 3 else np.asarray(np.trace(S)))
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.hollow else 1.0
+
+    @abstractmethod
+    def _distance(self, x: Values) -> Values: ...
+
+    @abstractmethod
+    def _normal(self, x: Values) -> Values: ...
+
+    @abstractmethod
+    def _curvature(self, x: Values) -> Values: ...
+
+    @abstractmethod
+    def _outline(self) -> Outline: ...
+
+    @abstractmethod
+    def _moments(self) -> tuple[float, Values]:
+        """Volume and second moments S (d, d) of the filled body."""
+
+
+def require_lengths(shape: Shape, **lengths: float) -> None:
+    """InputError unless every length is positive and finite."""
+    for word, value in lengths.items():
+        if not 0 < value < np.inf:
+            name = type(shape).__name__.lower()
+            raise InputError(f"the {word} of a {name} is {value}: it must be a positive number of metres")
+
+
+def require_fillet(shape: Shape, rounding: float, most: float) -> None:
+    """InputError unless edges have a rounding that fits; a sharp edge has no curvature that Newton could use."""
+    require_lengths(shape, rounding=rounding)
+    if rounding > most:
+        name = type(shape).__name__.lower()
+        raise InputError(f"the rounding of a {name} is {rounding} m, but at most {most} m fit into it: round it less")

@@ -1,0 +1,216 @@
+"""Barrier, longest step and friction of contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fracsim.errors import InputError
+from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
+from fracsim.mechanics.contact.friction import Friction, tangential
+from fracsim.mechanics.contact.motion import Motion
+from fracsim.mechanics.contact.placed import Placed
+from fracsim.mechanics.contact.pose import Pose
+from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
+from support.laws import rotation
+from support.shapes import ALL, Values, differences, points
+
+EPS = np.finfo(float).eps
+BARRIER = Barrier(stiffness=2e6, width=1e-3)
+
+
+def test_barrier_by_hand() -> None:
+    """b(d / 2) = kappa d ln 2 / 4, b' = -kappa (ln 2 + 1 / 2), b'' = kappa / d (2 ln 2 + 5)."""
+    g = np.array([0.5e-3])
+    assert BARRIER.energy(g)[0] == pytest.approx(2e6 * 1e-3 * np.log(2) / 4)
+    assert BARRIER.slope(g)[0] == pytest.approx(-2e6 * (np.log(2) + 0.5))
+    assert BARRIER.curvature(g)[0] == pytest.approx(2e6 / 1e-3 * (2 * np.log(2) + 5))
+
+
+@given(share=st.floats(1e-6, 1.5).filter(lambda share: abs(share - 1) > 2e-4))
+def test_slope_and_curvature_are_derivatives(share: float) -> None:
+    """By central differences with a step that suits the gap; not across g = d, where the third derivative jumps."""
+    g, h = np.array([[share * BARRIER.width]]), 1e-4 * share * BARRIER.width
+    scale = BARRIER.stiffness * max(1.0, 1 / share)
+    by = [differences(lambda x, f=f: f(x[:, 0]), g, h)[0, 0] for f in (BARRIER.energy, BARRIER.slope)]
+    assert BARRIER.slope(g[0])[0] == pytest.approx(by[0], rel=1e-6, abs=1e-6 * scale)
+    assert BARRIER.curvature(g[0])[0] == pytest.approx(by[1], rel=1e-6, abs=1e-6 * scale / share / BARRIER.width)
+
+
+def test_barrier_is_c2_where_it_begins() -> None:
+    """At d (1 - e): b = kappa d e^3, b' = -3 kappa e^2, b'' = 6 kappa e / d to leading order; zero from d on."""
+    e = 10.0 ** -np.arange(2, 9)
+    g = BARRIER.width * (1 - e)
+    got = [BARRIER.energy(g), BARRIER.slope(g), BARRIER.curvature(g)]
+    kappa, d = BARRIER.stiffness, BARRIER.width
+    for value, expected in zip(got, [kappa * d * e**3, -3 * kappa * e**2, 6 * kappa / d * e], strict=True):
+        # e itself carries the round-off of g / d
+        np.testing.assert_allclose(value / expected, 1, atol=0.05)
+        np.testing.assert_allclose((value / expected)[2:5], 1, atol=2e-3)
+    for each in (BARRIER.energy, BARRIER.slope, BARRIER.curvature):
+        np.testing.assert_array_equal(each(np.array([d, 2 * d, np.inf])), 0)
+
+
+def test_closed_gaps_are_infinitely_dear() -> None:
+    g = np.array([0.0, -1e-3, -np.inf])
+    np.testing.assert_array_equal(BARRIER.energy(g), np.inf)
+    np.testing.assert_array_equal(BARRIER.slope(g), -np.inf)
+    np.testing.assert_array_equal(BARRIER.curvature(g), np.inf)
+    assert BARRIER.energy(np.empty(0)).shape == (0,)
+
+
+@given(shares=st.lists(st.floats(1e-9, 2), min_size=2, max_size=20))
+def test_barrier_pushes_the_more_the_smaller_the_gap(shares: list[float]) -> None:
+    """Energy falls, pressure falls, and it is convex."""
+    g = np.sort(shares) * BARRIER.width
+    assert (np.diff(BARRIER.energy(g)) <= 0).all() and (np.diff(BARRIER.slope(g)) >= 0).all()
+    assert (BARRIER.slope(g) <= 0).all() and (BARRIER.curvature(g) >= 0).all()
+
+
+@pytest.mark.parametrize("wrong", (lambda: Barrier(0.0, 1.0), lambda: Barrier(1.0, np.nan), lambda: Friction(-1, 1),
+                                   lambda: Friction(0.3, 0.0)))  # fmt: skip
+def test_bad_numbers_are_said(wrong: object) -> None:
+    assert callable(wrong)
+    with pytest.raises(InputError, match="must be"):
+        wrong()
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@given(seed=st.integers(0, 10**6))
+def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
+    """Fast points through a wire of 1 mm that moves and turns: along all of the share every gap keeps its tenth."""
+    rng = np.random.default_rng(seed)
+    wire, pose = Capsule(5e-4, 1.0, axis=(0.0, 0.0, 1.0)[-dim:]), Pose.at(np.zeros(dim))
+    x = rng.uniform(-1, 1, (20, dim))
+    x = x[wire.distance(x) > 1e-3]
+    target = rng.uniform(-0.5, 0.5, len(x))[:, None] * np.eye(dim)[-1]
+    moved = 10 * (target - x)  # aimed at the wire, and far beyond
+    q = rng.normal(size=3 if dim == 2 else 6) * rng.choice([0.0, 1.0])
+    motion = Motion(Placed(wire, pose), x, moved, q)
+    share = longest_step(motion.gap, motion.speed, len(x))
+    assert ((share > 0) & (share <= 1)).all()
+    assert q.any() or (share < 1).all()  # the wire at rest is hit by all
+    now = wire.distance(x)
+    for part in np.linspace(0, 1, 300):
+        assert (motion.gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
+
+
+def still(shape: Shape, x: Values, moved: Values) -> Motion:
+    """Points that move past an obstacle at rest."""
+    return Motion(Placed(shape, Pose.at(np.zeros(shape.dim))), x, moved, np.zeros(3 if shape.dim == 2 else 6))
+
+
+def test_a_point_straight_at_a_plane_goes_nine_tenths() -> None:
+    """Gap 1, way 4 down: 0.9 / 4. Away, along, or not at all: the whole."""
+    plane, x = Plane((0.0, 1.0)), np.array([[0.0, 1.0]] * 4)
+    motion = still(plane, x, np.array([[0.0, -4.0], [0.0, 5.0], [7.0, 0.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(longest_step(motion.gap, motion.speed, 4), [0.225, 1, 1, 1], rtol=1e-12)
+
+
+def test_a_free_way_past_a_sphere_is_taken() -> None:
+    """A near miss costs looks, not the step; a hit stops short, not far short: the gap is closed to 10 %, up to 1 %."""
+    sphere = Sphere(1.0)
+    x, moved = np.array([[-2.0, 1.3, 0.0], [-2.0, 0.9, 0.0]]), np.array([[4.0, 0.0, 0.0]] * 2)
+    motion = still(sphere, x, moved)
+    for speed in (motion.speed, lambda share: np.linalg.norm(moved, axis=1)):  # tangents; 1-Lipschitz alone
+        share = longest_step(motion.gap, speed, 2)
+        assert share[0] == 1 and share[1] < 1
+        assert motion.gap(share)[1] == pytest.approx(KEPT * sphere.distance(x)[1], rel=0.01)
+
+
+@pytest.mark.parametrize("gap", (1e-3, 1e-6, 1e-9))
+def test_what_slides_close_over_a_floor_goes_on(gap: float) -> None:
+    """10 mm along the floor, however close: only what comes nearer counts."""
+    floor = Plane((0.0, 0.0, 1.0))
+    motion = still(floor, np.array([[0.0, 0.0, gap]]), np.array([[1e-2, 0.0, 0.0]]))
+    assert longest_step(motion.gap, motion.speed, 1)[0] == 1
+
+
+@pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
+@given(seed=st.integers(0, 10**6))
+def test_no_gap_closes_faster_than_its_bound(shape: Shape, seed: int) -> None:
+    """d(s') >= d(s) - speed(s) (s' - s) for s' > s while points and obstacle move, the latter turning a lot or not."""
+    rng, d = np.random.default_rng(seed), shape.dim
+    pose = Pose(rng.uniform(-1, 1, d), rotation(d, seed))
+    q = rng.normal(size=3 if d == 2 else 6)
+    q[d:] *= seed % 2
+    x, moved = points(shape, 30, seed), rng.normal(size=(30, d))
+    motion, shares = Motion(Placed(shape, pose), x, moved, q), np.linspace(0, 1, 11)
+    gaps = np.array([Placed(shape, pose.moved(s * q)).distance(x + s * moved) for s in shares])
+    np.testing.assert_allclose([motion.gap(np.full(30, s)) for s in shares], gaps, atol=1e-13)
+    for at, s in enumerate(shares):
+        least = gaps[at] - motion.speed(np.full(30, s)) * (shares[at:, None] - s)
+        assert (gaps[at:] >= least - 1e-12).all()
+
+
+def test_closed_gaps_have_no_safe_share() -> None:
+    with pytest.raises(ValueError, match="1 gaps are closed before the motion"):
+        longest_step(lambda s: np.array([1.0, 0.0]), np.ones_like, 2)
+    assert longest_step(lambda s: s, np.ones_like, 0).shape == (0,)
+
+
+def test_a_container_keeps_what_is_in_it() -> None:
+    """Points flung in a closed box stay in it."""
+    room, rng = Box((1.0, 1.0, 1.0), hollow=True), np.random.default_rng(0)
+    motion = still(room, rng.uniform(-0.45, 0.45, (200, 3)), rng.normal(size=(200, 3)) * 5)
+    share = longest_step(motion.gap, motion.speed, 200)
+    assert (motion.gap(share) >= KEPT * room.distance(motion.x) * (1 - 1e-9)).all()
+
+
+FRICTION = Friction(coefficient=0.4, sticking=1e-3)
+
+
+def sliding(dim: int, seed: int, count: int = 20) -> tuple[Values, Values, Values]:
+    """Normal forces, normals and motions from deep in sticking to far in sliding."""
+    rng = np.random.default_rng(seed)
+    n = rng.normal(size=(count, dim))
+    moved = rng.normal(size=(count, dim)) * 10 ** rng.uniform(-6, -1, (count, 1))
+    return rng.uniform(0, 50, count), n / np.linalg.norm(n, axis=1, keepdims=True), moved
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@given(seed=st.integers(0, 10**6))
+def test_friction_force_and_stiffness_are_derivatives(dim: int, seed: int) -> None:
+    """Central differences with a step of 1e-7 m, a thousandth of a thousandth of the slip that sticks."""
+    force, n, moved = sliding(dim, seed)
+    gradient = differences(lambda x: FRICTION.energy(force, n, x), moved, 1e-7)
+    np.testing.assert_allclose(FRICTION.gradient(force, n, moved), gradient, atol=1e-5 * 50)
+    hessian = differences(lambda x: FRICTION.gradient(force, n, x), moved, 1e-7)
+    stiffest = 0.4 * 50 * 2 / FRICTION.sticking
+    np.testing.assert_allclose(FRICTION.hessian(force, n, moved), hessian, atol=1e-3 * stiffest)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@given(seed=st.integers(0, 10**6))
+def test_coulomb(dim: int, seed: int) -> None:
+    """|f| <= mu lambda, with equality once it slides; along the slip and across the normal; stiffness >= 0."""
+    force, n, moved = sliding(dim, seed)
+    s, f = tangential(n, moved), FRICTION.gradient(force, n, moved)
+    size, slip = np.linalg.norm(f, axis=1), np.linalg.norm(s, axis=1)
+    assert (size <= 0.4 * force * (1 + 10 * EPS)).all()
+    slides = slip >= FRICTION.sticking
+    np.testing.assert_allclose(size[slides], 0.4 * force[slides], rtol=20 * EPS)
+    np.testing.assert_allclose(np.einsum("ni,ni->n", f, n), 0, atol=1e-13 * 50)
+    np.testing.assert_allclose(np.einsum("ni,ni->n", f, s), size * slip, rtol=1e-9, atol=1e-20)
+    H = FRICTION.hessian(force, n, moved)
+    assert (np.linalg.eigvalsh(H).min(axis=1) >= -1e-12 * np.abs(H).max()).all()
+
+
+@given(slips=st.lists(st.floats(0, 1e-2), min_size=2, max_size=20))
+def test_friction_costs_the_more_the_further_it_slips(slips: list[float]) -> None:
+    """mu lambda h / 3 without slip, growing, mu lambda |s| once it slides; the same for a slip the other way."""
+    y = np.sort(slips)
+    n, moved = np.tile([0.0, 1.0], (len(y), 1)), np.stack([y, y], axis=1)
+    energy = FRICTION.energy(np.full(len(y), 5.0), n, moved)
+    assert (np.diff(energy) >= -1e-18).all() and (energy >= 2.0 * 1e-3 / 3).all()
+    np.testing.assert_allclose(energy[y >= 1e-3], 2.0 * y[y >= 1e-3], rtol=1e-12)
+    np.testing.assert_array_equal(energy, FRICTION.energy(np.full(len(y), 5.0), n, -moved))
+
+
+def test_no_slip_no_force() -> None:
+    """At rest the force is 0 and the stiffness 2 mu lambda / h across the normal."""
+    n, rest = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3))
+    np.testing.assert_array_equal(FRICTION.gradient(np.ones(1), n, rest), 0)
+    np.testing.assert_allclose(FRICTION.hessian(np.ones(1), n, rest)[0], np.diag([800.0, 800.0, 0.0]))

@@ -1,0 +1,115 @@
+"""Rigid poses, and the distance to a shape at a pose with its derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from fracsim.mechanics.contact.placed import Placed
+from fracsim.mechanics.contact.pose import Pose, turning
+from fracsim.mechanics.contact.shapes import Shape
+from support.laws import rotation
+from support.shapes import ALL, Values, differences, points
+
+EPS = np.finfo(float).eps
+all_shapes = pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
+both = pytest.mark.parametrize("dim", (2, 3))
+
+
+def somewhere(dim: int, seed: int = 0) -> Pose:
+    """A random pose."""
+    return Pose(np.random.default_rng(seed).uniform(-1, 1, dim), rotation(dim, seed))
+
+
+def generator(w: Values) -> Values:
+    """The skew matrix W with W y = w x y, in 2D the angle times a quarter turn."""
+    if len(w) == 1:
+        return np.array([[0, -w[0]], [w[0], 0]])
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+@both
+@given(seed=st.integers(0, 10**6))
+def test_increments_are_exponentials(dim: int, seed: int) -> None:
+    """c + t and exp(W) R against SciPy's matrix exponential; the rotation stays one."""
+    pose = somewhere(dim, seed)
+    q = np.random.default_rng(seed).uniform(-2, 2, 3 if dim == 2 else 6)
+    moved = pose.moved(q)
+    np.testing.assert_allclose(moved.centre, pose.centre + q[:dim], atol=10 * EPS)
+    np.testing.assert_allclose(moved.rotation, expm(generator(q[dim:])) @ pose.rotation, atol=200 * EPS)
+
+
+@both
+def test_many_turns_leave_a_rotation(dim: int) -> None:
+    """A thousand increments: R^T R = I to round-off of one, and in 2D (or about one axis) angles add up."""
+    pose, q = Pose.at(np.zeros(dim)), np.zeros(3 if dim == 2 else 6)
+    q[-1] = 0.01
+    for _ in range(1000):
+        pose = pose.moved(q)
+    np.testing.assert_allclose(pose.rotation.T @ pose.rotation, np.eye(dim), atol=10 * EPS)
+    np.testing.assert_allclose(pose.rotation[:2, :2], expm(generator(np.array([10.0]))), atol=1e-11)
+
+
+@both
+def test_to_the_body_and_back(dim: int) -> None:
+    """Points, vectors and tensors: x = c + R X, v = R V, A = R B R^T."""
+    pose, rng = somewhere(dim), np.random.default_rng(1)
+    x, B = rng.normal(size=(20, dim)), rng.normal(size=(20, dim, dim))
+    np.testing.assert_allclose(pose.points_to_space(pose.to_body(x)), x, atol=20 * EPS)
+    np.testing.assert_allclose(pose.vectors_to_space(pose.to_body(x)), x - pose.centre, atol=20 * EPS)
+    A = pose.tensors_to_space(B)
+    np.testing.assert_allclose(A[3], pose.rotation @ B[3] @ pose.rotation.T, atol=20 * EPS)
+
+
+@both
+def test_fixed_points_turn_the_other_way(dim: int) -> None:
+    """G(y) w = -w x y."""
+    y, w = np.random.default_rng(2).normal(size=(5, dim)), np.array([0.3, -0.5, 0.7][: 1 if dim == 2 else 3])
+    np.testing.assert_allclose(turning(y) @ w, -y @ generator(w).T, atol=10 * EPS)
+
+
+def smooth(shape: Shape, x: Values) -> Values:
+    """Points without a kink of the distance, or a jump of its Hessian, within 1e-3 of them."""
+    bent = differences(shape.normal, x, 1e-3)
+    return np.asarray(x[np.abs(bent - shape.curvature(x)).max(axis=(1, 2)) < 1e-2])
+
+
+@all_shapes
+def test_derivatives_by_the_pose(shape: Shape) -> None:
+    """First and second derivatives of D(exp(-w) (x - c - t)) by central differences of increments of the pose."""
+    pose = somewhere(shape.dim, 5)
+    x = pose.points_to_space(smooth(shape, points(shape, 60, seed=4)))
+    placed, p = Placed(shape, pose), 3 if shape.dim == 2 else 6
+    assert len(x) > 20
+
+    def after(q: Values) -> Placed:
+        return Placed(shape, pose.moved(q))
+
+    h, steps = 1e-6, np.eye(p)
+    by_pose = np.stack([(after(h * e).distance(x) - after(-h * e).distance(x)) / (2 * h) for e in steps], axis=-1)
+    np.testing.assert_allclose(placed.by_pose(x), by_pose, atol=1e-8)
+    mixed = np.stack([(after(h * e).normal(x) - after(-h * e).normal(x)) / (2 * h) for e in steps], axis=-1)
+    np.testing.assert_allclose(placed.by_point_and_pose(x), mixed, atol=1e-6)
+    np.testing.assert_allclose(placed.normal(x), differences(placed.distance, x), atol=1e-8)
+    np.testing.assert_allclose(placed.curvature(x), differences(placed.normal, x), atol=1e-6)
+
+    H, h = placed.by_pose_twice(x), 1e-4  # second differences: round-off 1e-16 / h^2, truncation h^2
+    np.testing.assert_allclose(H, H.transpose(0, 2, 1), atol=1e-13)
+    for i in range(p):
+        for j in range(p):
+            a, b = h * steps[i], h * steps[j]
+            corners = [after(q).distance(x) for q in (a + b, a - b, b - a, -a - b)]
+            second = (corners[0] - corners[1] - corners[2] + corners[3]) / (4 * h**2)
+            np.testing.assert_allclose(H[:, i, j], second, atol=2e-6 * max(1, np.abs(H).max()))
+
+
+def test_the_sign_of_the_moment() -> None:
+    """By hand: a box turned by dw about z under a point beside its middle: the side at x > 0 rises, gaps shrink.
+
+    dd/dw = -((x - c) x n)_z = -(0.3 * 1) with x - c = (0.3, 1) and n = (0, 1).
+    """
+    placed = Placed(ALL["rectangle"], Pose.at(np.array([5.0, 2.0])))
+    np.testing.assert_allclose(placed.by_pose(np.array([[5.3, 3.0]])), [[0, -1, -0.3]], atol=10 * EPS)
