@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
@@ -38,9 +39,15 @@ FIRST = (
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of a file stay together, for they share what its fixtures made (`--dist loadgroup`)."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tests of a file stay together, for they share what its fixtures made (`--dist loadgroup`); repeats are slow."""
+    names = [item.nodeid.removeprefix("tests/") for item in items]
+    lost = [each for each in REPEATS if not any(name.startswith(each) for name in names)]
+    if lost and config.args == config.getini("testpaths"):  # of everything: its name has changed
+        raise pytest.UsageError(f"tests/repeats.py names what is no case: {', '.join(lost)}")
     for item in items:
+        if item.nodeid.removeprefix("tests/").startswith(REPEATS):
+            item.add_marker("slow")
         if item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 

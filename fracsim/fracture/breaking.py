@@ -80,6 +80,11 @@ class Breaking:
         self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
         self._memory: Damage | None = None
 
+    @property
+    def pattern(self) -> npt.NDArray[np.uint8]:
+        """(cells,) broken edges of each cell."""
+        return self.graph.pattern
+
     def evaluate(self) -> tuple[Values, Values]:
         """Cauchy stress (cells, 3 or 6) in Pa and energy density (cells,) in J/m^3 of the undamaged material."""
         values = self._evaluate()

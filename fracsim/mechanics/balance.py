@@ -234,6 +234,22 @@ class Balance:
         share = min(term.longest_step(change) for term in self.terms)
         return float(self.domain.comm.allreduce(share, op=MPI.MIN))
 
+    def reachable(self, u: Values) -> Values:
+        """(owned dofs,) a first guess of u that Newton's method may start from (collective)."""
+        for term in self.terms:
+            u = term.reachable(u)
+        return u
+
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+        """Edges have broken: patterns (cells,) of those of each cell (collective)."""
+        for term in self.terms:
+            term.edges_broke(pattern)
+
+    def driven(self) -> tuple[float, float]:
+        """Work from outside that no nodal force shows, and what of it is lost, this rank's share, J (collective)."""
+        work, lost = zip(*(term.driven() for term in self.terms), strict=True)
+        return sum(work), sum(lost)
+
     @property
     def symmetric(self) -> bool:
         """Whether K is symmetric, as all terms say of their share."""
@@ -293,7 +309,7 @@ class Balance:
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back; nothing may be asked any more."""
-        for kept in (self.vector, self._kept, self._assembler, self.mass):
+        for kept in (self.vector, self._kept, self._assembler, self.mass, *self.terms):
             kept.destroy()
         if self.scheme.implicit:
             self._tangent.destroy()

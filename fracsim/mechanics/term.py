@@ -9,6 +9,7 @@ contact). Residual, tangent, reactions, the residual's scale and the energy book
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -108,6 +109,30 @@ class Term:
     def longest_step(self, change: Values) -> float:
         """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0
+
+    def reachable(self, u: Values) -> Values:
+        """(owned dofs,) a first guess of u, m, changed to one that Newton's method may start from (collective)."""
+        return u
+
+    def potential(self) -> float | None:
+        """Energy whose derivative is its share of r at the current u, this rank's share, J; None: there is none, or it
+        is not known (collective)."""
+        return None
+
+    def readings(self) -> dict[str, Callable[[], Values]]:
+        """Columns of history.csv, each with a function that gives this rank's share, (1,)."""
+        return {}
+
+    def driven(self) -> tuple[float, float]:
+        """Work from outside in the step that has ended which `applied` does not show, and what of it is lost, this
+        rank's share, J; asked once a step (collective)."""
+        return 0.0, 0.0
+
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+        """Edges have broken: patterns (cells,) of those of each cell (collective)."""
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
 
     def damage_changed(self) -> None:
         """Edges broke, or cells lost stiffness. Not collective."""

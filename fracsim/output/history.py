@@ -49,6 +49,10 @@ class Probes:
         axes = AXES[: self._domain.dim]
         self.names = [f"{kinds[probe.quantity]}_{probe.name}_{axis}" for probe in probes for axis in axes]
         self._readings = [self._reading(probe) for probe in probes]
+        for term in balance.terms:
+            for name, reading in term.readings().items():
+                self.names.append(name)
+                self._readings.append(reading)
 
     def __call__(self) -> npt.NDArray[np.float64]:
         """All readings in the order of `names` (collective)."""

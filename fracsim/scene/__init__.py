@@ -4,6 +4,7 @@ Here alone a study becomes physics: what lies below this room takes numbers, arr
 
 material    the energy, its moduli and the yield law
 terms       what adds to the balance of forces, and the balance
+contact     obstacles, and how they act
 breaking    what flows and what breaks after a step
 """
 

@@ -75,6 +75,14 @@ def _dead_loads(parts: Parts) -> Term | None:
     return DeadLoads(parts.assembler, tractions=tractions, gravity=gravity, body_force=body_force)
 
 
+def _obstacles(parts: Parts) -> Term | None:
+    if not parts.study.obstacle:
+        return None
+    from .contact import obstacles_of
+
+    return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material)
+
+
 def _inertia(parts: Parts) -> Term | None:
     return Inertia(parts.u, parts.mass) if parts.scheme.inertia else None
 
@@ -93,6 +101,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
     "viscosity": _viscosity,
     "pressure": _pressure,
     "dead loads": _dead_loads,
+    "obstacles": _obstacles,
     "inertia": _inertia,
     "drag": _drag,
 }

@@ -45,6 +45,10 @@ class Breaking(Remembers, Protocol):
     not_finite: int  # cells whose stress was no number when it was looked at, summed over the passes of this rank
     phase: str  # what its seconds are counted under
 
+    @property
+    def pattern(self) -> npt.NDArray[np.uint8] | None:
+        """(cells,) broken edges of each cell (mesh.edges); None where nothing can break."""
+
     def __call__(self) -> PassResult:
         """A pass on the current displacement (collective)."""
 
@@ -107,6 +111,7 @@ class Unbreakable:
     passes: int | None = 1
     not_finite = 0
     phase = "energies"
+    pattern = None
 
     def __init__(self, balance: Balance, flow: Flow | None = None) -> None:
         self._balance, self._flow = balance, flow or NoFlow()

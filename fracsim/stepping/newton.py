@@ -186,6 +186,7 @@ class Solver:
         self._shrink()
         self._x.array_w[:] = guess
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
+        self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
         self.snes.solve(None, self._x)
         snes, reason = self.snes, self.snes.reason
         self.balance.displace_to(self._x)

@@ -170,6 +170,7 @@ class BalanceStepper:
 
     def _recalled(self) -> None:
         """The body is damaged otherwise than it was: an earlier state is stepped once more."""
+        self._tell_of_edges()
         self.balance.damage_changed()
 
     def _begin(self, state: State, dt: float) -> None:
@@ -239,6 +240,8 @@ class BalanceStepper:
         """The end of the step with its energies; those given are of this rank, J."""
         balance = self.balance
         elastic += sum(term.stored() for term in balance.terms if term is not balance.stress)
+        worked, rubbed = balance.driven()
+        work, lost = work + worked, lost + rubbed
         kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
         work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(
@@ -286,5 +289,11 @@ class BalanceStepper:
 
     def _damage_changed(self, result: PassResult) -> None:
         """Cells lost stiffness: forms are bound once to the cells that are left."""
+        if result.broken:
+            self._tell_of_edges()
         if result.died:
             self.balance.damage_changed()
+
+    def _tell_of_edges(self) -> None:
+        if (pattern := self.breaking.pattern) is not None:
+            self.balance.edges_broke(pattern)

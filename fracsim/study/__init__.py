@@ -3,6 +3,7 @@
 body            [mesh], [material], [damping]
 breaking        [fracture], [plasticity], [brittle]
 loading         [[boundary]], [load], [initial]
+touching        [[obstacle]], [contact]
 running         [time], [[probe]], [output]
 solver_options  [solver]
 whole           a study, and what its tables ask of one another
@@ -18,11 +19,12 @@ from .body import Damping, Elastic, Material, Mesh, Region
 from .breaking import Brittle, Fibre, Fracture, Grains, Heterogeneity, Plasticity
 from .loading import CONDITIONS, MOTIONS, Boundary, Box, Initial, Load, Plane
 from .running import FIELDS, Output, Probe, Time
+from .touching import Contact, Obstacle
 from .values import Table, TimeTable
 from .whole import Study
 
 __all__ = [
-    "CONDITIONS", "FIELDS", "MOTIONS", "Boundary", "Box", "Brittle", "Damping", "Elastic", "Fibre", "Fracture",
-    "Grains", "Heterogeneity", "Initial", "Load", "Material", "Mesh", "Output", "Plane", "Plasticity", "Probe",
-    "Region", "Study", "Table", "Time", "TimeTable",
+    "CONDITIONS", "FIELDS", "MOTIONS", "Boundary", "Box", "Brittle", "Contact", "Damping", "Elastic", "Fibre",
+    "Fracture", "Grains", "Heterogeneity", "Initial", "Load", "Material", "Mesh", "Obstacle", "Output", "Plane",
+    "Plasticity", "Probe", "Region", "Study", "Table", "Time", "TimeTable",
 ]  # fmt: skip

@@ -15,6 +15,13 @@ ENERGIES = {
     "stvk": "Saint Venant-Kirchhoff; moderate strains; plane stress in 2D",
     "neo-hookean": "stable neo-Hookean; large strains, any compression (default)",
 }
+OBSTACLES = {
+    "plane": "normal: a half space",
+    "sphere": "radius; in 2D a disk; hollow: a bowl",
+    "capsule": "radius, length between the centres of its ends, axis",
+    "cylinder": "radius, length, axis; rounded edges; 3D; hollow",
+    "box": "size; rounded edges; hollow",
+}
 
 
 def catalogue() -> dict[str, dict[str, str]]:
@@ -23,4 +30,4 @@ def catalogue() -> dict[str, dict[str, str]]:
     builders = {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in BUILDERS.items()}
     chosen = Time.model_fields["scheme"].default
     schemes = {name: kind.summary + " (default)" * (name == chosen) for name, kind in SCHEMES.items()}
-    return {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes}
+    return {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes, "obstacles": OBSTACLES}

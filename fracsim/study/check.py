@@ -19,8 +19,8 @@ from ..mesh.places import Group, Place
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import AXES, format_point
-from . import Brittle, Study
-from .conditions import conditions, fibre_direction, initial_motion, of_size, place_of, volume_loads
+from . import Brittle, Obstacle, Study
+from .conditions import conditions, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)
+    obstacles(study, dim)
     fibre_direction(study, dim)
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
@@ -156,12 +157,18 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
+    if study.obstacle:
+        yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
     yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _motion(obstacle: Obstacle) -> str:
+    return "fixed" if obstacle.displacement is None and obstacle.velocity is None else "driven"
 
 
 def _size(anatomy: Anatomy) -> str:

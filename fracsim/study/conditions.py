@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
 from ..mesh.places import Group, InBox, OnPlane, Place
 from ..meshes.words import AXES
-from . import MOTIONS, Boundary, Box, Plane, Study, TimeTable
+from . import MOTIONS, Boundary, Box, Obstacle, Plane, Study, TimeTable
 
 Flags = npt.NDArray[np.bool_]
 
@@ -42,6 +42,22 @@ class Condition:
     def moves(self) -> bool:
         """Whether it prescribes a motion."""
         return self.kind in MOTIONS
+
+
+@dataclass(frozen=True)
+class Placing:
+    """An entry of [[obstacle]].
+
+    Attributes:
+        geometry: arguments of its shape.    at: (d,) its reference point at t = 0, m.    moved: (d,) m of time.
+    """
+
+    name: str
+    shape: str
+    geometry: dict[str, Any]
+    at: Values
+    moved: TimeFunction | None
+    friction: float
 
 
 def conditions(study: Study, dim: int) -> list[Condition]:
@@ -93,6 +109,31 @@ def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
     """gravity (d,) in m/s^2 and body_force (d,) in N/m^3, as far as [load] has them."""
     given = {} if study.load is None else {key: getattr(study.load, key) for key in ("gravity", "body_force")}
     return {key: in_time(value, f"load.{key}", dim) for key, value in given.items() if value is not None}
+
+
+def obstacles(study: Study, dim: int) -> list[Placing]:
+    """All entries of [[obstacle]]. InputError where one does not fit the dimension."""
+    return [_placing(entry, dim, f"obstacle.{i}") for i, entry in enumerate(study.obstacle)]
+
+
+def _placing(entry: Obstacle, dim: int, key: str) -> Placing:
+    given = entry.geometry
+    for name in {"normal", "axis", "size"} & set(given):
+        given[name] = _vector(given[name], dim, f"{key}.{name}")
+    if "normal" in given:
+        given["direction"] = given.pop("normal")
+    if entry.shape == "plane":
+        given.pop("hollow", None)
+    elif entry.shape == "sphere":
+        given["dim"] = dim
+    elif entry.shape == "cylinder" and dim == 2:
+        raise InputError(f'{key}.shape = "cylinder": a 2D mesh has none; choose "sphere", which is a disk there')
+    moved: TimeFunction | None = None
+    if entry.displacement is not None:
+        moved = in_time(entry.displacement, f"{key}.displacement", dim)
+    elif entry.velocity is not None:
+        moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
+    return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction)
 
 
 def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None] | None:

@@ -9,6 +9,7 @@ from .breaking import Brittle, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
+from .touching import Contact, Obstacle
 from .values import Table
 
 
@@ -34,6 +35,8 @@ class Study(Table):
     load: Load | None = None
     initial: Initial | None = None
     solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
+    obstacle: list[Obstacle] = Field(default_factory=list)
+    contact: Contact | None = None
     probe: list[Probe] = Field(default_factory=list)
     output: Output = Output()
 
@@ -44,6 +47,14 @@ class Study(Table):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two probes have the name {twice[0]}")
         return probes
+
+    @field_validator("obstacle")
+    @classmethod
+    def _told_apart(cls, obstacles: list[Obstacle]) -> list[Obstacle]:
+        names = [each.name for each in obstacles]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two obstacles have the name {twice[0]}")
+        return obstacles
 
     @field_validator("solver")
     @classmethod
@@ -137,6 +148,17 @@ class Study(Table):
     def _explicit_steps_once(self) -> Study:
         if not self.time.kind.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
+        return self
+
+    @model_validator(mode="after")
+    def _contact_is_implicit(self) -> Study:
+        if self.obstacle and not self.time.kind.implicit:
+            raise ValueError(
+                f'[[obstacle]] needs an implicit scheme, not time.scheme = "{self.time.scheme}"; choose '
+                '"backward-euler"'
+            )
+        if self.contact is not None and not self.obstacle:
+            raise ValueError("[contact] needs an [[obstacle]]; contact of a body with itself is not there yet")
         return self
 
     @model_validator(mode="after")

@@ -229,6 +229,14 @@ RUNS: dict[str, dict[str, Any]] = {
         "time": {"scheme": "generalized-alpha", "step": 0.025, "end": 1.4},
         "probe": [{"name": "grip", "on": "right"}],
     },
+    # broken by a hammer that it does not pass, and rubbed by it
+    "struck": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xy"}],
+        "fracture": {"strength": 0.15, "radius": 0.1},
+        "obstacle": [{"name": "hammer", "shape": "sphere", "radius": 0.15, "at": [0.8, 0.78], "velocity": [0.05, -0.5],
+                      "friction": 0.3}],
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.0}, "probe": [{"name": "grip", "on": "left"}],
+    },
 }  # fmt: skip
 SURFACES = ("plate", "block")  # whose split surface is written
 # the same, each step solved with its own flow

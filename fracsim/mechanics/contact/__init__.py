@@ -1,5 +1,10 @@
 """Contact with analytic obstacles, which need no mesh: a signed distance says how far a point is outside.
 
+obstacles         the term of the balance
+obstacle          one that is held or driven
+touch             barrier and friction at the points of a surface
+reach             how far points may go, first guesses that have passed through nothing
+
 shapes            the register of shapes, by the name that a user writes
 shape             what a shape is: distance, normal, curvature, outline, inertia
 plane, ball       half space; sphere and capsule (in 2D disk and stadium)
@@ -12,7 +17,7 @@ motion            points and obstacle on their way: gaps, and bounds of how fast
 barrier           energy that keeps gaps open (IPC), and how far points may move without passing through
 friction          Coulomb friction as a lagged, smoothed potential (IPC)
 
-NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
+All but `obstacles` and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
 
 IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
 distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.

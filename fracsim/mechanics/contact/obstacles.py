@@ -1,0 +1,252 @@
+"""Contact of a body with obstacles: a term of the balance (METHOD section 9).
+
+    E(u) = sum over obstacles of  int b(gap(x)) dA  +  sum over points in touch of  mu lambda f0(|s|)
+
+over the split surface x(u) (mesh.split.local), each point with its share of the reference surface. Forces balance where
+the body will be at the end of a step, u_n + (u - u_n) / share, whatever level the scheme solves at; of a level inside
+the step they count with its share, and those of the step's start with the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+from scipy.sparse import bsr_matrix, csr_matrix, kron
+
+from ...mesh.domain import Domain
+from ...mesh.ranks import total
+from ...mesh.split.local import Following, LocalSurface
+from ...meshes.words import AXES
+from ..term import Level, Term
+from .barrier import Barrier
+from .friction import Friction
+from .obstacle import Obstacle
+from .placed import Placed
+from .reach import check_apart, safe_shares, within_reach
+from .touch import Grip, Touch, grip, touch
+
+Values = npt.NDArray[np.float64]
+
+LEFT_OUT = 0.05  # share of the barrier's width: what is nearer when it comes to light is in the obstacle, or as good as
+
+
+@dataclass(frozen=True)
+class Law:
+    """How contact acts: the barrier, and the speed of slip, m/s, below which friction passes for sticking."""
+
+    barrier: Barrier
+    creep: float
+
+
+class Obstacles(Term):
+    """Obstacles that the body cannot pass through.
+
+    Attributes:
+        obstacles: held or driven.    law: how they act.
+        area: (n,) of the points of this rank's surface, m^2; 0 of those left out.    follow: from nodes to points.
+    """
+
+    name = "obstacles"
+
+    def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
+        """InputError where the body at rest lies in an obstacle (collective)."""
+        self.obstacles, self.law = tuple(obstacles), law
+        self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
+        self.comm = domain.comm
+        self._surface = LocalSurface(domain)
+        self.follow = Following(domain, self._surface)
+        self.area: Values = self._surface.area
+        self._acted: list[Values] = [np.zeros(domain.dim) for _ in self.obstacles]
+        check_apart(self.comm, self._surface.points, self.obstacles)
+
+    # --- a step ---
+
+    def begin(self, level: Level) -> None:
+        """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
+        self._level, late = level, 1 - level.share
+        end = level.t + late * level.dt
+        self._placed = [each.placed(end) for each in self.obstacles]
+        self._at_start = [each.placed(end - level.dt) for each in self.obstacles]
+        self._ways = [each.way(end - level.dt, end) for each in self.obstacles]
+        self._grips: list[Grip | None] = [None] * len(self.obstacles)
+        self._touches: list[Touch] | None = None
+        if level.dt:
+            self._start_of_step(late)
+
+    def _start_of_step(self, late: float) -> None:
+        x, at = self.places(self._level.u), self._at_start
+        self._grips = [
+            grip(x, self.area, placed, self.law.barrier) if each.friction else None
+            for each, placed in zip(self.obstacles, at, strict=True)
+        ]
+        self._before: Values = np.zeros(self._owned)
+        if late:
+            forces = np.zeros_like(x)
+            for placed in at:
+                found = touch(x, self.area, placed, self.law.barrier, None, None, np.zeros(0))
+                forces[found.points] += found.normal
+            self._before = np.asarray(late * self.follow.handed_down(forces))
+
+    def displaced(self) -> None:
+        """What touches has to be found anew."""
+        self._touches = None
+
+    def places(self, u: Values) -> Values:
+        """(n, d) x of the points at the owned displacements u, m (collective)."""
+        return np.asarray(self._surface.points + self.follow(u))
+
+    def _at_end(self, u: Values) -> Values:
+        """(owned dofs,) displacement at the end of the step that belongs to u at the level."""
+        start, share = self._level.u, self._level.share
+        return u if share == 1 else np.asarray(start + (u - start) / share)
+
+    def _touching(self) -> list[Touch]:
+        """What each obstacle does at the current u (collective)."""
+        if self._touches is None:
+            self.x = self.places(self._at_end(self._u.x.array[: self._owned]))
+            self._touches = [self._touch(number) for number in range(len(self.obstacles))]
+        return self._touches
+
+    def _touch(self, number: int) -> Touch:
+        obstacle, held = self.obstacles[number], self._grips[number]
+        rub = Friction(obstacle.friction, self.law.creep * self._level.dt) if held is not None else None
+        way = self._ways[number][: self._domain.dim]
+        return touch(self.x, self.area, self._placed[number], self.law.barrier, held, rub, way)
+
+    # --- what it adds to the balance ---
+
+    def _forces(self, *, normal: bool = True) -> Values:
+        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; those of friction alone where
+        not `normal` (collective)."""
+        forces = np.zeros_like(self._surface.points)
+        for each in self._touching():
+            forces[each.points] += each.friction + (each.normal if normal else 0.0)
+        return self.follow.handed_down(forces)
+
+    def add_force(self, rows: Values) -> None:
+        """r -= forces (collective)."""
+        rows -= self.scale()
+
+    def scale(self) -> Values:
+        """(owned dofs,) forces at the level, N (collective)."""
+        share = self._level.share
+        return self._forces() if share == 1 else share * self._forces() + self._before
+
+    def coupling(self) -> PETSc.Mat | None:
+        """Minus the derivative of the forces, where anything is in touch (collective)."""
+        touches, d = self._touching(), self._domain.dim
+        count = int(total(self.comm, sum(len(each.points) for each in touches))[0])
+        if not count:
+            return None
+        points = np.concatenate([each.points for each in touches])
+        blocks = np.concatenate([each.stiffness for each in touches])
+        W = kron(self._surface.weights[points], np.eye(d), format="csr")
+        return self._matrix((W.T @ _diagonal(blocks) @ W).tocsr())
+
+    def _matrix(self, local: csr_matrix) -> PETSc.Mat:
+        """A matrix over the dofs from one over the dofs of this rank's columns, summed (collective)."""
+        d = self._domain.dim
+        matrix = PETSc.Mat().create(self.comm)
+        matrix.setSizes(((self._owned, PETSc.DETERMINE),) * 2, bsize=d)
+        matrix.setType(PETSc.Mat.Type.AIJ)
+        matrix.setUp()
+        dofs = (d * self._surface.columns[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
+        start, columns = local.indptr.astype(PETSc.IntType), dofs[local.indices]
+        matrix.setValuesIJV(start, columns, local.data, PETSc.InsertMode.ADD_VALUES, dofs)
+        matrix.assemble()
+        return matrix
+
+    def stored(self) -> float:
+        """Energy of the barriers at the current u, this rank's share, J (collective)."""
+        return sum(each.energy for each in self._touching())
+
+    def potential(self) -> float:
+        """Barriers and friction at the current u, this rank's share, J (collective)."""
+        return sum(each.energy + each.friction_energy for each in self._touching())
+
+    def drag(self) -> Values | None:
+        """(owned dofs,) minus the forces of friction, N (collective)."""
+        return -self._forces(normal=False) if any(each.friction for each in self.obstacles) else None
+
+    # --- how far Newton's method may go ---
+
+    def longest_step(self, change: Values) -> float:
+        """Share of a change of u that closes no gap by more than nine tenths (collective)."""
+        self._touching()
+        moved, rest = self.follow(np.divide(change, self._level.share)), np.zeros_like(self._ways[0])
+        shares = [safe_shares(placed, self.x, moved, rest)[self.area > 0] for placed in self._placed]
+        return float(min(share.min(initial=1.0) for share in shares))
+
+    def ways(self) -> list[tuple[Placed, Values]]:
+        """Where each obstacle is at the start of the step, and its way (p,) to the end."""
+        return list(zip(self._at_start, self._ways, strict=True))
+
+    def reachable(self, u: Values) -> Values:
+        """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
+        level = self._level
+        if not level.dt:
+            return u
+        end = within_reach(self, level.u, self._at_end(u))
+        return np.asarray(level.u + level.share * (end - level.u))
+
+    # --- what breaks, and what is told ---
+
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+        """New walls are part of the surface; what lies in an obstacle when it comes to light is left out (collective).
+
+        Gaps inside a body that bends around an obstacle may be closed before anything is there that could touch.
+        """
+        self._surface.follow_damage(pattern)
+        self.follow.destroy()
+        self.follow = Following(self._domain, self._surface)
+        x = self.places(self._at_end(self._u.x.array[: self._owned]))
+        gap = np.min([placed.distance(x) for placed in self._placed], axis=0)
+        self.area = np.where(gap > LEFT_OUT * self.law.barrier.width, self._surface.area, 0.0)
+        self._grips, self._touches = [None] * len(self.obstacles), None
+
+    def readings(self) -> dict[str, Callable[[], Values]]:
+        """contact_NAME_AXIS: (1,) forces of the body on each obstacle, this rank's share, N (collective)."""
+        return {
+            f"contact_{each.name}_{axis}": partial(self._on_obstacle, number, place)
+            for number, each in enumerate(self.obstacles)
+            for place, axis in enumerate(AXES[: self._domain.dim])
+        }
+
+    def _on_obstacle(self, number: int, axis: int) -> Values:
+        return -self._force_of(number)[axis : axis + 1]
+
+    def _force_of(self, number: int) -> Values:
+        """(d,) of an obstacle on this rank's points, N (collective)."""
+        found = self._touching()[number]
+        return np.asarray((found.normal + found.friction).sum(axis=0))
+
+    def driven(self) -> tuple[float, float]:
+        """Work of the obstacles' own motion in the step on this rank, and what of it friction takes, J (collective).
+
+        Friction's `drag` counts the way of the body; the slip is that way less the obstacle's.
+        """
+        work = lost = 0.0
+        for number, way in enumerate(self._ways):
+            shift, found = way[: self._domain.dim], self._touching()[number]
+            now = self._force_of(number)
+            work += float((now + self._acted[number]) @ shift) / 2
+            lost += float(found.friction.sum(axis=0) @ shift)
+            self._acted[number] = now
+        return work, lost
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+        self.follow.destroy()
+
+
+def _diagonal(blocks: Values) -> csr_matrix:
+    """(n d, n d) of blocks (n, d, d)."""
+    n, d = blocks.shape[:2]
+    matrix = bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=(n * d, n * d))
+    return matrix.tocsr()

@@ -1,0 +1,77 @@
+"""Points on their way: how far they may go before an obstacle, and first guesses that have passed through nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ...errors import InputError
+from .barrier import longest_step
+from .motion import Motion
+from .obstacle import Obstacle
+from .placed import Placed
+
+if TYPE_CHECKING:
+    from .obstacles import Obstacles
+
+Values = npt.NDArray[np.float64]
+
+ROUNDS = 20  # in which points that follow several nodes are brought back
+
+
+def safe_shares(placed: Placed, x: Values, moved: Values, q: Values) -> Values:
+    """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
+    moves by q meanwhile; 0 where the gap is closed already."""
+    gap = placed.distance(x)
+    turn = np.linalg.norm(q[placed.pose.dim :])
+    relative = moved - q[: placed.pose.dim]
+    reach = np.linalg.norm(relative, axis=1) + turn * (np.linalg.norm(x - placed.pose.centre, axis=1) + 1.0)
+    share = np.where(gap > 0, 1.0, 0.0)
+    near = np.flatnonzero((gap > 0) & (gap < 1.2 * reach))
+    if len(near):
+        motion = Motion(placed, x[near], moved[near], q)
+        share[near] = longest_step(motion.gap, motion.speed, len(near))
+    return share
+
+
+def within_reach(contact: Obstacles, start: Values, end: Values) -> Values:
+    """(owned dofs,) of displacements at the start and a guess of the end of a step, the end with every point stopped
+    where it would pass into an obstacle; from there on the obstacle takes it along (collective).
+
+    Each point on its own: to shorten the step of the whole body would leave a driven obstacle inside it. A point of a
+    crack follows several nodes, which it brings back with it.
+    """
+    comm, x = contact.comm, contact.places(start)
+    for _ in range(ROUNDS):
+        back, stopped = _brought_back(contact, x, contact.follow(end - start))
+        if not comm.allreduce(int(stopped.any())):
+            return end
+        weight = contact.follow.handed_down(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
+        change = contact.follow.handed_down(back)
+        end = end + np.where(np.abs(weight) > 1e-3, change / np.where(np.abs(weight) > 1e-3, weight, 1.0), 0.0)
+    return end
+
+
+def _brought_back(contact: Obstacles, x: Values, moved: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
+    """(n, d) what is to be added to the ways of points, and which of them are stopped."""
+    back, stopped = np.zeros_like(x), np.zeros(len(x), bool)
+    for placed, q in contact.ways():
+        share = np.where(contact.area > 0, safe_shares(placed, x, moved, q), 1.0)
+        held = share < 1
+        back[held] = ((share - 1)[:, None] * (moved - q[: x.shape[1]]))[held]
+        stopped |= held
+    return back, stopped
+
+
+def check_apart(comm: MPI.Intracomm, x: Values, obstacles: tuple[Obstacle, ...]) -> None:
+    """InputError where a point of the body lies in an obstacle before the first step (collective)."""
+    for number, each in enumerate(obstacles):
+        least = comm.allreduce(float(each.placed(0.0).distance(x).min(initial=np.inf)), op=MPI.MIN)
+        if least <= 0:
+            raise InputError(
+                f"obstacle.{number}: {each.name} overlaps the body at the start, by {-least:.4g} m; "
+                "move it away or make it smaller"
+            )

@@ -1,0 +1,87 @@
+"""What an obstacle does to the points of a surface: barrier and lagged friction, with the forces of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .barrier import Barrier
+from .friction import Friction
+from .placed import Placed
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Where a step began: points in touch then, whose friction of the step is lagged.
+
+    Attributes:
+        points: (k,) of the surface.    force: (k,) normal force, N.    normal: (k, d).    start: (k, d) places, m.
+    """
+
+    points: Ints
+    force: Values
+    normal: Values
+    start: Values
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Points in touch with one obstacle, and what acts on them.
+
+    Attributes:
+        points: (k,) of the surface, with a gap below the barrier's width or gripped by friction.
+        energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.    friction_energy: J.
+        stiffness: (k, d, d) minus the derivative of the forces, positive semi-definite, N/m.
+    """
+
+    points: Ints
+    energy: float
+    normal: Values
+    friction: Values
+    friction_energy: float
+    stiffness: Values
+
+
+def grip(x: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
+    """Normal forces at places x (n, d) of the start of a step."""
+    gap = placed.distance(x)
+    near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
+    return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near])
+
+
+def touch(
+    x: Values, area: Values, placed: Placed, barrier: Barrier, held: Grip | None, friction: Friction | None, way: Values
+) -> Touch:
+    """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, m.
+
+    The barrier's energy is the integral of b(gap) over the surface, each point with its area.
+    """
+    gap = placed.distance(x)
+    near = (gap < barrier.width) & (area > 0)
+    if friction is not None and held is not None:
+        near[held.points] = True
+    points = np.flatnonzero(near)
+    gap, share, at = gap[points], area[points], x[points]
+    normal, slope = placed.normal(at), barrier.slope(gap)
+    bent = barrier.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    stiffness = share[:, None, None] * positive(bent + slope[:, None, None] * placed.curvature(at))
+    rubbed, stored = np.zeros_like(at), 0.0
+    if friction is not None and held is not None and len(held.points):
+        moved = x[held.points] - held.start - way
+        row = np.searchsorted(points, held.points)
+        rubbed[row] = -friction.gradient(held.force, held.normal, moved)
+        stiffness[row] += friction.hessian(held.force, held.normal, moved)
+        stored = float(friction.energy(held.force, held.normal, moved).sum())
+    energy = float(share @ barrier.energy(gap))
+    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, stored, stiffness)
+
+
+def positive(blocks: Values) -> Values:
+    """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with."""
+    values, vectors = np.linalg.eigh(np.nan_to_num(blocks, posinf=0.0, neginf=0.0))
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))

@@ -1,0 +1,41 @@
+"""Contact that a study asks for: its obstacles, and how they act. Imported where there are any."""
+
+from __future__ import annotations
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..mechanics.contact.barrier import Barrier
+from ..mechanics.contact.obstacle import Obstacle
+from ..mechanics.contact.obstacles import Law, Obstacles
+from ..mechanics.contact.shapes import SHAPES
+from ..mechanics.material import MaterialFields
+from ..mesh.domain import Domain
+from ..study import Contact, Study
+from ..study.conditions import Placing, obstacles
+
+DISTANCE = 0.05  # of the mean edge: a hundredth of it is where a press of a hundredth of Young's modulus holds
+STIFFNESS = 0.1  # of Young's modulus
+CREEP = 1e-3  # of the body's size, a second
+
+
+def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Obstacles:
+    """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
+    entries = [_obstacle(each, number) for number, each in enumerate(obstacles(study, domain.dim))]
+    return Obstacles(domain, u, entries, _law(study.contact or Contact(), domain, material))
+
+
+def _obstacle(entry: Placing, number: int) -> Obstacle:
+    try:
+        shape = SHAPES[entry.shape](**entry.geometry)
+    except InputError as error:
+        raise InputError(f"obstacle.{number}: {error}") from None
+    return Obstacle(entry.name, shape, entry.at, entry.moved, entry.friction)
+
+
+def _law(contact: Contact, domain: Domain, material: MaterialFields) -> Law:
+    young = domain.comm.allreduce(float(np.max(material.young, initial=0.0)), op=MPI.MAX)
+    distance = contact.distance or DISTANCE * domain.mean_edge
+    return Law(Barrier(contact.stiffness or STIFFNESS * young, distance), contact.creep or CREEP * domain.size)

@@ -1,0 +1,57 @@
+"""Cases that `make test-all` alone runs: each shows on another kind what a case that stays in `make test` shows.
+
+Starts of the test's name, file first, over the case that stays.
+"""
+
+REPEATS = (
+    # a signal while the run is set up, and later: on two ranks; of mpirun itself
+    "test_restart.py::test_a_signal_right_after_the_start[0]",
+    "test_restart.py::test_a_signal_ends_a_run_with_a_checkpoint[SIGTERM-0]",
+    "test_restart.py::test_ending_mpirun_itself_leaves_a_checkpoint",
+    # a checkpoint of two ranks: on one; the exit code of what does not converge: of the other codes on two ranks
+    "test_restart.py::test_a_checkpoint_of_two_ranks_goes_on_with_others[3]",
+    "test_restart.py::test_the_exit_code_of_a_run_that_does_not_converge",
+    # a full disk: rows of history on two ranks, a checkpoint on two ranks, fields.xdmf; one that stays full: history
+    "test_cannot_write.py::test_a_full_disk_ends_the_run[xml-0]",
+    "test_cannot_write.py::test_a_full_disk_ends_the_run[surface-2]",
+    "test_cannot_write.py::test_a_full_disk_ends_the_run[pieces-0]",
+    "test_cannot_write.py::test_a_disk_that_stays_full[surface]",
+    # a rank that fails alone: with input, and with a fault
+    "test_ranks.py::test_a_rank_that_fails_alone_ends_all[1-not-converged",
+    "test_ranks.py::test_a_rank_that_fails_alone_ends_all[1-exit",
+    "test_ranks.py::test_a_rank_that_fails_alone_ends_all[0-disk",
+    # sweeps: one that runs every case and then none, one that is stopped, the list
+    "test_sweep.py::test_a_changed_study_is_run_again",
+    "test_sweep.py::test_runs_on_two_ranks",
+    # whose a folder is: on one process
+    "test_own_files.py::test_a_folder_of_the_users_is_left_alone[2]",
+    # studies on the figure: jelly-figure runs; the blow lands on the figure of a builder
+    "test_studies.py::test_a_coarse_version_runs[struck-figure]",
+    "test_studies.py::test_the_blow_lands_on_a_surface_of_ones_own",
+    "test_studies.py::test_full_sizes_are_those_of_the_paper",
+    "test_study_file.py::test_studies_of_the_package_survive_being_written[struck-figure]",
+    # builders and surfaces: the cube and the torus in one other unit, the solid figure, the vase
+    "test_meshes_fill.py::test_the_unit_of_length_does_not_matter[cube-shell0-0.3-1000.0]",
+    "test_meshes_fill.py::test_the_unit_of_length_does_not_matter[torus-shell1-0.2-1000.0]",
+    "test_meshes_fill.py::test_cells_are_expected_within_a_factor[torus]",
+    "test_meshes_fill.py::test_volume_is_that_of_the_surface[notched-bar",
+    "test_meshes_builders.py::test_a_hollow_figure_is_nowhere_thinner_than_its_wall",
+    # further energies of plasticity: neo-hookean, the default
+    "test_plasticity.py::test_plastic_volume_is_kept[corotated]",
+    "test_plasticity.py::test_plastic_volume_is_kept[stvk]",
+    "test_plasticity.py::test_a_step_is_solved_with_the_last_flow_once_more[corotated]",
+    "test_plasticity.py::test_a_step_is_solved_with_the_last_flow_once_more[stvk]",
+    "test_plasticity.py::test_the_return_is_that_of_a_dense_solver[corotated",
+    "test_plasticity.py::test_energy_balance[newmark]",
+    # balances of breaking bodies: generalized-alpha with both approaches, which is of second order as Newmark is
+    "test_fracture.py::test_energy_balance_of_dynamic_fracture[edge-newmark]",
+    "test_fracture.py::test_energy_balance_of_dynamic_fracture[chi-newmark]",
+    "test_closing.py::test_explicit_steps_stay_stable_with_damage[edge-True]",
+    # trials of the report: the other rows of its table
+    "test_evidence_stability.py::test_two_approaches_fail_and_chi_holds",
+    # surfaces in 3D: of the same test in 2D
+    "test_brittle.py::test_moving_nodes_over_spares_a_curved_surface[3]",
+    "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[stadium]",
+    "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[ring]",
+    "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[drum]",
+)

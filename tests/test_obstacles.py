@@ -1,0 +1,221 @@
+"""Contact of a body with obstacles, against closed forms and conservation laws."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fracsim.errors import InputError
+from fracsim.mechanics.contact.obstacles import Obstacles
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.split.local import Following, LocalSurface
+from fracsim.scene import Scene
+from support.ranks import TESTS
+from support.scenes import Walk, each_step, make_scene, march, positions
+
+Values = npt.NDArray[np.float64]
+
+FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
+SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
+G = 10.0
+
+
+def floor(height: float, **more: Any) -> dict[str, Any]:
+    """A plane below the body, y upwards."""
+    return {"name": "floor", "shape": "plane", "at": [0.0, height], "normal": [0.0, 1.0]} | more
+
+
+def places(scene: Scene, state: Walk) -> Values:
+    """(nodes, d) where the nodes are, m."""
+    return positions(scene) + state.u.reshape(-1, scene.domain.dim)
+
+
+def mass(scene: Scene) -> Values:
+    """(nodes, 1) kg."""
+    return scene.balance.mass.lumped.reshape(-1, scene.domain.dim)[:, :1]
+
+
+# --- the surface that touches ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int) -> None:
+    """With a third of the body torn: x = A X + b at every point, and sum f, sum X f^T of forces are those at the
+    points. The area grows by that of the walls."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0] * dim, "h": 0.25, "pattern": "unstructured"})
+    domain = scene.domain
+    surface, graph = LocalSurface(domain), EdgeGraph(domain)
+    assert surface.area.sum() == pytest.approx(2 * dim)
+    ends = domain.nodes[graph.edge_nodes][:, :, 0]
+    graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.5))
+    surface.follow_damage(graph.pattern)
+    assert surface.area.sum() > 2 * dim + 1.5
+    follow, X = Following(domain, surface), positions(scene)
+    A, b = np.random.default_rng(dim).normal(size=(dim, dim)), np.arange(dim) + 1.0
+    x = follow((X @ A.T + b).reshape(-1))
+    np.testing.assert_allclose(x, surface.points @ A.T + b, atol=1e-13)
+    f = np.sin(100 * surface.points) * surface.area[:, None]
+    nodal = follow.handed_down(f).reshape(-1, dim)
+    np.testing.assert_allclose(nodal.sum(axis=0), f.sum(axis=0), atol=1e-13)
+    np.testing.assert_allclose(X.T @ nodal, surface.points.T @ f, atol=1e-13)
+
+
+# --- impulse, rest, pressure ----------------------------------------------------------------------------------------
+
+
+def test_the_impulse_of_contact_is_what_balances_momentum() -> None:
+    """Backward Euler: M (v - v_n) = dt f for every step, so that m v = sum of dt f - m g t through a whole bounce; and
+    the floor is never passed, though the body is as soft as jelly and falls 0.2 m."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25}, material=SOFT, load={"gravity": [0.0, -G]},
+        obstacle=[floor(-0.2, friction=0.3)], solver=FINE,
+        time={"scheme": "backward-euler", "step": 0.01, "end": 0.6},
+    )  # fmt: skip
+    impulse, touched, before = np.zeros(2), 0, 0.0
+    for report in each_step(scene, state):
+        force = -scene.probes()
+        impulse += force * report.dt
+        touched += force[1] > 0
+        assert places(scene, state)[:, 1].min() > -0.2
+        assert abs(force[0]) <= 0.3 * before * (1 + 1e-9)  # lagged: of the normal force at the start of the step
+        before = force[1]
+    momentum = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
+    np.testing.assert_allclose(momentum, impulse - np.array([0.0, 100 * G * state.t]), atol=1e-4)
+    assert touched > 20 and np.ptp(impulse) > 500
+
+
+def test_a_body_at_rest_is_carried() -> None:
+    """Laid on the floor, damped to rest: the load cell reads m g."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT | {"young": 1e5},
+        load={"gravity": [0.0, -G]}, damping={"mass": 20.0}, obstacle=[floor(-1e-3)], solver=FINE,
+        time={"scheme": "backward-euler", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    march(scene, state)
+    assert scene.probes() == pytest.approx([0.0, -50 * G], rel=1e-4, abs=1e-3)
+    assert state.work == pytest.approx(
+        -G * (mass(scene) * state.u.reshape(-1, 2))[:, 1].sum(), rel=1e-6
+    )  # a floor that is held does no work
+
+
+@pytest.mark.parametrize("rotate", (False, True))
+def test_a_press_reads_hookes_law(rotate: bool) -> None:
+    """A platen comes down to 0.98 m on a block of 1 m, E = 1e4 Pa, nu = 0: force = E int strain dA, the strain that of
+    the top, a gap below the platen; what the base carries is the same, and its work is stored in block and barrier."""
+    axes = [1, 0] if rotate else [0, 1]
+    turn = lambda values: [values[axis] for axis in axes]  # noqa: E731
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25},
+        material={"energy": "linear", "young": 1e4, "poisson": 0.0, "density": 1.0},
+        boundary=[{"on": "left" if rotate else "bottom", "fix": "xy"}],
+        obstacle=[{"name": "platen", "shape": "plane", "at": turn([0.0, 1.015]), "normal": turn([0.0, -1.0]),
+                   "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], turn([0.0, -0.035])]}}],
+        probe=[{"name": "base", "on": "left" if rotate else "bottom"}], solver=FINE,
+        time={"scheme": "quasi-static", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    (*_, report) = march(scene, state)
+    x, X = places(scene, state)[:, axes], positions(scene)[:, axes]
+    top = np.flatnonzero(X[:, 1] > 1 - 1e-9)
+    top = top[np.argsort(X[top, 0])]
+    strain, height = 1 - np.trapezoid(x[top, 1], X[top, 0]), x[:, 1].max()
+    pushed = scene.probes().reshape(2, 2)[:, axes]
+    assert 0.98 - 0.05 * 0.25 < height < 0.98
+    assert pushed[1] == pytest.approx([0.0, 1e4 * strain], rel=1e-6, abs=1e-6)
+    assert pushed[0] == pytest.approx(pushed[1], rel=1e-6, abs=1e-6)
+    assert report.elastic > 0.5 * 1e4 * strain**2
+    assert state.work == pytest.approx(report.elastic, rel=2e-2)  # trapezia in a barrier
+    assert abs(state.dissipated) < 1e-6 * report.elastic
+
+
+# --- friction -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("share", "sticks"), [(1.1, True), (0.9, False)])
+def test_a_block_on_a_slope(share: float, sticks: bool) -> None:
+    """tan(theta) = 0.5 and mu = `share` of it: it stays, or slides with g (sin - mu cos); gravity is turned, not the
+    slope. It is laid on without a drop, and left to settle a little before anything is measured."""
+    slope, steps = 0.5, 60
+    down = np.array([slope, -1.0]) / np.hypot(1, slope) * G
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT | {"young": 1e6},
+        load={"gravity": down.tolist()}, damping={"stiffness": 0.01}, obstacle=[floor(-0.0095, friction=share * slope)],
+        contact={"distance": 0.01, "creep": 1e-3}, solver=FINE,
+        time={"scheme": "backward-euler", "step": 0.01, "end": steps * 0.01},
+    )  # fmt: skip
+    march(scene, state, steps // 2)
+    before = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)[0] / 50
+    march(scene, state)
+    after = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)[0] / 50
+    if sticks:
+        assert abs(after) < 1.5e-3
+    else:
+        assert (after - before) / (steps / 2 * 0.01) == pytest.approx(down[0] + share * slope * down[1], rel=0.05)
+
+
+# --- speed, geometry, refusals --------------------------------------------------------------------------------------
+
+
+def test_a_striker_faster_than_its_step_does_not_tunnel() -> None:
+    """A disk at 100 m/s crosses the thin bar five times over in a step: it pushes it along instead."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.1], "h": 0.05}, material=SOFT | {"young": 1e6, "density": 1.0},
+        obstacle=[{"name": "striker", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.3], "velocity": [0.0, -100.0]}],
+        time={"scheme": "backward-euler", "step": 5e-3, "end": 1e-2},
+    )  # fmt: skip
+    struck = 0.0
+    for _ in each_step(scene, state):
+        struck = max(struck, scene.probes()[1])
+        centre = np.array([0.5, 0.3 - 100 * state.t])
+        x = places(scene, state)
+        assert np.linalg.norm(x - centre, axis=1).min() > 0.1
+        assert x[:, 1].mean() < centre[1]
+    assert state.v.reshape(-1, 2)[:, 1].mean() < -50
+    assert struck > 0
+
+
+def test_a_body_in_a_bowl_stays_there() -> None:
+    """A block thrown into a hollow disk: every node is inside it after every step, and the wall takes its speed."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [0.4, 0.4], "h": 0.1, "pattern": "unstructured", "origin": [-0.2, -0.2]},
+        material=SOFT, initial={"velocity": [3.0, 1.0], "spin": [4.0]},
+        obstacle=[{"name": "bowl", "shape": "sphere", "radius": 0.5, "at": [0.0, 0.0], "hollow": True}],
+        time={"scheme": "backward-euler", "step": 0.01, "end": 0.5},
+    )  # fmt: skip
+    for _ in each_step(scene, state):
+        assert np.linalg.norm(places(scene, state), axis=1).max() < 0.5
+    assert np.linalg.norm((mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)) < 0.7 * 16 * np.hypot(3, 1)
+
+
+def test_a_cracked_body_touches_with_its_walls() -> None:
+    """A strip that has come apart is pushed from the crack's side: the platen meets points that were inside it."""
+    scene, _ = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.125, "pattern": "unstructured"},
+        material=SOFT, fracture={"strength": 1e9}, solver=FINE,
+        obstacle=[floor(-1e-2)], time={"scheme": "backward-euler", "step": 0.01, "end": 1.0},
+    )  # fmt: skip
+    graph, domain = scene.fracture.graph, scene.domain
+    y = domain.nodes[graph.edge_nodes][:, :, 1]
+    graph.break_edges((y.min(axis=1) < 0.25) & (y.max(axis=1) > 0.25))
+    scene.fracture.changed()
+    scene.balance.edges_broke(graph.pattern)
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
+    X = contact._surface.points
+    inside = (X[:, 0] > 0.05) & (X[:, 0] < 0.95) & (X[:, 1] > 0.05) & (X[:, 1] < 0.45)
+    assert inside.sum() > 10 and contact.area[inside].min() > 0
+
+
+def test_an_obstacle_inside_the_body_is_refused() -> None:
+    with pytest.raises(InputError, match=r"obstacle\.0: floor overlaps the body at the start, by 0\.05 m"):
+        make_scene(obstacle=[floor(0.05)])
+
+
+def test_a_study_without_obstacles_imports_no_contact() -> None:
+    code = "import sys; from support.scenes import *; make_scene(); print([n for n in sys.modules if 'contact' in n])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=TESTS, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
