@@ -17,14 +17,13 @@ The caller maps nodes to points of the surface and forces back: x = W u and W^T 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import ipctk
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .crossings import NONE, crossings
+from .near import Kind, Near, longest
 from .slip import Friction, projection
 
 Values = npt.NDArray[np.float64]
@@ -33,32 +32,7 @@ Flags = npt.NDArray[np.bool_]
 
 EDGES = 0.5  # of the distance of the barrier
 MARGIN = 1.0  # of the distance of the barrier: how far points may move before candidates are looked for again
-KEPT = 0.1  # of a gap is left by the longest step
 MOST = 100  # pieces of a step
-ROUNDS = 1000  # of the collision detection: faces that slide on each other would take for ever
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """Points against elements, or edges against edges: its barrier, and the candidates that it does not look at."""
-
-    barrier: ipctk.BarrierPotential
-    drop: str
-
-    def candidates(self, mesh: ipctk.CollisionMesh, *x: Values, radius: float) -> ipctk.Candidates:
-        """Pairs nearer than twice `radius` (m) at x, or on the way from one x to the other."""
-        found = ipctk.Candidates()
-        found.build(mesh, *x, radius, ipctk.LBVH())
-        setattr(found, self.drop, [])
-        return found
-
-    def touching(self, candidates: ipctk.Candidates, mesh: ipctk.CollisionMesh, x: Values) -> ipctk.NormalCollisions:
-        """Those of the candidates on which the barrier acts."""
-        pairs = ipctk.NormalCollisions()
-        pairs.use_area_weighting = True
-        pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
-        pairs.build(candidates, mesh, x, self.barrier.dhat)
-        return pairs
 
 
 class Pairs:
@@ -82,37 +56,34 @@ class Pairs:
         # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
         kinds = [((1 + solid) * stiffness, 1.0, "ee_candidates")]
         kinds += [(stiffness, EDGES, "fv_candidates")] if solid else []
-        self._kinds = [_Kind(ipctk.BarrierPotential(share * distance, k, True), drop) for k, share, drop in kinds]
-        self._ccd = ipctk.AdditiveCCD(ROUNDS, 1.0 - KEPT)
-        self._margin, self._radius = MARGIN * distance, (0.5 + MARGIN) * distance
+        made = [Kind(ipctk.BarrierPotential(share * distance, k, True), drop) for k, share, drop in kinds]
+        self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction = friction
-        self._near: list[ipctk.Candidates] = []
-        self._near_at: Values | None = None
 
     # --- the barrier ---
 
     def energy(self, x: Values) -> float:
         """E(x), J."""
         on = self._mesh.vertices(x)
-        return float(sum(kind.barrier(pairs, self._mesh, on) for kind, pairs in self._touching(on)))
+        return float(sum(kind.barrier(pairs, self._mesh, on) for kind, pairs in self._near.touching(on)))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
         on = self._mesh.vertices(x)
-        found = sum(kind.barrier.gradient(pairs, self._mesh, on) for kind, pairs in self._touching(on))
+        found = sum(kind.barrier.gradient(pairs, self._mesh, on) for kind, pairs in self._near.touching(on))
         return np.asarray(self._mesh.to_full_dof(found)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, the share of each pair without its negative eigenvalues."""
         on, how = self._mesh.vertices(x), projection(exact=exact)
-        found = sum(kind.barrier.hessian(pairs, self._mesh, on, how) for kind, pairs in self._touching(on))
+        found = sum(kind.barrier.hessian(pairs, self._mesh, on, how) for kind, pairs in self._near.touching(on))
         return csr_matrix(self._mesh.to_full_dof(found))
 
     def least_gap(self, x: Values) -> float:
         """The least distance between elements on which the barrier acts, m; infinite where there is none."""
         on = self._mesh.vertices(x)
-        squared = [pairs.compute_minimum_distance(self._mesh, on) for _, pairs in self._touching(on)]
+        squared = [pairs.compute_minimum_distance(self._mesh, on) for _, pairs in self._near.touching(on)]
         return float(np.sqrt(min(squared)))
 
     # --- friction ---
@@ -124,7 +95,7 @@ class Pairs:
         """
         on = self._mesh.vertices(x)
         parts = []
-        for kind, pairs in self._touching(on):
+        for kind, pairs in self._near.touching(on):
             part = ipctk.TangentialCollisions()
             part.build(self._mesh, on, pairs, kind.barrier, self._friction)
             parts.append(part)
@@ -139,18 +110,13 @@ class Pairs:
         the pair that would meet is left at least KEPT of its distance at the begin of the piece.
         """
         on, way = self._mesh.vertices(x), self._mesh.vertices(to) - self._mesh.vertices(x)
-        pieces = max(1, int(np.ceil(_longest(way) / self._edge)))
+        way -= way.mean(axis=0)  # what all have in common brings nothing together
+        pieces = max(1, int(np.ceil(longest(way) / self._edge)))
         for piece in range(min(pieces, MOST)):
-            share = self._free(on + piece / pieces * way, on + (piece + 1) / pieces * way)
+            share = self._near.free(on + piece / pieces * way, on + (piece + 1) / pieces * way)
             if share < 1.0:
                 return (piece + share) / pieces
         return min(pieces, MOST) / pieces
-
-    def _free(self, on: Values, end: Values) -> float:
-        near = self._near
-        if not (self._is_near(on) and self._is_near(end)):
-            near = [kind.candidates(self._mesh, on, end, radius=0.0) for kind in self._kinds]
-        return float(min(each.compute_collision_free_stepsize(self._mesh, on, end, 0.0, self._ccd) for each in near))
 
     def overlaps(self, x: Values) -> Ints:
         """(k, 2) elements that cut each other."""
@@ -166,22 +132,3 @@ class Pairs:
         flags = np.any(self.gradient(x) != 0, axis=1)[self._elements].any(axis=1)
         flags[self.overlaps(x)] = True
         return np.asarray(flags)
-
-    # --- candidates ---
-
-    def _touching(self, on: Values) -> list[tuple[_Kind, ipctk.NormalCollisions]]:
-        if not self._is_near(on):
-            self._near = [kind.candidates(self._mesh, on, radius=self._radius) for kind in self._kinds]
-            self._near_at = on.copy()
-        pairs = [kind.touching(near, self._mesh, on) for kind, near in zip(self._kinds, self._near, strict=True)]
-        return list(zip(self._kinds, pairs, strict=True))
-
-    def _is_near(self, on: Values) -> bool:
-        """Whether no point has moved so far that a pair within reach may be missing among the candidates."""
-        if self._near_at is None:
-            return False
-        return _longest(on - self._near_at) <= self._margin
-
-
-def _longest(vectors: Values) -> float:
-    return float(np.sqrt(np.max(np.sum(vectors**2, axis=1), initial=0.0)))

@@ -1,9 +1,9 @@
 """Coulomb friction with pressures and directions held: a potential of the sliding (Li et al. 2020, IPC, eq. 19).
 
-    E(x) = mu sum_k N_k f(|T_k^T (x - x_0)|),   f(y) = y - e/3 ... for y > e, with f' rising from 0 to 1 over 0 < y < e
+    E(x) = mu sum_k N_k f(|T_k^T (x - x_0)|),   f(y) = y for y > e, -y^3 / (3 e^2) + y^2 / e + e / 3 below
 
-N_k: what presses a pair together, N; T_k: its tangents; x_0: where the step began; e: `slip`, m. Its gradient is the
-friction of a backward Euler step, its size at most mu N_k and its direction against the sliding.
+N_k: what presses a pair together, N; T_k: its tangents; x_0: where the step began; e: `slip`, m. f' rises from 0 to 1,
+so that the gradient is the friction of a backward Euler step: against the sliding, and mu N_k at most.
 """
 
 from __future__ import annotations
