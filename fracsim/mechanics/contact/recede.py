@@ -1,5 +1,8 @@
 """Where the two sides of a new crack stand for contact: apart by a gap, so that no barrier acts as an edge breaks.
 
+A gap of twice the distance of the barrier, itself 3 % of an edge, leaves no pair within it on meshes of gmsh, whichever
+edges break, and room for a state of strain of about 1 %. With more strain, or slivers: Pairs.crowded.
+
 Every copy goes towards the mean of the nodes that it follows, so far that all walls of the crack at it recede by half
 the gap along their normals; the boundary of the body keeps its place. (A fixed share of the edge, METHOD section 9,
 leaves walls that are aslant to their edge nearer to each other: half of the gap on a lattice, a fifth on worse
