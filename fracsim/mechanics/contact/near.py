@@ -1,0 +1,79 @@
+"""Which elements of a surface are near each other: candidates, kept while points move little, and pairs that touch.
+
+Two kinds of pairs: points against elements, and in 3D edges against edges, each with its own barrier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ipctk
+import numpy as np
+import numpy.typing as npt
+
+Values = npt.NDArray[np.float64]
+
+KEPT = 0.1  # of a gap is left by a step
+ROUNDS = 1000  # of the collision detection: faces that slide on each other would take for ever
+CCD = ipctk.AdditiveCCD(ROUNDS, 1.0 - KEPT)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """The barrier of one kind of pairs, and the list of ipctk's candidates that is not looked at."""
+
+    barrier: ipctk.BarrierPotential
+    drop: str
+
+    def candidates(self, mesh: ipctk.CollisionMesh, *x: Values, radius: float) -> ipctk.Candidates:
+        """Pairs nearer than twice `radius` (m) at x, or on the way from one x to the other."""
+        found = ipctk.Candidates()
+        found.build(mesh, *x, radius, ipctk.LBVH())
+        setattr(found, self.drop, [])
+        return found
+
+    def touching(self, candidates: ipctk.Candidates, mesh: ipctk.CollisionMesh, x: Values) -> ipctk.NormalCollisions:
+        """Those of the candidates on which the barrier acts."""
+        pairs = ipctk.NormalCollisions()
+        pairs.use_area_weighting = True
+        pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
+        pairs.build(candidates, mesh, x, self.barrier.dhat)
+        return pairs
+
+
+class Near:
+    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points."""
+
+    def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[Kind], distance: float, margin: float) -> None:
+        self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
+        self._candidates: list[ipctk.Candidates] = []
+        self._found: list[tuple[Kind, ipctk.NormalCollisions]] = []
+        self._looked_at = self._found_at = np.full(mesh.rest_positions.shape, np.nan)
+
+    def touching(self, x: Values) -> list[tuple[Kind, ipctk.NormalCollisions]]:
+        """The pairs of each kind on which its barrier acts; those of the last x are kept."""
+        if not np.array_equal(x, self._found_at):
+            if not self._holds(x):
+                self._candidates = [kind.candidates(self._mesh, x, radius=self._radius) for kind in self._kinds]
+                self._looked_at = x.copy()
+            each = zip(self._kinds, self._candidates, strict=True)
+            self._found = [(kind, kind.touching(candidates, self._mesh, x)) for kind, candidates in each]
+            self._found_at = x.copy()
+        return self._found
+
+    def free(self, x: Values, to: Values) -> float:
+        """The share in (0, 1] of the way from x to `to` on which nothing meets: KEPT of each gap is left."""
+        near = self._candidates
+        if not (self._holds(x) and self._holds(to)):
+            near = [kind.candidates(self._mesh, x, to, radius=0.0) for kind in self._kinds]
+        return float(min(each.compute_collision_free_stepsize(self._mesh, x, to, 0.0, CCD) for each in near))
+
+    def _holds(self, x: Values) -> bool:
+        """Whether no pair within reach can be missing: points have moved little but for what they have in common."""
+        moved = x - self._looked_at
+        return longest(moved - moved.mean(axis=0)) <= self._margin
+
+
+def longest(vectors: Values) -> float:
+    """The greatest length of the rows."""
+    return float(np.sqrt(np.max(np.sum(vectors**2, axis=1), initial=0.0)))
