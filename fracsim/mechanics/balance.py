@@ -240,6 +240,17 @@ class Balance:
             u = term.reachable(u)
         return u
 
+    def potential(self) -> tuple[float, float]:
+        """The incremental potential, whose derivative is r, at the current u, and the size of what it is the sum of,
+        J (collective)."""
+        parts = total(self.domain.comm, np.array([term.potential() or 0.0 for term in self.terms]))
+        return float(parts.sum()), float(np.abs(parts).sum())
+
+    @cached_property
+    def conservative(self) -> bool:
+        """Whether r is the derivative of `potential` (collective)."""
+        return all([term.potential() is not None for term in self.terms])
+
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""
         for term in self.terms:

@@ -44,6 +44,11 @@ class Drag(Term):
         u_v = self._level.u_v
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_v)] - u_v))
 
+    def potential(self) -> float:
+        """a c_v (u - u_v) . M (u - u_v) / 2, J."""
+        rate = self.acceleration()
+        return float(rate @ self._mass.times(rate)) / (2 * self.mass_factor) if self.mass_factor else 0.0
+
     def drag(self) -> Values:
         """(owned dofs,) a M v, N."""
         assert self._level is not None

@@ -68,6 +68,11 @@ class Inertia(Term):
         u_a = self._level.u_a
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_a)] - u_a)) if self.mass_factor else None
 
+    def potential(self) -> float:
+        """c_a (u - u_a) . M (u - u_a) / 2, J."""
+        a = self.acceleration()
+        return 0.0 if a is None else float(a @ self._mass.times(a)) / (2 * self.mass_factor)
+
     def scale(self) -> Values | None:
         """(owned dofs,) M c_a (u - u_a), M lumped, N."""
         assert self._level is not None

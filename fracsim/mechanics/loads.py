@@ -56,6 +56,7 @@ class DeadLoads(Term):
     def __init__(
         self,
         assembler: Assembler,
+        u: fem.Function,
         *,
         tractions: Sequence[OnFacets] = (),
         gravity: tuple[Expr, TimeFunction] | None = None,
@@ -63,7 +64,7 @@ class DeadLoads(Term):
     ) -> None:
         """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
         domain, d = assembler.domain, assembler.domain.dim
-        self._assembler, self._moving = assembler, _Moving(domain)
+        self._assembler, self._u, self._moving = assembler, u, _Moving(domain)
         w, dx = ufl.TestFunction(domain.space), ufl.dx(domain=domain.mesh)
         facets, of_volume = [each for each, _ in tractions], []
         if gravity is not None:
@@ -87,6 +88,10 @@ class DeadLoads(Term):
     def add_force(self, rows: Values) -> None:
         """r -= f, the nodal forces (owned dofs,) of all loads at the level, N."""
         rows -= self.force
+
+    def potential(self) -> float:
+        """-f . u, J."""
+        return -float(self.force @ self._u.x.array[: len(self.force)])
 
     def applied(self) -> Values:
         """(owned dofs,) f, N."""

@@ -212,6 +212,11 @@ class Stress(Term):
         """int psi dX at the current u, this rank's share, J."""
         return float(fem.assemble_scalar(self._energy_form))
 
+    def potential(self) -> float | None:
+        """int psi dX at the current u, J; None where the tangent is not symmetric, or steps are solved with their own
+        flow."""
+        return self.stored() if self.symmetric and self._flow_form is None else None
+
     def force(self) -> Values:
         """(owned dofs,) forces of the stress alone at the current u, N."""
         return self._assembler(self._alone)

@@ -115,8 +115,8 @@ class Term:
         return u
 
     def potential(self) -> float | None:
-        """Energy whose derivative is its share of r at the current u, this rank's share, J; None: there is none, or it
-        is not known (collective)."""
+        """Energy whose derivative is its share of r at the current u, this rank's share, J (collective); None: there is
+        none. Where all terms have one their sum is what Newton's line search goes down."""
         return None
 
     def readings(self) -> dict[str, Callable[[], Values]]:

@@ -12,12 +12,14 @@ from ..mechanics.contact.obstacle import Obstacle
 from ..mechanics.contact.obstacles import Law, Obstacles
 from ..mechanics.contact.shapes import SHAPES
 from ..mechanics.material import MaterialFields
+from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..study import Contact, Study
 from ..study.conditions import Placing, obstacles
 
 DISTANCE = 0.05  # of the mean edge: a hundredth of it is where a press of a hundredth of Young's modulus holds
 STIFFNESS = 0.1  # of Young's modulus
+DISTANCE_ITSELF, STIFFNESS_ITSELF = 0.03, 0.03  # the same: ipctk's barrier presses 3.6 times as hard
 CREEP = 1e-3  # of the body's size, a second
 
 
@@ -25,6 +27,20 @@ def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: Materi
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
     entries = [_obstacle(each, number) for number, each in enumerate(obstacles(study, domain.dim))]
     return Obstacles(domain, u, entries, _law(study.contact or Contact(), domain, material))
+
+
+def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
+    """The term of a body that touches itself (collective). InputError without ipctk."""
+    try:
+        from ..mechanics.contact import itself
+    except ImportError:
+        raise InputError(
+            "[contact] needs ipctk, which this environment lacks: pip install fracsim[contact], or itself = false"
+        ) from None
+    distance = contact.distance or DISTANCE_ITSELF * domain.mean_edge
+    stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
+    creep = contact.creep or CREEP * domain.size
+    return itself.SelfContact(domain, u, itself.Law(distance, stiffness, contact.friction, creep))
 
 
 def _obstacle(entry: Placing, number: int) -> Obstacle:
@@ -36,6 +52,13 @@ def _obstacle(entry: Placing, number: int) -> Obstacle:
 
 
 def _law(contact: Contact, domain: Domain, material: MaterialFields) -> Law:
-    young = domain.comm.allreduce(float(np.max(material.young, initial=0.0)), op=MPI.MAX)
     distance = contact.distance or DISTANCE * domain.mean_edge
-    return Law(Barrier(contact.stiffness or STIFFNESS * young, distance), contact.creep or CREEP * domain.size)
+    return Law(
+        Barrier(contact.stiffness or STIFFNESS * _young(domain, material), distance),
+        contact.creep or CREEP * domain.size,
+    )
+
+
+def _young(domain: Domain, material: MaterialFields) -> float:
+    """The largest Young's modulus, Pa (collective)."""
+    return float(domain.comm.allreduce(float(np.max(material.young, initial=0.0)), op=MPI.MAX))

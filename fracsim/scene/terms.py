@@ -72,7 +72,7 @@ def _dead_loads(parts: Parts) -> Term | None:
         return None
     gravity = (parts.density, on_volume["gravity"]) if "gravity" in on_volume else None
     body_force = on_volume.get("body_force")
-    return DeadLoads(parts.assembler, tractions=tractions, gravity=gravity, body_force=body_force)
+    return DeadLoads(parts.assembler, parts.u, tractions=tractions, gravity=gravity, body_force=body_force)
 
 
 def _obstacles(parts: Parts) -> Term | None:
@@ -81,6 +81,14 @@ def _obstacles(parts: Parts) -> Term | None:
     from .contact import obstacles_of
 
     return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material)
+
+
+def _contact(parts: Parts) -> Term | None:
+    if parts.study.contact is None or not parts.study.contact.itself:
+        return None
+    from .contact import self_contact_of
+
+    return self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress.material)
 
 
 def _inertia(parts: Parts) -> Term | None:
@@ -102,6 +110,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
     "pressure": _pressure,
     "dead loads": _dead_loads,
     "obstacles": _obstacles,
+    "contact": _contact,
     "inertia": _inertia,
     "drag": _drag,
 }

@@ -39,6 +39,9 @@ FACTORISED = 100_000
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
+# Potentials that differ by less than this share of their terms are the same.
+ROUND_OFF = 1e4 * float(np.finfo(float).eps)
+
 # A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
 # preconditioner is made anew anyhow, every dead cell goes.
 SHRINK_BELOW = 0.9
@@ -70,13 +73,15 @@ class Solver:
         snes.setConvergenceTest(self._converged)
         if balance.limits_steps:
             snes.setLineSearchPreCheck(self._limit)
+            if balance.conservative:
+                snes.setObjective(lambda _, x: self._potential(x))
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
-        self._first = 0.0
+        self._first, self._height = 0.0, np.inf
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -194,6 +199,18 @@ class Solver:
             self.balance.update_reactions()
         krylov = snes.getLinearSolveIterations() + extended
         return SolveResult(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
+
+    def _potential(self, x: PETSc.Vec) -> float:
+        """The incremental potential at x, J: what the line search goes down with contact.
+
+        On the norm of r, which a barrier makes steep, it cuts good steps to nothing. Near the solution potentials
+        differ by round-off alone: those are returned as the same, so that whole steps are taken there.
+        """
+        self.balance.displace_to(x)
+        potential, size = self.balance.potential()
+        if not abs(potential - self._height) <= ROUND_OFF * size:
+            self._height = potential
+        return self._height
 
     # --- linear solves by themselves ---
 

@@ -159,6 +159,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
     if study.obstacle:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
+    if study.contact is not None and study.contact.itself:
+        yield f"contact     of the body with itself, friction {study.contact.friction:g}; detected on one rank"
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
     yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"

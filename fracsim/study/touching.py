@@ -55,8 +55,10 @@ class Obstacle(Table):
 
 
 class Contact(Table):
-    """[contact]: how contact acts."""
+    """[contact]: of the body and its pieces with themselves; and how obstacles act."""
 
-    distance: Positive | None = None  # m, gap from which on it acts; default 5 % of the mean edge
-    stiffness: Positive | None = None  # Pa; default a tenth of Young's modulus
+    itself: Flag = True  # false: obstacles alone
+    friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
+    distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
+    stiffness: Positive | None = None  # Pa; default 3 % of Young's modulus, obstacles a tenth
     creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the body's size a second

@@ -152,13 +152,13 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _contact_is_implicit(self) -> Study:
-        if self.obstacle and not self.time.kind.implicit:
+        wanted = "[[obstacle]]" if self.obstacle else "[contact]" if self.contact is not None else ""
+        if wanted and not self.time.kind.implicit:
             raise ValueError(
-                f'[[obstacle]] needs an implicit scheme, not time.scheme = "{self.time.scheme}"; choose '
-                '"backward-euler"'
+                f'{wanted} needs an implicit scheme, not time.scheme = "{self.time.scheme}"; choose "backward-euler"'
             )
-        if self.contact is not None and not self.obstacle:
-            raise ValueError("[contact] needs an [[obstacle]]; contact of a body with itself is not there yet")
+        if self.contact is not None and not self.contact.itself and not self.obstacle:
+            raise ValueError("[contact] has itself = false and there is no [[obstacle]]: nothing can touch; remove it")
         return self
 
     @model_validator(mode="after")

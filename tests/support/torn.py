@@ -237,6 +237,14 @@ RUNS: dict[str, dict[str, Any]] = {
                       "friction": 0.3}],
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.0}, "probe": [{"name": "grip", "on": "left"}],
     },
+    # torn, then pushed together until its pieces touch one another
+    "shut": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
+            "time": [0.0, 0.7, 1.4], "value": [[0.0, 0.0], [0.2, 0.02], [-0.1, 0.0]]}}],
+        "fracture": {"strength": 0.1, "radius": 0.1}, "contact": {"friction": 0.2},
+        "time": {"scheme": "backward-euler", "step": 0.025, "end": 1.4}, "probe": [{"name": "grip", "on": "right"}],
+    },
 }  # fmt: skip
 SURFACES = ("plate", "block")  # whose split surface is written
 # the same, each step solved with its own flow

@@ -17,14 +17,15 @@ motion            points and obstacle on their way: gaps, and bounds of how fast
 barrier           energy that keeps gaps open (IPC), and how far points may move without passing through
 friction          Coulomb friction as a lagged, smoothed potential (IPC)
 
-Contact of a surface with itself, by ipctk (no study asks for it yet):
+Contact of a body with itself, by ipctk:
 
+itself            the term of the balance
 pairs             barrier and friction between the elements of a surface; how far points may go
 near, slip        which elements are near each other; friction between them
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
 
-All but `obstacles` and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
+All but the two terms and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
 
 IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
 distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.

@@ -167,8 +167,11 @@ class Obstacles(Term):
         return sum(each.energy for each in self._touching())
 
     def potential(self) -> float:
-        """Barriers and friction at the current u, this rank's share, J (collective)."""
-        return sum(each.energy + each.friction_energy for each in self._touching())
+        """share^2 times barriers and friction at the end of the step, less what the start's forces do, this rank's
+        share, J (collective)."""
+        share, u = self._level.share, self._u.x.array[: self._owned]
+        energy = sum(each.energy + each.friction_energy for each in self._touching())
+        return energy if share == 1 else share**2 * energy - float(self._before @ u)
 
     def drag(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""

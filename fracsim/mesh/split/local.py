@@ -84,17 +84,11 @@ class LocalSurface:
         """(d nodes, nodes) d/dX_j of a nodal field, averaged over the intact cells around each node (collective)."""
         domain, d = self._domain, self._domain.dim
         cells = np.flatnonzero(~is_split(d)[pattern])
-        corners = domain.cell_nodes[cells].astype(np.int64)
-        X = domain.nodes[corners]
-        inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
-        slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # (cells, d, d + 1)
-        volume = domain.volumes[cells]
+        corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells]
         share = volume[:, None] / self._summed(corners, volume)[corners]
         number = self._global(corners.reshape(-1)).reshape(corners.shape)
-        entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
-        at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
-        of = np.broadcast_to(number[:, None, None, :], entries.shape)
-        return self._matrix(domain.node_count * d, 1, at.reshape(-1), of.reshape(-1), entries.reshape(-1), local=False)
+        entries = gradient_entries(domain.nodes[corners], share, number)
+        return self._matrix(domain.node_count * d, 1, *entries, local=False)
 
     def _summed(self, corners: Ints, volume: Values) -> Values:
         """(nodes,) volume of the cells around each node, on all ranks, m^d (collective)."""
@@ -124,6 +118,41 @@ class LocalSurface:
         matrix.setValuesIJV(indices[0], indices[1], summed.data, PETSc.InsertMode.ADD_VALUES, indices[2])
         matrix.assemble()
         return matrix
+
+
+def whole_weights(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], places: Values) -> csr_matrix:
+    """(n, nodes) w of points at reference `places` (n, d), which may be others than the surface's own; one rank that
+    has the whole mesh."""
+    d, count, follow = skeleton.dim, len(made.points), made.follow
+    parents = np.diff(follow.start)
+    rows = np.repeat(np.arange(count), parents)
+    share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
+    mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
+    corners = skeleton.cells[~is_split(d)[pattern]]
+    X = skeleton.points[corners]
+    volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
+    around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
+    at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
+    gradients = csr_matrix((values, (at, of)), shape=(d * follow.nodes, follow.nodes))
+    of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
+    arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
+                      shape=(count, d * follow.nodes))  # fmt: skip
+    return (mean + arms @ gradients).tocsr()
+
+
+def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:
+    """Entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
+
+    `X` (cells, d + 1, d) corners, `number` (cells, d + 1) of their nodes, `share` (cells, d + 1) of each cell in the
+    average around each of its nodes.
+    """
+    d = X.shape[2]
+    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
+    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
+    entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
+    at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
+    of = np.broadcast_to(number[:, None, None, :], entries.shape)
+    return at.reshape(-1), of.reshape(-1), entries.reshape(-1)
 
 
 def _mesh_of(domain: Domain) -> MeshData:

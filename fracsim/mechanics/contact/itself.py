@@ -1,0 +1,233 @@
+"""Contact of a body with itself, and of its pieces with one another: a term of the balance (METHOD section 9).
+
+The split surface lies on rank 0, which finds what touches (pairs) and hands forces and stiffness down to the nodes:
+x = W u, f = W^T dE/dx, K = W^T d2E/dx2 W. All else stays where it is. What rank 0 does alone in a step is in the
+timings of Pairs: for 50,000 triangles less than a step of the body inside them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix, kron
+
+from ...mesh.domain import Domain
+from ...mesh.ranks import from_root, on_root
+from ...mesh.split.build import split
+from ...mesh.split.local import whole_weights
+from ...mesh.split.skeleton import Skeleton
+from ..term import Level, Term
+from .pairs import Pairs
+from .recede import receded
+from .slip import Friction
+
+Values = npt.NDArray[np.float64]
+GAP = 2.0  # between the sides of a new crack, in distances of the barrier (recede)
+
+
+@dataclass(frozen=True)
+class Law:
+    """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s."""
+
+    distance: float
+    stiffness: float
+    friction: float
+    creep: float
+
+
+class _Surface:
+    """The split surface and its pairs for a state of damage, on rank 0.
+
+    Attributes:
+        weights: (n, nodes) W.    rest: (n, d) reference places, new walls drawn back, m.    pairs: what may touch.
+    """
+
+    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values) -> None:
+        """`u`: (nodes, d) where the body is, m: walls that are crowded there are left out."""
+        made = split(skeleton, pattern)
+        self.rest = receded(made, GAP * law.distance)
+        self.weights = whole_weights(made, skeleton, pattern, self.rest)
+        how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
+        self.pairs = Pairs(self.rest, made.elements, **how)
+        if pattern.any():
+            new = (made.origin == 0) & self.pairs.crowded(self.places(u))
+            if new.any():
+                self.pairs = Pairs(self.rest, made.elements[~new], **how)
+
+    def places(self, u: Values) -> Values:
+        """(n, d) x of nodal displacements (nodes, d), m."""
+        return np.asarray(self.rest + self.weights @ u)
+
+    def handed_down(self, forces: Values) -> Values:
+        """(nodes, d) of forces (n, d) at the points, N."""
+        return np.asarray(self.weights.T @ forces)
+
+    def stiffness(self, H: csr_matrix) -> csr_matrix:
+        """(nodes d, nodes d) of (n d, n d), N/m."""
+        W = kron(self.weights, np.eye(self.rest.shape[1]), format="csr")
+        return (W.T @ H @ W).tocsr()
+
+
+class SelfContact(Term):
+    """A body that cannot pass through itself."""
+
+    name = "contact"
+
+    def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
+        """InputError where the surface at rest cuts itself (collective)."""
+        self.law, self._domain, self._u = law, domain, u
+        self._owned, self.comm = domain.node_count * domain.dim, domain.comm
+        self._skeleton = None if domain.source is None else Skeleton(domain.source)
+        first = domain.space.dofmap.index_map.local_range[0]
+        self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
+        self._pattern = np.zeros(domain.cell_count, np.uint8)
+        self._before = np.zeros(self._owned)
+        self._rebuild()
+
+    # --- where the surface is ---
+
+    def _rebuild(self) -> None:
+        """The surface of the damage of now (collective)."""
+        pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
+
+        def made() -> _Surface:
+            assert self._skeleton is not None and pattern is not None and u is not None
+            return _Surface(self._skeleton, pattern, self.law, u)
+
+        self._surface = on_root(self.comm, made)
+        self._x: Values | None = None
+        self._start: Values | None = None
+        self._rubbing: Friction | None = None
+        self._moved = True
+
+    def _gathered(self, u: Values) -> Values | None:
+        """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
+        return self._domain.gather_nodes(np.asarray(u).reshape(-1, self._domain.dim))
+
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+        """New walls may touch from here on, unless something touches them as they appear (collective)."""
+        self._pattern = pattern
+        self._rebuild()
+        self._rubbing, self._moved = None, True
+
+    def begin(self, level: Level) -> None:
+        """A step begins: friction is that of its start."""
+        self._level, self._moved, self._rubbing = level, True, None
+        if not level.dt:
+            return
+        self._start = self._placed(level.u)
+        if self.law.friction and self._surface is not None and self._start is not None:
+            x, slip = self._start, self.law.creep * level.dt
+            self._rubbing = self._surface.pairs.lag_friction(x, x, slip)
+        if level.share < 1:
+            self._before = (1 - level.share) * self._handed_down(self._start)
+
+    def displaced(self) -> None:
+        """What touches has to be found anew."""
+        self._moved = True
+
+    def _places(self) -> Values | None:
+        """(n, d) at the end of the step that belongs to the current u, on rank 0 (collective)."""
+        if self._moved:
+            self._x, self._moved = self._placed(self._at_end(self._u.x.array[: self._owned])), False
+        return self._x
+
+    def _placed(self, u: Values) -> Values | None:
+        """(n, d) x of the owned displacements u, on rank 0 (collective)."""
+        nodal = self._gathered(u)
+        return None if self._surface is None or nodal is None else self._surface.places(nodal)
+
+    def _at_end(self, u: Values) -> Values:
+        level = self._level
+        return u if level.share == 1 else np.asarray(level.u + (u - level.u) / level.share)
+
+    # --- what it adds to the balance ---
+
+    def _handed_down(self, x: Values | None) -> Values:
+        """(owned dofs,) forces on the nodes with the surface at x (n, d), given on rank 0, N (collective)."""
+
+        def found() -> Values:
+            assert self._surface is not None and x is not None
+            gradient = self._surface.pairs.gradient(x)
+            if self._rubbing is not None:
+                gradient = gradient + self._rubbing.gradient(x)
+            return self._surface.handed_down(-gradient)
+
+        return np.asarray(self._domain.gather_nodes.scatter(on_root(self.comm, found))).reshape(-1)
+
+    def add_force(self, rows: Values) -> None:
+        """r -= forces (collective)."""
+        rows -= self.scale()
+
+    def scale(self) -> Values:
+        """(owned dofs,) forces at the level, N (collective)."""
+        share, forces = self._level.share, self._handed_down(self._places())
+        return forces if share == 1 else np.asarray(share * forces + self._before)
+
+    def coupling(self) -> PETSc.Mat | None:
+        """Minus the derivative of the forces, where anything is in touch (collective)."""
+        x = self._places()
+
+        def found() -> csr_matrix:
+            assert self._surface is not None and x is not None
+            H = self._surface.pairs.hessian(x)
+            return H if self._rubbing is None else (H + self._rubbing.hessian(x)).tocsr()
+
+        H = on_root(self.comm, found)
+        if not self.comm.bcast(H is not None and H.nnz):
+            return None
+        return self._matrix(None if H is None or self._surface is None else self._surface.stiffness(H))
+
+    def _matrix(self, whole: csr_matrix | None) -> PETSc.Mat:
+        """A matrix over the dofs from rank 0's, in the order of the input mesh (collective)."""
+        d = self._domain.dim
+        matrix = PETSc.Mat().create(self.comm)
+        matrix.setSizes(((self._owned, PETSc.DETERMINE),) * 2, bsize=d)
+        matrix.setType(PETSc.Mat.Type.AIJ)
+        matrix.setUp()
+        if whole is not None:
+            assert self._numbers is not None
+            dofs = (d * self._numbers[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
+            start, columns = whole.indptr.astype(PETSc.IntType), dofs[whole.indices]
+            matrix.setValuesIJV(start, columns, whole.data, PETSc.InsertMode.ADD_VALUES, dofs)
+        matrix.assemble()
+        return matrix
+
+    def stored(self) -> float:
+        """Energy of the barrier at the current u, on rank 0, J (collective)."""
+        x = self._places()
+        return 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
+
+    def potential(self) -> float:
+        """share^2 times barrier and friction at the end of the step, less what the start's forces do, this rank's
+        share, J (collective)."""
+        share, x, energy = self._level.share, self._places(), self.stored()
+        if self._rubbing is not None and x is not None:
+            energy += self._rubbing.energy(x)
+        if share == 1:
+            return energy
+        return share**2 * energy - float(self._before @ self._u.x.array[: self._owned])
+
+    # --- how far Newton's method may go ---
+
+    def longest_step(self, change: Values) -> float:
+        """Share of a change of u on the way of which nothing meets (collective)."""
+        x, way = self._places(), self._gathered(np.divide(change, self._level.share))
+        return from_root(self.comm, lambda: self._free(x, way))
+
+    def _free(self, x: Values | None, way: Values | None) -> float:
+        assert self._surface is not None and x is not None and way is not None
+        return self._surface.pairs.longest_step(x, x + self._surface.weights @ way)
+
+    def reachable(self, u: Values) -> Values:
+        """(owned dofs,) a first guess of u as far on the way from the start as nothing meets (collective)."""
+        level = self._level
+        if not level.dt:
+            return u
+        x, way = self._start, self._gathered(self._at_end(u) - level.u)
+        share = from_root(self.comm, lambda: self._free(x, way))
+        return u if share == 1 else np.asarray(level.u + share * (u - level.u))

@@ -1,0 +1,82 @@
+"""Contact of a body with itself and of its pieces with one another, in whole scenes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+
+from fracsim.mechanics.contact.itself import SelfContact
+from fracsim.meshes.builders.box import Box
+from support.scenes import each_step, make_scene, march, positions
+
+FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
+SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
+
+
+def two_blocks(path: Any, dim: int, gap: float) -> str:
+    """A file with two blocks of side 1 along x, `gap` apart, their meshes not alike."""
+    left = Box(size=(1.0,) * dim, h=0.34).build()
+    right = Box(size=(1.0,) * dim, h=0.5, origin=(1.0 + gap, *[0.05] * (dim - 1))).build()
+    points = np.concatenate([left.points, right.points])
+    cells = np.concatenate([left.cells, right.cells + len(left.points)])
+    kind = {2: "triangle", 3: "tetra"}[dim]
+    if dim == 2:
+        points = np.pad(points, ((0, 0), (0, 1)))
+    meshio.Mesh(points, [(kind, cells)]).write(path / "two.vtu")
+    return str(path / "two.vtu")
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_two_bodies_collide(tmp_path: Any, dim: int) -> None:
+    """Thrown at each other: momentum is kept to the solver's tolerance, they touch, and nothing cuts anything."""
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, dim, 0.05)}, material=SOFT, contact={}, solver=FINE,
+        time={"scheme": "backward-euler", "step": 0.01, "end": 0.3},
+    )  # fmt: skip
+    X = positions(scene)
+    v = np.zeros_like(X)
+    v[X[:, 0] < 1.01, 0] = 1.0
+    state.v = v.reshape(-1)
+    state.settle()
+    m = scene.balance.mass.lumped.reshape(-1, dim)
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    before, touched = (m * v).sum(axis=0), 0
+    for _ in each_step(scene, state):
+        x = contact._places()
+        assert len(contact._surface.pairs.overlaps(x)) == 0
+        touched += contact.stored() > 0
+        after = (m * state.v.reshape(-1, dim)).sum(axis=0)
+        np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
+    right = X[:, 0] > 1.01
+    assert touched > 3 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.3 * before[0]
+    assert scene.balance.kinetic_energy(state.v) + state.elastic < 0.5 * before[0] * 1.001
+
+
+def test_a_cracked_column_carries_its_upper_half() -> None:
+    """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
+    reads nothing."""
+    carried = []
+    for contact in ({"contact": {}}, {}):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [0.5, 1.0], "h": 0.125}, material=SOFT | {"energy": "corotated"},
+            fracture={"strength": 1e9}, boundary=[
+                {"on": "bottom", "fix": "xy"},
+                {"on": "top", "displacement": {"time": [0.0, 0.4], "value": [[0.0, 0.0], [0.0, -0.05]]}}],
+            probe=[{"name": "base", "on": "bottom"}], damping={"mass": 20.0}, solver=FINE,
+            time={"scheme": "backward-euler", "step": 0.01, "end": 0.6}, **contact,
+        )  # fmt: skip
+        graph = scene.fracture.graph
+        y = scene.domain.nodes[graph.edge_nodes][:, :, 1]
+        graph.break_edges((y.min(axis=1) < 0.45) & (y.max(axis=1) > 0.45))
+        scene.fracture.restored()
+        scene.balance.damage_changed()
+        scene.balance.edges_broke(graph.pattern)
+        state.remember()
+        march(scene, state)
+        carried.append(scene.probes()[1])
+    # 0.05 m less the gap of the crack over a column of 1 m: E A strain, about
+    assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
+    assert abs(carried[1]) < 1e-3 * carried[0]
