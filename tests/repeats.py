@@ -51,6 +51,7 @@ REPEATS = (
     "test_evidence_stability.py::test_two_approaches_fail_and_chi_holds",
     # surfaces in 3D: of the same test in 2D
     "test_brittle.py::test_moving_nodes_over_spares_a_curved_surface[3]",
+    "test_barrier.py::test_nothing_tunnels_through_a_thin_capsule[2]",
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[stadium]",
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[ring]",
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[drum]",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,9 @@ from mpi4py import MPI
 
 from fracsim.fracture.breaking import Breaking
 from fracsim.fracture.edge_law import Brittle
-from fracsim.mesh.edges import EdgeGraph
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from support.ranks import run_on_ranks
+from support.ranks import OnRanks
 from support.scenes import Values, make_scene, make_study, march
 
 
@@ -60,26 +58,14 @@ def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
     assert graph.broken[aligned].all() and np.all(graph.integrity[aligned] == 0)
 
 
-def weakened(comm: MPI.Comm) -> tuple[Values, int]:
-    """(n, 1) integrities after each rank has lowered what it sees of the edges, and how many broke (collective)."""
-    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"})
-    graph, domain = EdgeGraph(scene.domain), scene.domain
-    values = np.ones(len(graph.integrity))
-    np.minimum.at(values, graph.cell_edges, (domain.cell_input % 5 / 4)[:, None])  # each cell says its own number
-    count = graph.weaken(values)[0]
-    assert graph.weaken(np.ones(len(values))) == (0, 0)  # never rises
-    found = graph.gather_weakened()
-    return (np.column_stack(found) if found is not None else np.empty(0)), count
-
-
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (2, 3))
-def test_the_least_of_all_ranks_counts(tmp_path: Path, ranks: int) -> None:
+def test_the_least_of_all_ranks_counts(on_ranks: OnRanks, ranks: int) -> None:
     """What an edge keeps is the least that any cell says, on whichever rank it is."""
-    alone, count = weakened(MPI.COMM_SELF)
-    found = run_on_ranks("test_edge_law", ranks, tmp_path)
-    np.testing.assert_array_equal(found["integrity"], alone)
-    assert found["count"] == count > 0 and len(np.unique(alone[:, 2])) == 4
+    alone, found = (on_ranks(count)[0] for count in (1, ranks))
+    integrity = found["weakened-integrity"]
+    np.testing.assert_array_equal(integrity, alone["weakened-integrity"])
+    assert found["weakened-count"] == alone["weakened-count"] > 0 and len(np.unique(integrity[:, 2])) == 4
 
 
 def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
@@ -95,9 +81,3 @@ def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)
     np.testing.assert_array_equal(again.scene.fracture.graph.pattern, graph.pattern)
     assert again.state.memory["damage"].integrity.min() == 0
-
-
-if __name__ == "__main__":
-    integrity, broke = weakened(MPI.COMM_WORLD)
-    if MPI.COMM_WORLD.rank == 0:
-        np.savez(sys.argv[1], integrity=integrity, count=broke)

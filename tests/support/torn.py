@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx.fem import IntegralType
+from mpi4py import MPI
 
 from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.nonlocal_average import NonlocalAverage
@@ -17,10 +18,10 @@ from fracsim.mesh.domain import Domain
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.pieces import find_pieces
 from fracsim.mesh.ranks import total
-from fracsim.scene import Scene
+from fracsim.scene import Scene, build_scene
 from fracsim.stepping.state import State
 
-from .scenes import Values, each_step, make_scene
+from .scenes import Values, each_step, make_scene, make_study
 from .surface_run import WrittenSurface
 
 Found = dict[str, npt.NDArray[Any]]
@@ -128,6 +129,20 @@ def edges(domain: Domain) -> Found:
         order = np.lexsort(keys.T[::-1])
         found |= {"edges-keys": keys[order], "edges-noise": noise[order]}
     return found
+
+
+def weakened(comm: MPI.Intracomm) -> tuple[npt.NDArray[Any] | None, int]:
+    """(n, 3) keys and integrities after each rank has lowered what it sees of the edges, on rank 0, and how many broke
+    (collective)."""
+    mesh = {"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"}
+    domain = build_scene(comm, make_study(mesh=mesh)).domain
+    graph = EdgeGraph(domain)
+    values = np.ones(len(graph.integrity))
+    np.minimum.at(values, graph.cell_edges, (domain.cell_input % 5 / 4)[:, None])  # each cell says its own number
+    count = graph.weaken(values)[0]
+    assert graph.weaken(np.ones(len(values))) == (0, 0)  # never rises
+    found = graph.gather_weakened()
+    return (None if found is None else np.column_stack(found)), count
 
 
 def weaken(scene: Scene) -> None:
@@ -283,4 +298,6 @@ def compared(folder: Path) -> Found:
         found |= pieces(label)
     for name in RUNS:
         found |= run(name, folder if name in SURFACES else None)
+    integrity, count = weakened(MPI.COMM_WORLD)
+    found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
     return found | dead_cells() | by_rows()

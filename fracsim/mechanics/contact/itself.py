@@ -84,8 +84,8 @@ class SelfContact(Term):
         self._skeleton = None if domain.source is None else Skeleton(domain.source)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
-        self._pattern = np.zeros(domain.cell_count, np.uint8)
-        self._before = np.zeros(self._owned)
+        self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
+        self._before: Values = np.zeros(self._owned)
         self._rebuild()
 
     # --- where the surface is ---
