@@ -18,14 +18,15 @@ demo:
 workers := $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 2 ? 2 : n > 8 ? 8 : n)))
 parallel := -n $(workers) --dist loadgroup
 
+on_ranks = $(shell grep -l "mark.ranks" $(wildcard tests/test_*.py))
 # Three ranks on two cores wait for one another at every message: beside other tests for minutes, alone for seconds.
 test: readers
 	./env pytest $(parallel) -m "not slow and not ranks"
-	./env pytest -m "not slow and ranks"
+	./env pytest -m "not slow and ranks" $(on_ranks)
 
 test-all: readers
 	./env pytest $(parallel) -m "not ranks"
-	./env pytest -m ranks
+	./env pytest -m ranks $(on_ranks)
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:

@@ -11,7 +11,8 @@ REPEATS = (
     # a checkpoint of two ranks: on one; the exit code of what does not converge: of the other codes on two ranks
     "test_restart.py::test_a_checkpoint_of_two_ranks_goes_on_with_others[3]",
     "test_restart.py::test_the_exit_code_of_a_run_that_does_not_converge",
-    # a full disk: rows of history on two ranks, a checkpoint on two ranks, fields.xdmf; one that stays full: history
+    # a full disk: rows of history, and fields.xdmf, on two ranks; one that stays full: history
+    "test_cannot_write.py::test_a_full_disk_ends_the_run[checkpoint-2]",
     "test_cannot_write.py::test_a_full_disk_ends_the_run[xml-0]",
     "test_cannot_write.py::test_a_full_disk_ends_the_run[surface-2]",
     "test_cannot_write.py::test_a_full_disk_ends_the_run[pieces-0]",
@@ -25,7 +26,10 @@ REPEATS = (
     "test_sweep.py::test_runs_on_two_ranks",
     # whose a folder is: on one process
     "test_own_files.py::test_a_folder_of_the_users_is_left_alone[2]",
-    # studies on the figure: jelly-figure runs; the blow lands on the figure of a builder
+    # studies on a figure: those on a vase run as they do
+    "test_studies.py::test_a_coarse_version_runs[jelly-figure]",
+    "test_studies.py::test_what_the_comments_offer_is_valid[struck-figure]",
+    "test_studies.py::test_what_the_comments_offer_is_valid[jelly-figure]",
     "test_studies.py::test_a_coarse_version_runs[struck-figure]",
     "test_studies.py::test_the_blow_lands_on_a_surface_of_ones_own",
     "test_studies.py::test_full_sizes_are_those_of_the_paper",
@@ -35,7 +39,18 @@ REPEATS = (
     "test_meshes_fill.py::test_the_unit_of_length_does_not_matter[torus-shell1-0.2-1000.0]",
     "test_meshes_fill.py::test_cells_are_expected_within_a_factor[torus]",
     "test_meshes_fill.py::test_volume_is_that_of_the_surface[notched-bar",
+    "test_meshes_builders.py::test_cells_are_positive_and_the_check_has_nothing_to_say[figure-0.4",
+    "test_meshes_builders.py::test_facets_are_shared_by_two_cells_and_the_boundary_is_closed[figure-0.4",
+    "test_meshes_builders.py::test_boundary_normals_point_outwards[figure-0.4",
+    "test_meshes_builders.py::test_groups_are_those_announced_and_cover_the_boundary_once[figure-0.4",
+    "test_meshes_builders.py::test_bounds_are_known_before_building[figure-0.4",
+    "test_meshes_builders.py::test_cells_are_estimated[figure-0.4",
+    "test_meshes_builders.py::test_plane_groups_lie_on_their_planes[figure-0.4",
     "test_meshes_builders.py::test_a_hollow_figure_is_nowhere_thinner_than_its_wall",
+    # plane strain against 3D: neo-hookean, and corotated by its closed form in both
+    "test_energies.py::test_plane_strain_is_3d_at_unit_thickness_stretch[corotated]",
+    "test_patch.py::test_static_patch[corotated-2]",
+    "test_patch.py::test_static_patch[stvk-2]",
     # further energies of plasticity: neo-hookean, the default
     "test_plasticity.py::test_plastic_volume_is_kept[corotated]",
     "test_plasticity.py::test_plastic_volume_is_kept[stvk]",

@@ -11,6 +11,7 @@ import pytest
 from fracsim.mechanics.contact.itself import SelfContact
 from fracsim.meshes.builders.box import Box
 from support.scenes import each_step, make_scene, march, positions
+from support.torn import RUNS
 
 FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
 SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
@@ -80,3 +81,18 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     # 0.05 m less the gap of the crack over a column of 1 m: E A strain, about
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
+
+
+@pytest.mark.slow
+def test_a_hammer_goes_on_through_crumbs() -> None:
+    """A driven disk breaks a plate whose pieces touch it and one another: what is jammed between them makes it wait
+    within a step, and it goes on; nothing is passed."""
+    study = RUNS["struck"] | {"contact": {"friction": 0.2}}
+    scene, state = make_scene(**study | {"time": study["time"] | {"end": 0.7}, "solver": {}})
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    for _ in each_step(scene, state):
+        hammer = np.array([0.8, 0.78]) + state.t * np.array([0.05, -0.5])
+        assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
+    assert contact._surface is not None
+    assert len(contact._surface.pairs.overlaps(contact._places())) == 0
+    assert scene.fracture.graph.broken_count > 10

@@ -184,7 +184,7 @@ def test_a_body_in_a_bowl_stays_there() -> None:
         mesh={"builder": "box", "size": [0.4, 0.4], "h": 0.1, "pattern": "unstructured", "origin": [-0.2, -0.2]},
         material=SOFT, initial={"velocity": [3.0, 1.0], "spin": [4.0]},
         obstacle=[{"name": "bowl", "shape": "sphere", "radius": 0.5, "at": [0.0, 0.0], "hollow": True}],
-        time={"scheme": "backward-euler", "step": 0.01, "end": 0.5},
+        time={"scheme": "backward-euler", "step": 0.01, "end": 0.3},
     )  # fmt: skip
     for _ in each_step(scene, state):
         assert np.linalg.norm(places(scene, state), axis=1).max() < 0.5

@@ -235,10 +235,19 @@ class Balance:
         return float(self.domain.comm.allreduce(share, op=MPI.MIN))
 
     def reachable(self, u: Values) -> Values:
-        """(owned dofs,) a first guess of u that Newton's method may start from (collective)."""
+        """(owned dofs,) a first guess of u that Newton's method may start from: the step's start where there is no
+        better one, with terms held back until it has gone on (collective)."""
         for term in self.terms:
             u = term.reachable(u)
-        return u
+        if all([term.clear(u) for term in self.terms]):
+            return u
+        for term in self.terms:
+            term.hold_back()
+        return self.level.u
+
+    def go_on(self) -> bool:
+        """Whether terms were held back: they have gone on, and r = 0 is to be solved once more (collective)."""
+        return any([term.go_on() for term in self.terms])
 
     def potential(self) -> tuple[float, float]:
         """The incremental potential, whose derivative is r, at the current u, and the size of what it is the sum of,

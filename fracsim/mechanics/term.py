@@ -114,6 +114,17 @@ class Term:
         """(owned dofs,) a first guess of u, m, changed to one that Newton's method may start from (collective)."""
         return u
 
+    def clear(self, u: Values) -> bool:
+        """Whether Newton's method may start from u (owned dofs,), m (collective)."""
+        return True
+
+    def hold_back(self) -> None:
+        """Act for now only as far as the body at the step's start allows (collective)."""
+
+    def go_on(self) -> bool:
+        """Whether it was held back: it acts as far as the body where it is now allows (collective)."""
+        return False
+
     def potential(self) -> float | None:
         """Energy whose derivative is its share of r at the current u, this rank's share, J (collective); None: there is
         none. Where all terms have one their sum is what Newton's line search goes down."""

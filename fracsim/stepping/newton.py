@@ -39,6 +39,8 @@ FACTORISED = 100_000
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
+LEGS = 20  # solves of a step in which obstacles that are jammed come on
+
 # Potentials that differ by less than this share of their terms are the same.
 ROUND_OFF = 1e4 * float(np.finfo(float).eps)
 
@@ -192,13 +194,25 @@ class Solver:
         self._x.array_w[:] = guess
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
         self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
-        self.snes.solve(None, self._x)
-        snes, reason = self.snes, self.snes.reason
+        newton, krylov, held = self._solve_in_legs()
+        reason = self.snes.reason
         self.balance.displace_to(self._x)
         if reason > 0 and self._single:  # Newton's method has evaluated them for its test
             self.balance.update_reactions()
-        krylov = snes.getLinearSolveIterations() + extended
-        return SolveResult(reason > 0, snes.its, krylov, "" if reason > 0 else self._sentence())
+        if held:
+            return SolveResult(False, newton, krylov + extended, f"Obstacles are jammed: not there after {LEGS} solves")
+        return SolveResult(reason > 0, newton, krylov + extended, "" if reason > 0 else self._sentence())
+
+    def _solve_in_legs(self) -> tuple[int, int, bool]:
+        """Newton's method from x, once more each time that what was held back has gone on: all iterations, and whether
+        something is still held back."""
+        newton = krylov = 0
+        for _ in range(LEGS):
+            self.snes.solve(None, self._x)
+            newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
+            if self.snes.reason <= 0 or not self.balance.go_on():
+                return newton, krylov, False
+        return newton, krylov, True
 
     def _potential(self, x: PETSc.Vec) -> float:
         """The incremental potential at x, J: what the line search goes down with contact.

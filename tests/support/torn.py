@@ -28,7 +28,7 @@ Found = dict[str, npt.NDArray[Any]]
 
 MESHES: dict[str, dict[str, Any]] = {
     "2d": {"builder": "box", "size": [1.0, 0.6], "h": 0.07, "pattern": "unstructured"},
-    "3d": {"builder": "box", "size": [1.0, 0.5, 0.5], "h": 0.17, "pattern": "unstructured"},
+    "3d": {"builder": "box", "size": [1.0, 0.5, 0.5], "h": 0.19, "pattern": "unstructured"},
     "comb": {"builder": "box", "size": [1.0, 1.0], "h": 1 / 24},
     "bar": {"builder": "box", "size": [1.0, 0.25, 0.25], "h": 0.125},
 }

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import bsr_matrix, csr_matrix, kron
 
@@ -76,6 +77,7 @@ class Obstacles(Term):
         self._ways = [each.way(end - level.dt, end) for each in self.obstacles]
         self._grips: list[Grip | None] = [None] * len(self.obstacles)
         self._touches: list[Touch] | None = None
+        self._gone = 1.0  # share of their way
         if level.dt:
             self._start_of_step(late)
 
@@ -197,6 +199,39 @@ class Obstacles(Term):
             return u
         end = within_reach(self, level.u, self._at_end(u))
         return np.asarray(level.u + level.share * (end - level.u))
+
+    def clear(self, u: Values) -> bool:
+        """Whether every gap is open with the body at u (collective)."""
+        x = self.places(self._at_end(u))
+        least = [placed.distance(x)[self.area > 0].min(initial=np.inf) for placed in self._placed]
+        return bool(self.comm.allreduce(min(least) > 0, op=MPI.LAND))
+
+    def hold_back(self) -> None:
+        """Obstacles wait on their way where they would meet the body at the step's start: what is jammed between them
+        and something else cannot be taken along by a guess (collective)."""
+        self._gone = 0.0
+        self._go_on(self.places(self._level.u))
+
+    def go_on(self) -> bool:
+        """The rest of the way, or as far as the body where it is now lets them (collective)."""
+        if self._gone == 1:
+            return False
+        self._touching()
+        self._go_on(self.x)
+        return True
+
+    def _go_on(self, x: Values) -> None:
+        """A share of the rest of the way that is safe with points at x (n, d)."""
+        rest, still = 1 - self._gone, np.zeros_like(x)
+        here = [placed.pose.moved(self._gone * q) for placed, q in self.ways()]
+        shares = [
+            safe_shares(Placed(each.shape, pose), x, still, rest * q)[self.area > 0].min(initial=1.0)
+            for each, pose, q in zip(self.obstacles, here, self._ways, strict=True)
+        ]
+        share = self.comm.allreduce(float(min(shares)), op=MPI.MIN)
+        self._gone = 1.0 if share == 1 else self._gone + share * rest
+        self._placed = [Placed(placed.shape, placed.pose.moved(self._gone * q)) for placed, q in self.ways()]
+        self._touches = None
 
     # --- what breaks, and what is told ---
 
