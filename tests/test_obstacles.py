@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from mpi4py import MPI
 
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.obstacles import Obstacles
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.split.local import Following, LocalSurface
-from fracsim.scene import Scene
+from fracsim.run import Run
+from fracsim.scene import Scene, build_scene
 from support.ranks import TESTS
-from support.scenes import Walk, each_step, make_scene, march, positions
+from support.scenes import Walk, each_step, make_scene, make_study, march, positions
+from support.torn import RUNS
 
 Values = npt.NDArray[np.float64]
 
@@ -219,3 +223,24 @@ def test_a_study_without_obstacles_imports_no_contact() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=TESTS, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
+
+
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """A plate under a driven, rubbing disk that breaks it: stopped half-way and resumed, the same energies, cracks and
+    forces."""
+    tables = RUNS["struck"] | {"solver": FINE, "output": {"picture": False}}
+    going, folder = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "going"), tmp_path / "stopped"
+    stopped = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), folder)
+    for run in (going, stopped):
+        for _ in range(11):
+            run.step()
+    stopped.checkpoint()
+    assert going.breaks.figures[0] > 0
+    again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), folder, restart=True)
+    for run in (going, again):
+        for _ in range(7):
+            run.step()
+    assert again.breaks.figures == going.breaks.figures
+    for name in ("work", "dissipated", "elastic"):
+        assert getattr(again.state, name) == pytest.approx(getattr(going.state, name), rel=1e-6)
+    np.testing.assert_allclose(again.scene.probes(), going.scene.probes(), atol=1e-6)

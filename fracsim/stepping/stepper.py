@@ -138,8 +138,8 @@ class BalanceStepper:
         """The state of a checkpoint, with a body whose damage and flow were read from it."""
         balance = self.balance
         self.breaking.restored()
-        self._recalled()
         balance.displace(state.u)
+        self._recalled()
         return replace(self.remember(state), elastic=balance.stress.stored())
 
     def remember(self, state: State) -> State:

@@ -63,7 +63,7 @@ class Obstacles(Term):
         self._surface = LocalSurface(domain)
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
-        self._acted: list[Values] = [np.zeros(domain.dim) for _ in self.obstacles]
+        self._unseen = False  # whether walls have come to light since the last step began
         check_apart(self.comm, self._surface.points, self.obstacles)
 
     # --- a step ---
@@ -83,16 +83,18 @@ class Obstacles(Term):
 
     def _start_of_step(self, late: float) -> None:
         x, at = self.places(self._level.u), self._at_start
-        self._grips = [
-            grip(x, self.area, placed, self.law.barrier) if each.friction else None
-            for each, placed in zip(self.obstacles, at, strict=True)
-        ]
+        if self._unseen:
+            self._leave_out(x, at)
+            self._unseen = False
+        held = [grip(x, self.area, placed, self.law.barrier) for placed in at]
+        self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
+        pushed = [each.force[:, None] * each.normal for each in held]
+        self._pushed = [forces.sum(axis=0) for forces in pushed]
         self._before: Values = np.zeros(self._owned)
         if late:
             forces = np.zeros_like(x)
-            for placed in at:
-                found = touch(x, self.area, placed, self.law.barrier, None, None, np.zeros(0))
-                forces[found.points] += found.normal
+            for each, push in zip(held, pushed, strict=True):
+                forces[each.points] += push
             self._before = np.asarray(late * self.follow.handed_down(forces))
 
     def displaced(self) -> None:
@@ -243,10 +245,12 @@ class Obstacles(Term):
         self._surface.follow_damage(pattern)
         self.follow.destroy()
         self.follow = Following(self._domain, self._surface)
-        x = self.places(self._at_end(self._u.x.array[: self._owned]))
-        gap = np.min([placed.distance(x) for placed in self._placed], axis=0)
+        self._leave_out(self.places(self._at_end(self._u.x.array[: self._owned])), self._placed)
+        self._grips, self._touches, self._unseen = [None] * len(self.obstacles), None, True
+
+    def _leave_out(self, x: Values, obstacles: Sequence[Placed]) -> None:
+        gap = np.min([placed.distance(x) for placed in obstacles], axis=0)
         self.area = np.where(gap > LEFT_OUT * self.law.barrier.width, self._surface.area, 0.0)
-        self._grips, self._touches = [None] * len(self.obstacles), None
 
     def readings(self) -> dict[str, Callable[[], Values]]:
         """contact_NAME_AXIS: (1,) forces of the body on each obstacle, this rank's share, N (collective)."""
@@ -257,12 +261,8 @@ class Obstacles(Term):
         }
 
     def _on_obstacle(self, number: int, axis: int) -> Values:
-        return -self._force_of(number)[axis : axis + 1]
-
-    def _force_of(self, number: int) -> Values:
-        """(d,) of an obstacle on this rank's points, N (collective)."""
         found = self._touching()[number]
-        return np.asarray((found.normal + found.friction).sum(axis=0))
+        return -(found.normal + found.friction)[:, axis].sum(keepdims=True)
 
     def driven(self) -> tuple[float, float]:
         """Work of the obstacles' own motion in the step on this rank, and what of it friction takes, J (collective).
@@ -272,10 +272,9 @@ class Obstacles(Term):
         work = lost = 0.0
         for number, way in enumerate(self._ways):
             shift, found = way[: self._domain.dim], self._touching()[number]
-            now = self._force_of(number)
-            work += float((now + self._acted[number]) @ shift) / 2
-            lost += float(found.friction.sum(axis=0) @ shift)
-            self._acted[number] = now
+            pushed, rubbed = found.normal.sum(axis=0), float(found.friction.sum(axis=0) @ shift)
+            work += float((pushed + self._pushed[number]) @ shift) / 2 + rubbed
+            lost += rubbed
         return work, lost
 
     def destroy(self) -> None:
