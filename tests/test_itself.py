@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
 
 import meshio
 import numpy as np
 import pytest
 
+from fracsim.errors import InputError
 from fracsim.mechanics.contact.itself import SelfContact
 from fracsim.meshes.builders.box import Box
 from support.scenes import each_step, make_scene, march, positions
@@ -17,7 +18,7 @@ FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
 SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
 
 
-def two_blocks(path: Any, dim: int, gap: float) -> str:
+def two_blocks(path: Path, dim: int, gap: float) -> str:
     """A file with two blocks of side 1 along x, `gap` apart, their meshes not alike."""
     left = Box(size=(1.0,) * dim, h=0.34).build()
     right = Box(size=(1.0,) * dim, h=0.5, origin=(1.0 + gap, *[0.05] * (dim - 1))).build()
@@ -31,7 +32,7 @@ def two_blocks(path: Any, dim: int, gap: float) -> str:
 
 
 @pytest.mark.parametrize("dim", (2, 3))
-def test_two_bodies_collide(tmp_path: Any, dim: int) -> None:
+def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
     """Thrown at each other: momentum is kept to the solver's tolerance, they touch, and nothing cuts anything."""
     scene, state = make_scene(
         mesh={"file": two_blocks(tmp_path, dim, 0.05)}, material=SOFT, contact={}, solver=FINE,
@@ -81,6 +82,33 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     # 0.05 m less the gap of the crack over a column of 1 m: E A strain, about
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
+
+
+def test_bodies_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
+    for gap in (0.0, -0.1):
+        with pytest.raises(InputError, match=r"surface elements cut or touch each other at the start, the first near"):
+            make_scene(mesh={"file": two_blocks(tmp_path, 2, gap)}, material=SOFT, contact={})
+
+
+def test_friction_between_bodies_is_in_the_books(tmp_path: Path) -> None:
+    """A block that grazes another: what is lost beside the scheme's own loss is friction, and no energy is gained."""
+    lost = []
+    for mu in (0.0, 0.5):
+        scene, state = make_scene(
+            mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"friction": mu}, solver=FINE,
+            time={"scheme": "backward-euler", "step": 0.01, "end": 0.3},
+        )  # fmt: skip
+        X = positions(scene)
+        v = np.zeros_like(X)
+        v[X[:, 0] < 1.01] = [1.0, 0.5]
+        state.v = v.reshape(-1)
+        state.settle()
+        start = scene.balance.kinetic_energy(state.v)
+        march(scene, state)
+        end = scene.balance.kinetic_energy(state.v) + state.elastic
+        lost.append(state.dissipated)
+        assert end + state.dissipated < start * 1.001
+    assert lost[0] == 0 and 0.005 * start < lost[1] < 0.5 * start
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from .body import Damping, Material, Mesh
 from .breaking import Brittle, Fracture, Plasticity
@@ -40,21 +40,13 @@ class Study(Table):
     probe: list[Probe] = Field(default_factory=list)
     output: Output = Output()
 
-    @field_validator("probe")
+    @field_validator("probe", "obstacle")
     @classmethod
-    def _distinct(cls, probes: list[Probe]) -> list[Probe]:
-        names = [probe.name for probe in probes]
+    def _told_apart[Entry: (Probe, Obstacle)](cls, entries: list[Entry], info: ValidationInfo) -> list[Entry]:
+        names = [each.name for each in entries]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two probes have the name {twice[0]}")
-        return probes
-
-    @field_validator("obstacle")
-    @classmethod
-    def _told_apart(cls, obstacles: list[Obstacle]) -> list[Obstacle]:
-        names = [each.name for each in obstacles]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two obstacles have the name {twice[0]}")
-        return obstacles
+            raise ValueError(f"two {info.field_name}s have the name {twice[0]}")
+        return entries
 
     @field_validator("solver")
     @classmethod

@@ -15,11 +15,13 @@ from dolfinx import fem
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix, kron
 
+from ...errors import InputError
 from ...mesh.domain import Domain
 from ...mesh.ranks import from_root, on_root
 from ...mesh.split.build import split
 from ...mesh.split.local import whole_weights
 from ...mesh.split.skeleton import Skeleton
+from ...meshes.words import format_point
 from ..term import Level, Term
 from .pairs import Pairs
 from .recede import receded
@@ -53,7 +55,9 @@ class _Surface:
         self.weights = whole_weights(made, skeleton, pattern, self.rest)
         how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         self.pairs = Pairs(self.rest, made.elements, **how)
-        if pattern.any():
+        if not pattern.any():
+            _check_apart(self.pairs, self.rest, made.elements)
+        else:
             new = (made.origin == 0) & self.pairs.crowded(self.places(u))
             if new.any():
                 self.pairs = Pairs(self.rest, made.elements[~new], **how)
@@ -70,6 +74,16 @@ class _Surface:
         """(nodes d, nodes d) of (n d, n d), N/m."""
         W = kron(self.weights, np.eye(self.rest.shape[1]), format="csr")
         return (W.T @ H @ W).tocsr()
+
+
+def _check_apart(pairs: Pairs, x: Values, elements: npt.NDArray[np.int64]) -> None:
+    """InputError where a body at rest cuts or touches itself."""
+    if len(found := pairs.overlaps(x)):
+        where = format_point(x[elements[found[0]]].mean(axis=(0, 1)))
+        raise InputError(
+            f"[contact]: {len(found)} pairs of surface elements cut or touch each other at the start, the first near "
+            f"{where}; move the bodies apart"
+        )
 
 
 class SelfContact(Term):
@@ -147,12 +161,13 @@ class SelfContact(Term):
 
     # --- what it adds to the balance ---
 
-    def _handed_down(self, x: Values | None) -> Values:
-        """(owned dofs,) forces on the nodes with the surface at x (n, d), given on rank 0, N (collective)."""
+    def _handed_down(self, x: Values | None, *, normal: bool = True) -> Values:
+        """(owned dofs,) forces on the nodes with the surface at x (n, d), given on rank 0, N; those of friction alone
+        where not `normal` (collective)."""
 
         def found() -> Values:
             assert self._surface is not None and x is not None
-            gradient = self._surface.pairs.gradient(x)
+            gradient = self._surface.pairs.gradient(x) if normal else np.zeros_like(x)
             if self._rubbing is not None:
                 gradient = gradient + self._rubbing.gradient(x)
             return self._surface.handed_down(-gradient)
@@ -201,6 +216,10 @@ class SelfContact(Term):
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
         x = self._places()
         return 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
+
+    def drag(self) -> Values | None:
+        """(owned dofs,) minus the forces of friction, N (collective)."""
+        return -self._handed_down(self._places(), normal=False) if self.law.friction else None
 
     def potential(self) -> float:
         """share^2 times barrier and friction at the end of the step, less what the start's forces do, this rank's
