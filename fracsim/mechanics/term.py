@@ -44,6 +44,10 @@ class Level:
     u_v: Values
     share: float = 1.0
 
+    def at_end(self, u: Values) -> Values:
+        """(owned dofs,) displacement at the end of the step that belongs to u at the level, m."""
+        return u if self.share == 1 else np.asarray(self.u + (u - self.u) / self.share)
+
 
 class Term:
     """A term of the balance that adds nothing: the base of all others, which say what they add.

@@ -193,7 +193,8 @@ class Solver:
         self._shrink()
         self._x.array_w[:] = guess
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
-        self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
+        if self.balance.limits_steps:
+            self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
         newton, krylov, held = self._solve_in_legs()
         reason = self.snes.reason
         self.balance.displace_to(self._x)

@@ -22,6 +22,7 @@ from ...mesh.split.build import split
 from ...mesh.split.local import whole_weights
 from ...mesh.split.skeleton import Skeleton
 from ...meshes.words import format_point
+from ..coupling import Coupling
 from ..term import Level, Term
 from .pairs import Pairs
 from .recede import receded
@@ -95,6 +96,7 @@ class SelfContact(Term):
         """InputError where the surface at rest cuts itself (collective)."""
         self.law, self._domain, self._u = law, domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
+        self._coupling = Coupling(domain)
         self._skeleton = None if domain.source is None else Skeleton(domain.source)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
@@ -147,17 +149,13 @@ class SelfContact(Term):
     def _places(self) -> Values | None:
         """(n, d) at the end of the step that belongs to the current u, on rank 0 (collective)."""
         if self._moved:
-            self._x, self._moved = self._placed(self._at_end(self._u.x.array[: self._owned])), False
+            self._x, self._moved = self._placed(self._level.at_end(self._u.x.array[: self._owned])), False
         return self._x
 
     def _placed(self, u: Values) -> Values | None:
         """(n, d) x of the owned displacements u, on rank 0 (collective)."""
         nodal = self._gathered(u)
         return None if self._surface is None or nodal is None else self._surface.places(nodal)
-
-    def _at_end(self, u: Values) -> Values:
-        level = self._level
-        return u if level.share == 1 else np.asarray(level.u + (u - level.u) / level.share)
 
     # --- what it adds to the balance ---
 
@@ -195,22 +193,9 @@ class SelfContact(Term):
         H = on_root(self.comm, found)
         if not self.comm.bcast(H is not None and H.nnz):
             return None
-        return self._matrix(None if H is None or self._surface is None else self._surface.stiffness(H))
-
-    def _matrix(self, whole: csr_matrix | None) -> PETSc.Mat:
-        """A matrix over the dofs from rank 0's, in the order of the input mesh (collective)."""
-        d = self._domain.dim
-        matrix = PETSc.Mat().create(self.comm)
-        matrix.setSizes(((self._owned, PETSc.DETERMINE),) * 2, bsize=d)
-        matrix.setType(PETSc.Mat.Type.AIJ)
-        matrix.setUp()
-        if whole is not None:
-            assert self._numbers is not None
-            dofs = (d * self._numbers[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
-            start, columns = whole.indptr.astype(PETSc.IntType), dofs[whole.indices]
-            matrix.setValuesIJV(start, columns, whole.data, PETSc.InsertMode.ADD_VALUES, dofs)
-        matrix.assemble()
-        return matrix
+        if H is None or self._surface is None or self._numbers is None:
+            return self._coupling(csr_matrix((0, 0)), np.empty(0, np.int64))
+        return self._coupling(self._surface.stiffness(H), self._numbers)
 
     def stored(self) -> float:
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
@@ -247,6 +232,10 @@ class SelfContact(Term):
         level = self._level
         if not level.dt:
             return u
-        x, way = self._start, self._gathered(self._at_end(u) - level.u)
+        x, way = self._start, self._gathered(self._level.at_end(u) - level.u)
         share = from_root(self.comm, lambda: self._free(x, way))
         return u if share == 1 else np.asarray(level.u + share * (u - level.u))
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+        self._coupling.destroy()

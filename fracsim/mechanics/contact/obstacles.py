@@ -24,6 +24,7 @@ from ...mesh.domain import Domain
 from ...mesh.ranks import total
 from ...mesh.split.local import Following, LocalSurface
 from ...meshes.words import AXES
+from ..coupling import Coupling
 from ..term import Level, Term
 from .barrier import Barrier
 from .friction import Friction
@@ -60,7 +61,7 @@ class Obstacles(Term):
         self.obstacles, self.law = tuple(obstacles), law
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
-        self._surface = LocalSurface(domain)
+        self._surface, self._coupling = LocalSurface(domain), Coupling(domain)
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
         self._unseen = False  # whether walls have come to light since the last step began
@@ -105,15 +106,10 @@ class Obstacles(Term):
         """(n, d) x of the points at the owned displacements u, m (collective)."""
         return np.asarray(self._surface.points + self.follow(u))
 
-    def _at_end(self, u: Values) -> Values:
-        """(owned dofs,) displacement at the end of the step that belongs to u at the level."""
-        start, share = self._level.u, self._level.share
-        return u if share == 1 else np.asarray(start + (u - start) / share)
-
     def _touching(self) -> list[Touch]:
         """What each obstacle does at the current u (collective)."""
         if self._touches is None:
-            self.x = self.places(self._at_end(self._u.x.array[: self._owned]))
+            self.x = self.places(self._level.at_end(self._u.x.array[: self._owned]))
             self._touches = [self._touch(number) for number in range(len(self.obstacles))]
         return self._touches
 
@@ -151,20 +147,7 @@ class Obstacles(Term):
         points = np.concatenate([each.points for each in touches])
         blocks = np.concatenate([each.stiffness for each in touches])
         W = kron(self._surface.weights[points], np.eye(d), format="csr")
-        return self._matrix((W.T @ _diagonal(blocks) @ W).tocsr())
-
-    def _matrix(self, local: csr_matrix) -> PETSc.Mat:
-        """A matrix over the dofs from one over the dofs of this rank's columns, summed (collective)."""
-        d = self._domain.dim
-        matrix = PETSc.Mat().create(self.comm)
-        matrix.setSizes(((self._owned, PETSc.DETERMINE),) * 2, bsize=d)
-        matrix.setType(PETSc.Mat.Type.AIJ)
-        matrix.setUp()
-        dofs = (d * self._surface.columns[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
-        start, columns = local.indptr.astype(PETSc.IntType), dofs[local.indices]
-        matrix.setValuesIJV(start, columns, local.data, PETSc.InsertMode.ADD_VALUES, dofs)
-        matrix.assemble()
-        return matrix
+        return self._coupling((W.T @ _diagonal(blocks) @ W).tocsr(), self._surface.columns)
 
     def stored(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
@@ -199,12 +182,12 @@ class Obstacles(Term):
         level = self._level
         if not level.dt:
             return u
-        end = within_reach(self, level.u, self._at_end(u))
+        end = within_reach(self, level.u, self._level.at_end(u))
         return np.asarray(level.u + level.share * (end - level.u))
 
     def clear(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
-        x = self.places(self._at_end(u))
+        x = self.places(self._level.at_end(u))
         least = [placed.distance(x)[self.area > 0].min(initial=np.inf) for placed in self._placed]
         return bool(self.comm.allreduce(min(least) > 0, op=MPI.LAND))
 
@@ -245,7 +228,7 @@ class Obstacles(Term):
         self._surface.follow_damage(pattern)
         self.follow.destroy()
         self.follow = Following(self._domain, self._surface)
-        self._leave_out(self.places(self._at_end(self._u.x.array[: self._owned])), self._placed)
+        self._leave_out(self.places(self._level.at_end(self._u.x.array[: self._owned])), self._placed)
         self._grips, self._touches, self._unseen = [None] * len(self.obstacles), None, True
 
     def _leave_out(self, x: Values, obstacles: Sequence[Placed]) -> None:
@@ -280,6 +263,7 @@ class Obstacles(Term):
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self.follow.destroy()
+        self._coupling.destroy()
 
 
 def _diagonal(blocks: Values) -> csr_matrix:

@@ -21,6 +21,7 @@ from scipy.sparse import csr_matrix
 
 from ...meshes.data import MeshData
 from ..domain import Domain
+from ..ranks import offset
 from ..simplices import is_split
 from .build import Split, split
 from .skeleton import CRACK, Skeleton
@@ -110,7 +111,7 @@ class LocalSurface:
         matrix = PETSc.Mat().create(self._domain.comm)
         matrix.setSizes(((count, PETSc.DETERMINE), (owned, PETSc.DETERMINE)))
         matrix.setType(PETSc.Mat.Type.AIJ)
-        first = self._domain.comm.exscan(count) or 0 if local else 0
+        first = offset(self._domain.comm, count) if local else 0
         matrix.setUp()  # PETSc counts entries itself: rows of other ranks have them, too
         here, place = np.unique(rows + first, return_inverse=True)
         summed = csr_matrix((values, (place.reshape(-1), columns)), shape=(len(here), matrix.size[1]))
