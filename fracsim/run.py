@@ -77,8 +77,7 @@ class Run:
     def _resume(self) -> Notes:
         """Take up the state of the checkpoint, and what it says beside it."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
-        stress = scene.balance.stress
-        state = read_checkpoint(self.folder, scene.domain, self.state, stress, breaks.record, breaks.surfaces)
+        state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.count()
         self.state = scene.stepper.resume(state)
         if notes.values()["time"]["step"] != scene.study.time.step:  # else the size of the last step goes on
@@ -143,8 +142,8 @@ class Run:
         """Write a checkpoint of now; returns its path. Raises CannotWrite (collective)."""
         began = time.perf_counter()
         notes, domain, breaks = Notes(self._text, self.monitors.saved()), self.scene.domain, self.breaks
-        stress = self.scene.balance.stress
-        path = write_checkpoint(self.folder, domain, self.state, stress, notes, breaks.record, breaks.surfaces)
+        balance = self.scene.balance
+        path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
         self._saved_at = self.state.t
         self._meter.output += time.perf_counter() - began
         return path

@@ -62,11 +62,11 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int)
     follow, X = Following(domain, surface), positions(scene)
     A, b = np.random.default_rng(dim).normal(size=(dim, dim)), np.arange(dim) + 1.0
     x = follow((X @ A.T + b).reshape(-1))
-    np.testing.assert_allclose(x, surface.points @ A.T + b, atol=1e-13)
-    f = np.sin(100 * surface.points) * surface.area[:, None]
+    np.testing.assert_allclose(x, surface.at.rest @ A.T + b, atol=1e-13)
+    f = np.sin(100 * surface.at.rest) * surface.area[:, None]
     nodal = follow.handed_down(f).reshape(-1, dim)
     np.testing.assert_allclose(nodal.sum(axis=0), f.sum(axis=0), atol=1e-13)
-    np.testing.assert_allclose(X.T @ nodal, surface.points.T @ f, atol=1e-13)
+    np.testing.assert_allclose(X.T @ nodal, surface.at.rest.T @ f, atol=1e-13)
 
 
 # --- impulse, rest, pressure ----------------------------------------------------------------------------------------
@@ -208,7 +208,7 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    X = contact._surface.points
+    X = contact._surface.at.rest
     inside = (X[:, 0] > 0.05) & (X[:, 0] < 0.95) & (X[:, 1] > 0.05) & (X[:, 1] < 0.45)
     assert inside.sum() > 10 and contact.area[inside].min() > 0
 

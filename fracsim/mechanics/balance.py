@@ -265,6 +265,30 @@ class Balance:
         for term in self.terms:
             term.edges_broke(pattern)
 
+    def memory(self) -> dict[str, object]:
+        """What terms are between two steps beside u."""
+        return {term.name: past for term in self.terms if (past := term.memory()) is not None}
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave, with the damage of then (collective)."""
+        assert isinstance(memory, dict)
+        for term in self.terms:
+            if term.name in memory:
+                term.recall(memory[term.name])
+
+    def saved(self) -> dict[str, Values]:
+        """The same for a checkpoint, by term and name, whole on rank 0 (collective)."""
+        return {f"{term.name}.{name}": values for term in self.terms for name, values in term.saved().items()}
+
+    def restore(self, saved: object) -> None:
+        """Be again what `saved` gave on rank 0; the same arrays on all ranks (collective)."""
+        assert isinstance(saved, dict)
+        for term in self.terms:
+            own = {name.removeprefix(f"{term.name}."): values for name, values in saved.items()
+                   if name.startswith(f"{term.name}.")}  # fmt: skip
+            if own:
+                term.restore(own)
+
     def driven(self) -> tuple[float, float]:
         """Work from outside that no nodal force shows, and what of it is lost, this rank's share, J (collective)."""
         work, lost = zip(*(term.driven() for term in self.terms), strict=True)

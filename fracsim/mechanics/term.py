@@ -146,6 +146,20 @@ class Term:
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""
 
+    def memory(self) -> object:
+        """What it is between two steps beside u, never to be written to again; None: it has no past."""
+        return None
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave, with the damage of then (collective)."""
+
+    def saved(self) -> dict[str, Values]:
+        """The same for a checkpoint: arrays that do not know of ranks, whole on rank 0 (collective)."""
+        return {}
+
+    def restore(self, saved: dict[str, Values]) -> None:
+        """Be again what `saved` gave on rank 0, with u and the damage of then; the same arrays on all ranks."""
+
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
 

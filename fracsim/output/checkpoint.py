@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.stress import Stress
+from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.ranks import Gather, on_root
 from ..meshes.data import MeshData
@@ -37,6 +37,7 @@ _NODAL = ("u", "v", "a", "forces")
 _SOMETIMES = ("drag", "out_of_balance")
 _ON_EVERY_RANK = ("weakened", "integrity", "broken", "breaks", "starts")
 _NOTES = ("study", "monitors")
+_TERMS = "term."  # before the names of what terms of the balance remember
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def write_checkpoint(
     folder: Path,
     domain: Domain,
     state: State,
-    stress: Stress,
+    balance: Balance,
     notes: Notes,
     record: EdgeRecord | None = None,
     surfaces: BrittleSurfaces | None = None,
@@ -76,8 +77,9 @@ def write_checkpoint(
     `record`: what is remembered of broken edges, in a study with fracture; `surfaces`: in one with brittle cracks.
     Raises CannotWrite.
     """
-    d = domain.dim
-    arrays = {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
+    d, stress = domain.dim, balance.stress
+    arrays: dict[str, Any] = {f"{_TERMS}{name}": values for name, values in balance.saved().items()}
+    arrays |= {name: domain.gather_nodes(getattr(state, name).reshape(-1, d)) for name in _NODAL}
     for name in _SOMETIMES:
         if (values := getattr(state, name)) is not None:
             arrays[name] = domain.gather_nodes(values.reshape(-1, d))
@@ -116,19 +118,22 @@ def read_checkpoint(
     folder: Path,
     domain: Domain,
     state: State,
-    stress: Stress,
+    balance: Balance,
     record: EdgeRecord | None = None,
     surfaces: BrittleSurfaces | None = None,
 ) -> State:
-    """The state of a checkpoint, with chi and the record with its graph brought to it (collective).
+    """The state of a checkpoint, with chi and the record with its graph brought to it (collective). What terms
+    remember comes as memory["saved"]: stepper.resume gives it to them, once the body is where it was.
 
     InputError where there is no checkpoint that fits.
     """
-    comm, plastic = domain.comm, stress.material.plastic
+    comm, stress = domain.comm, balance.stress
+    plastic = stress.material.plastic
     arrays = on_root(comm, lambda: _read(folder, domain.source, record is not None, plastic is not None))
     head = None
     if arrays is not None:
         small: dict[str, Any] = {name: arrays.get(name) for name in _ON_EVERY_RANK}
+        small |= {name: values for name, values in arrays.items() if name.startswith(_TERMS)}
         head = arrays.pop("clock"), list(arrays), small
     clock, names, small = comm.bcast(head)
 
@@ -146,7 +151,8 @@ def read_checkpoint(
     if plastic is not None and "plastic" in names:
         plastic.recall(scattered(domain.gather_cells, "plastic"))
     read: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
-    return replace(state, **read)
+    terms = {name.removeprefix(_TERMS): values for name, values in small.items() if name.startswith(_TERMS)}
+    return replace(state, **read, memory={"saved": terms})
 
 
 @contextlib.contextmanager

@@ -140,6 +140,7 @@ class BalanceStepper:
         self.breaking.restored()
         balance.displace(state.u)
         self._recalled()
+        balance.restore(state.memory.get("saved", {}))
         return replace(self.remember(state), elastic=balance.stress.stored())
 
     def remember(self, state: State) -> State:
@@ -162,7 +163,7 @@ class BalanceStepper:
         return self._finish(state, dt, solve, began)
 
     def _memory(self) -> dict[str, object]:
-        return {"damage": self.breaking.memory(), "flow": self.flow.memory()}
+        return {"damage": self.breaking.memory(), "flow": self.flow.memory(), "terms": self.balance.memory()}
 
     def _recall(self, state: State) -> None:
         if "damage" in state.memory and self.breaking.recall(state.memory["damage"]):
@@ -177,6 +178,8 @@ class BalanceStepper:
         """The step begins, for the first time or once more: with what the body had flowed at its start."""
         if "flow" in state.memory:
             self.flow.recall(state.memory["flow"])
+        if terms := state.memory.get("terms"):
+            self.balance.recall(terms)
         self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
 
     def _size(self, state: State) -> float:

@@ -7,85 +7,21 @@ timings of Pairs: for 50,000 triangles less than a step of the body inside them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
-from scipy.sparse import csr_matrix, kron
+from scipy.sparse import csr_matrix
 
-from ...errors import InputError
 from ...mesh.domain import Domain
 from ...mesh.ranks import from_root, on_root
-from ...mesh.split.build import split
-from ...mesh.split.local import whole_weights
 from ...mesh.split.skeleton import Skeleton
-from ...meshes.words import format_point
 from ..coupling import Coupling
 from ..term import Level, Term
-from .pairs import Pairs
-from .recede import receded
+from .crowd import Law, Surface
 from .slip import Friction
 
 Values = npt.NDArray[np.float64]
-GAP = 2.0  # between the sides of a new crack, in distances of the barrier (recede)
-
-
-@dataclass(frozen=True)
-class Law:
-    """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s."""
-
-    distance: float
-    stiffness: float
-    friction: float
-    creep: float
-
-
-class _Surface:
-    """The split surface and its pairs for a state of damage, on rank 0.
-
-    Attributes:
-        weights: (n, nodes) W.    rest: (n, d) reference places, new walls drawn back, m.    pairs: what may touch.
-    """
-
-    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values) -> None:
-        """`u`: (nodes, d) where the body is, m: walls that are crowded there are left out."""
-        made = split(skeleton, pattern)
-        self.rest = receded(made, GAP * law.distance)
-        self.weights = whole_weights(made, skeleton, pattern, self.rest)
-        how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
-        self.pairs = Pairs(self.rest, made.elements, **how)
-        if not pattern.any():
-            _check_apart(self.pairs, self.rest, made.elements)
-        else:
-            new = (made.origin == 0) & self.pairs.crowded(self.places(u))
-            if new.any():
-                self.pairs = Pairs(self.rest, made.elements[~new], **how)
-
-    def places(self, u: Values) -> Values:
-        """(n, d) x of nodal displacements (nodes, d), m."""
-        return np.asarray(self.rest + self.weights @ u)
-
-    def handed_down(self, forces: Values) -> Values:
-        """(nodes, d) of forces (n, d) at the points, N."""
-        return np.asarray(self.weights.T @ forces)
-
-    def stiffness(self, H: csr_matrix) -> csr_matrix:
-        """(nodes d, nodes d) of (n d, n d), N/m."""
-        W = kron(self.weights, np.eye(self.rest.shape[1]), format="csr")
-        return (W.T @ H @ W).tocsr()
-
-
-def _check_apart(pairs: Pairs, x: Values, elements: npt.NDArray[np.int64]) -> None:
-    """InputError where a body at rest cuts or touches itself."""
-    if len(found := pairs.overlaps(x)):
-        where = format_point(x[elements[found[0]]].mean(axis=(0, 1)))
-        raise InputError(
-            f"[contact]: {len(found)} pairs of surface elements cut or touch each other at the start, the first near "
-            f"{where}; move the bodies apart"
-        )
-
 
 class SelfContact(Term):
     """A body that cannot pass through itself."""
@@ -102,6 +38,7 @@ class SelfContact(Term):
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
         self._before: Values = np.zeros(self._owned)
+        self._surface: Surface | None = None
         self._rebuild()
 
     # --- where the surface is ---
@@ -110,9 +47,9 @@ class SelfContact(Term):
         """The surface of the damage of now (collective)."""
         pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
 
-        def made() -> _Surface:
+        def made() -> Surface:
             assert self._skeleton is not None and pattern is not None and u is not None
-            return _Surface(self._skeleton, pattern, self.law, u)
+            return Surface(self._skeleton, pattern, self.law, u, self._surface)
 
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
@@ -125,17 +62,40 @@ class SelfContact(Term):
         return self._domain.gather_nodes(np.asarray(u).reshape(-1, self._domain.dim))
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """New walls may touch from here on, unless something touches them as they appear (collective)."""
+        """New walls may touch from here on, drawn in where they are crowded as they appear (collective)."""
         self._pattern = pattern
         self._rebuild()
         self._rubbing, self._moved = None, True
+
+    def memory(self) -> object:
+        """What is drawn in, and left out, on rank 0."""
+        return (self._surface and self._surface.memory(),)
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave (not collective)."""
+        assert isinstance(memory, tuple)
+        if self._surface is not None:
+            self._surface.recall(memory[0])
+
+    def saved(self) -> dict[str, Values]:
+        """Shares of arms, and numbers of elements that are left out."""
+        share, out = (np.empty(0), np.empty(0)) if self._surface is None else self._surface.memory()
+        return {"share": share, "left_out": out}
+
+    def restore(self, saved: dict[str, Values]) -> None:
+        """Be again what `saved` gave."""
+        if self._surface is not None:
+            self._surface.recall((saved["share"], saved["left_out"]))
 
     def begin(self, level: Level) -> None:
         """A step begins: friction is that of its start."""
         self._level, self._moved, self._rubbing = level, True, None
         if not level.dt:
             return
-        self._start = self._placed(level.u)
+        nodal = self._gathered(level.u)
+        if self._surface is not None and nodal is not None:
+            self._surface.make_room(nodal)
+            self._start = self._surface.places(nodal)
         if self.law.friction and self._surface is not None and self._start is not None:
             x, slip = self._start, self.law.creep * level.dt
             self._rubbing = self._surface.pairs.lag_friction(x, x, slip)
@@ -225,7 +185,7 @@ class SelfContact(Term):
 
     def _free(self, x: Values | None, way: Values | None) -> float:
         assert self._surface is not None and x is not None and way is not None
-        return self._surface.pairs.longest_step(x, x + self._surface.weights @ way)
+        return self._surface.pairs.longest_step(x, x + self._surface.at.weights @ way)
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u as far on the way from the start as nothing meets (collective)."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,7 @@ from scipy.sparse import bsr_matrix, csr_matrix, kron
 
 from ...mesh.domain import Domain
 from ...mesh.ranks import total
+from ...mesh.split.identity import found_again
 from ...mesh.split.local import Following, LocalSurface
 from ...meshes.words import AXES
 from ..coupling import Coupling
@@ -31,12 +33,11 @@ from .friction import Friction
 from .obstacle import Obstacle
 from .placed import Placed
 from .reach import check_apart, safe_shares, within_reach
+from .room import Known, drawn_in, let_out
 from .touch import Grip, Touch, grip, touch
 
 Values = npt.NDArray[np.float64]
-
-LEFT_OUT = 0.05  # share of the barrier's width: what is nearer when it comes to light is in the obstacle, or as good as
-
+Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Law:
@@ -64,8 +65,7 @@ class Obstacles(Term):
         self._surface, self._coupling = LocalSurface(domain), Coupling(domain)
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
-        self._unseen = False  # whether walls have come to light since the last step began
-        check_apart(self.comm, self._surface.points, self.obstacles)
+        check_apart(self.comm, self._surface.at.rest, self.obstacles)
 
     # --- a step ---
 
@@ -83,10 +83,9 @@ class Obstacles(Term):
             self._start_of_step(late)
 
     def _start_of_step(self, late: float) -> None:
-        x, at = self.places(self._level.u), self._at_start
-        if self._unseen:
-            self._leave_out(x, at)
-            self._unseen = False
+        at = self._at_start
+        self._make_room(self.follow.nodal(self._level.u), at)
+        x = self.places(self._level.u)
         held = [grip(x, self.area, placed, self.law.barrier) for placed in at]
         self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
         pushed = [each.force[:, None] * each.normal for each in held]
@@ -104,7 +103,7 @@ class Obstacles(Term):
 
     def places(self, u: Values) -> Values:
         """(n, d) x of the points at the owned displacements u, m (collective)."""
-        return np.asarray(self._surface.points + self.follow(u))
+        return np.asarray(self._surface.at.rest + self.follow(u))
 
     def _touching(self) -> list[Touch]:
         """What each obstacle does at the current u (collective)."""
@@ -124,7 +123,7 @@ class Obstacles(Term):
     def _forces(self, *, normal: bool = True) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; those of friction alone where
         not `normal` (collective)."""
-        forces = np.zeros_like(self._surface.points)
+        forces = np.zeros_like(self._surface.at.rest)
         for each in self._touching():
             forces[each.points] += each.friction + (each.normal if normal else 0.0)
         return self.follow.handed_down(forces)
@@ -146,7 +145,7 @@ class Obstacles(Term):
             return None
         points = np.concatenate([each.points for each in touches])
         blocks = np.concatenate([each.stiffness for each in touches])
-        W = kron(self._surface.weights[points], np.eye(d), format="csr")
+        W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
         return self._coupling((W.T @ _diagonal(blocks) @ W).tocsr(), self._surface.columns)
 
     def stored(self) -> float:
@@ -221,19 +220,61 @@ class Obstacles(Term):
     # --- what breaks, and what is told ---
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """New walls are part of the surface; what lies in an obstacle when it comes to light is left out (collective).
-
-        Gaps inside a body that bends around an obstacle may be closed before anything is there that could touch.
-        """
+        """New walls are part of the surface, drawn in where they would lie in an obstacle (collective)."""
+        placed, width = self._placed, self.law.barrier.width
+        u = self._level.at_end(self._u.x.array[: self._owned])
+        old = self._surface.at
+        gap = np.where(self.area > 0, _gaps(placed, self.places(u)), 0.0)
+        known = Known.of(self._surface.identity(), old.share[old.copies], gap[old.copies], width)
         self._surface.follow_damage(pattern)
         self.follow.destroy()
         self.follow = Following(self._domain, self._surface)
-        self._leave_out(self.places(self._level.at_end(self._u.x.array[: self._owned])), self._placed)
-        self._grips, self._touches, self._unseen = [None] * len(self.obstacles), None, True
+        at, nodal = self._surface.at, self.follow.nodal(u)
+        share, gap = known.again(self._surface.identity(), width)
+        self._leave_out(drawn_in(at, nodal, at.copies, share, gap, partial(_gaps, placed)))
+        self._grips, self._touches = [None] * len(self.obstacles), None
 
-    def _leave_out(self, x: Values, obstacles: Sequence[Placed]) -> None:
-        gap = np.min([placed.distance(x) for placed in obstacles], axis=0)
-        self.area = np.where(gap > LEFT_OUT * self.law.barrier.width, self._surface.area, 0.0)
+    def memory(self) -> tuple[Values, Values]:
+        """Shares of arms, and areas."""
+        return self._surface.at.share, self.area
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave of this surface (not collective)."""
+        share, area = cast("tuple[Values, Values]", memory)
+        if share is not self._surface.at.share:
+            self._surface.at.draw_in(share)
+        self.area = area
+
+    def saved(self) -> dict[str, Values]:
+        """Rows of copies that are drawn in or left out: identity, share, whether left out; on rank 0 (collective)."""
+        at = self._surface.at
+        which = np.flatnonzero((at.share[at.copies] < 1) | (self.area[at.copies] == 0))
+        rows = self._surface.identity()[which]
+        of = at.copies[which]
+        known = np.column_stack([rows, at.share[of], self.area[of] == 0])
+        gathered = self.comm.gather(known)
+        return {"drawn_in": np.concatenate(gathered) if gathered is not None else known}
+
+    def restore(self, saved: dict[str, Values]) -> None:
+        """Be again what `saved` gave."""
+        rows, at = saved["drawn_in"], self._surface.at
+        place = found_again(rows[:, :-2], self._surface.identity())
+        which, share = at.copies[place[place >= 0]], np.ones(len(at.share))
+        share[which] = rows[place >= 0, -2]
+        at.draw_in(share)
+        self._leave_out(which[rows[place >= 0, -1] > 0])
+
+    def _leave_out(self, points: Ints) -> None:
+        self.area = self._surface.area.copy()
+        self.area[points] = 0.0
+
+    def _make_room(self, nodal: Values, obstacles: Sequence[Placed]) -> None:
+        """Points that were drawn in or left out come back as far as there is room."""
+        at, width, gaps = self._surface.at, self.law.barrier.width, partial(_gaps, obstacles)
+        let_out(at, nodal, width, gaps)
+        out = np.flatnonzero(self.area == 0)
+        if len(out):
+            self._leave_out(drawn_in(at, nodal, out, np.ones(len(out)), np.full(len(out), width), gaps))
 
     def readings(self) -> dict[str, Callable[[], Values]]:
         """contact_NAME_AXIS: (1,) forces of the body on each obstacle, this rank's share, N (collective)."""
@@ -264,6 +305,11 @@ class Obstacles(Term):
         """Give the memory of PETSc's objects back."""
         self.follow.destroy()
         self._coupling.destroy()
+
+
+def _gaps(obstacles: Sequence[Placed], x: Values) -> Values:
+    """(n,) least distance of places x (n, d) to the obstacles, m."""
+    return np.asarray(np.min([placed.distance(x) for placed in obstacles], axis=0))
 
 
 def _diagonal(blocks: Values) -> csr_matrix:

@@ -28,7 +28,6 @@ from .slip import Friction, projection
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 EDGES = 0.5  # of the distance of the barrier
 MARGIN = 1.0  # of the distance of the barrier: how far points may move before candidates are looked for again
@@ -123,12 +122,6 @@ class Pairs:
         on = self._mesh.vertices(x)
         return crossings(self._mesh, on) if ipctk.has_intersections(self._mesh, on, ipctk.LBVH()) else NONE
 
-    def crowded(self, x: Values) -> Flags:
-        """(m,) elements on which the barrier acts, or that cut others.
-
-        Walls of a new crack that are crowded as they appear are to be left out until they are not: then no energy
-        comes from nothing, and they carry load once they have been apart.
-        """
-        flags = np.any(self.gradient(x) != 0, axis=1)[self._elements].any(axis=1)
-        flags[self.overlaps(x)] = True
-        return np.asarray(flags)
+    def load(self, x: Values) -> Values:
+        """(n,) size of the barrier's force on each point, N."""
+        return np.asarray(np.linalg.norm(self.gradient(x), axis=1))

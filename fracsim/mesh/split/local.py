@@ -24,6 +24,8 @@ from ..domain import Domain
 from ..ranks import offset
 from ..simplices import is_split
 from .build import Split, split
+from .drawn import Drawn, gradient_entries, middles
+from .identity import identity
 from .skeleton import CRACK, Skeleton
 
 Ints = npt.NDArray[np.int64]
@@ -35,8 +37,8 @@ class LocalSurface:
     """Points of the surface of this rank's cells.
 
     Attributes:
-        points: (n, d) reference coordinates, m.    area: (n,) share of each in the surface, m^2 (2D: m).
-        weights: (n, columns) w.    columns: (columns,) global numbers of the nodes that the points follow.
+        at: where the n points are.    area: (n,) share of each in the surface, m^2 (2D: m).
+        columns: global numbers of the nodes that the points follow: the columns of the weights of `at`.
     """
 
     def __init__(self, domain: Domain) -> None:
@@ -48,36 +50,36 @@ class LocalSurface:
         """Be the surface of a body with these patterns of broken edges, (cells,) (collective)."""
         made = split(self._skeleton, pattern)
         area = _areas(made, self._skeleton)
-        touching = np.flatnonzero(area > 0)
-        self.points, self.area = made.points[touching], area[touching]
-        rows, nodes, values = _entries(made, touching)
-        turning = self._domain.comm.allreduce(len(made.follow.turning)) > 0
-        matrix = self._mean(touching, rows, nodes, values)
-        if turning:
-            matrix = self._turned(matrix, made, pattern, rows, nodes, values, touching)
-        start, columns, entries = matrix.getValuesCSR()
-        matrix.destroy()
-        self.columns, place = np.unique(columns, return_inverse=True)
-        shape = len(touching), len(self.columns)
-        self.weights = csr_matrix((entries, place.reshape(-1), start), shape=shape)
+        self._touching = np.flatnonzero(area > 0)
+        self.area, self._made = area[self._touching], made
+        rows, nodes, values = _entries(made, self._touching)
+        matrices = [self._mean(self._touching, rows, nodes, values)]
+        if self._domain.comm.allreduce(len(made.follow.turning)) > 0:
+            matrices.append(self._arms(made, pattern, rows, nodes, values, self._touching))
+        self.columns, (mean, *arms) = _on_columns(matrices)
+        middle = middles(made.points, made.follow)[self._touching]
+        self.at = Drawn(mean, middle, *(arms or [csr_matrix(mean.shape)]), made.points[self._touching] - middle)
+
+    def identity(self) -> Values:
+        """(k, 2 d + 1) rows that tell the copies `at.copies` from all others, whatever breaks (split.identity)."""
+        domain = self._domain
+        return identity(self._made, self._touching[self.at.copies], domain.node_input, domain.size)
 
     def _mean(self, touching: Ints, rows: Ints, nodes: Ints, values: Values) -> PETSc.Mat:
         """(points, nodes) mean over the parents of each point."""
         return self._matrix(len(touching), 1, rows, self._global(nodes), values)
 
-    def _turned(
-        self, mean: PETSc.Mat, made: Split, pattern: npt.NDArray[np.uint8], rows: Ints, nodes: Ints, values: Values,
-        touching: Ints,
-    ) -> PETSc.Mat:  # fmt: skip
-        """mean + arms times the averages of gradients around the parents: w (collective)."""
+    def _arms(
+        self, made: Split, pattern: npt.NDArray[np.uint8], rows: Ints, nodes: Ints, values: Values, touching: Ints
+    ) -> PETSc.Mat:
+        """(points, nodes) arms times the averages of gradients around the parents (collective)."""
         d = self._domain.dim
         arm = made.follow.arm[_of_points(made, touching)]
         gradients = self._gradients(pattern)
         by = np.repeat(rows, d), (d * self._global(nodes)[:, None] + np.arange(d)).reshape(-1)
         arms = self._matrix(len(touching), d, *by, (values[:, None] * arm).reshape(-1))
         result = arms.matMult(gradients)
-        result.axpy(1.0, mean, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        for used in (mean, arms, gradients):
+        for used in (arms, gradients):
             used.destroy()
         return result
 
@@ -121,41 +123,6 @@ class LocalSurface:
         return matrix
 
 
-def whole_weights(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], places: Values) -> csr_matrix:
-    """(n, nodes) w of points at reference `places` (n, d), which may be others than the surface's own; one rank that
-    has the whole mesh."""
-    d, count, follow = skeleton.dim, len(made.points), made.follow
-    parents = np.diff(follow.start)
-    rows = np.repeat(np.arange(count), parents)
-    share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
-    mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
-    corners = skeleton.cells[~is_split(d)[pattern]]
-    X = skeleton.points[corners]
-    volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
-    around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
-    at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
-    gradients = csr_matrix((values, (at, of)), shape=(d * follow.nodes, follow.nodes))
-    of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
-    arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
-                      shape=(count, d * follow.nodes))  # fmt: skip
-    return (mean + arms @ gradients).tocsr()
-
-
-def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:
-    """Entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
-
-    `X` (cells, d + 1, d) corners, `number` (cells, d + 1) of their nodes, `share` (cells, d + 1) of each cell in the
-    average around each of its nodes.
-    """
-    d = X.shape[2]
-    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
-    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
-    entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
-    at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
-    of = np.broadcast_to(number[:, None, None, :], entries.shape)
-    return at.reshape(-1), of.reshape(-1), entries.reshape(-1)
-
-
 def _mesh_of(domain: Domain) -> MeshData:
     """This rank's cells, and which of their facets are on the boundary of the body."""
     exterior = domain._exterior
@@ -193,12 +160,24 @@ def _entries(made: Split, points: Ints) -> tuple[Ints, Ints, Values]:
     return rows, made.follow.parents[_of_points(made, points)], np.repeat(1.0 / count, count)
 
 
+def _on_columns(matrices: list[PETSc.Mat]) -> tuple[Ints, list[csr_matrix]]:
+    """The columns that are used, and this rank's rows of the matrices on them; the matrices are given back."""
+    found = [each.getValuesCSR() for each in matrices]
+    for each in matrices:
+        each.destroy()
+    columns, place = np.unique(np.concatenate([columns for _, columns, _ in found]), return_inverse=True)
+    places = np.split(place.reshape(-1), np.cumsum([len(columns) for _, columns, _ in found])[:-1])
+    shape = len(found[0][0]) - 1, len(columns)
+    each = zip(found, places, strict=True)
+    return columns, [csr_matrix((entries, at, start), shape=shape) for (start, _, entries), at in each]
+
+
 class Following:
     """Carries values between the nodes of a body, wherever they are, and the points of this rank's surface."""
 
     def __init__(self, domain: Domain, surface: LocalSurface) -> None:
         """For the surface as it is now (collective)."""
-        self.weights, self._dim = surface.weights, domain.dim
+        self._surface, self._dim = surface, domain.dim
         self._nodes = PETSc.Vec().createMPI((domain.node_count * domain.dim, PETSc.DETERMINE), bsize=domain.dim,
                                             comm=domain.comm)  # fmt: skip
         self._here = PETSc.Vec().createSeq(len(surface.columns) * domain.dim, bsize=domain.dim)
@@ -208,13 +187,17 @@ class Following:
 
     def __call__(self, owned: Values) -> Values:
         """(n, d) values at the points of a field given by its owned dofs (collective)."""
+        return np.asarray(self._surface.at.weights @ self.nodal(owned))
+
+    def nodal(self, owned: Values) -> Values:
+        """(columns, d) values at the nodes that the points follow (collective)."""
         self._nodes.array_w[:] = owned
         self._scatter.scatter(self._nodes, self._here, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
-        return np.asarray(self.weights @ self._here.array_r.reshape(-1, self._dim))
+        return np.asarray(self._here.array_r.reshape(-1, self._dim))
 
     def handed_down(self, forces: Values) -> Values:
         """(owned dofs,) nodal forces of forces (n, d) at the points, N (collective)."""
-        self._here.array_w[:] = (self.weights.T @ forces).reshape(-1)
+        self._here.array_w[:] = (self._surface.at.weights.T @ forces).reshape(-1)
         self._nodes.set(0.0)
         self._scatter.scatter(self._here, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return self._nodes.array_r.copy()

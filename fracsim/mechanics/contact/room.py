@@ -1,0 +1,77 @@
+"""Room for walls that come to light where there is none: their points are drawn in towards their nodes.
+
+Gaps inside a body are closed before anything is there that could touch: it bends around an obstacle, is squeezed, or a
+crumb whose cells are all split loses its deformation gradient. A new point takes the largest share of its arm that
+brings no barrier to act, one that was there before the largest at which it is no nearer than it was: no energy comes
+from nothing. Where there is no room even at the node, the point is left out. With every step points go out again as
+far as the barrier lets them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ...mesh.split.drawn import Drawn
+from ...mesh.split.identity import found_again
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+SHARES = np.linspace(1.0, 0.0, 11)  # of the share that a point had
+OUT = 0.2  # of the arm, that a step gives back
+
+
+@dataclass(frozen=True)
+class Known:
+    """Copies that are worth knowing again: rows of `identity`, their shares (k,), and gaps (k,) in m; 0: left out."""
+
+    rows: Values
+    share: Values
+    gap: Values
+
+    @classmethod
+    def of(cls, rows: Values, share: Values, gap: Values, width: float) -> Known:
+        """Of all copies those that are within `width` m, or drawn in."""
+        which = np.flatnonzero((gap < width) | (share < 1))
+        return cls(rows[which], share[which], gap[which])
+
+    def again(self, rows: Values, width: float) -> tuple[Values, Values]:
+        """(n,) shares that the copies `rows` begin with, and gaps that they must keep: all of `width`, if new."""
+        share, gap = np.ones(len(rows)), np.full(len(rows), width)
+        at = found_again(self.rows, rows)
+        share[at[at >= 0]], gap[at[at >= 0]] = self.share[at >= 0], self.gap[at >= 0]
+        return share, np.where(gap > 0, np.minimum(gap, width), width)
+
+
+def drawn_in(
+    at: Drawn, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
+) -> Ints:
+    """Draw points `which` (k,) in from `share` (k,) until gaps(x) reach `wanted` (k,), m; those that have no room, whose
+    shares stay. `u`: (nodes, d) displacements, m."""
+    found, left = at.share.copy(), np.arange(len(which))
+    found[which] = share
+    for part in SHARES:
+        trial = part * share[left]
+        fits = gaps(at.places(u, which[left], trial)) >= wanted[left] * (1 - 1e-9)  # of what does not move: round-off
+        found[which[left[fits]]] = trial[fits]
+        left = left[~fits]
+        if not len(left):
+            break
+    if (found != at.share).any():
+        at.draw_in(found)
+    return which[left]
+
+
+def let_out(at: Drawn, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> None:
+    """Let points that were drawn in go out by OUT where gaps stay `wanted`, m."""
+    inside = np.flatnonzero(at.share < 1)
+    if not len(inside):
+        return
+    trial, share = np.minimum(at.share[inside] + OUT, 1.0), at.share.copy()
+    fits = gaps(at.places(u, inside, trial)) >= wanted
+    share[inside[fits]] = trial[fits]
+    at.draw_in(share)

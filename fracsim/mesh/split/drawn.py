@@ -1,0 +1,94 @@
+"""Where points of a split surface are: linear in the nodes, and drawn in towards them as far as there is no room.
+
+    x = mean over p of (x_p + s F_p (X - X_p)) = X_s + sum over nodes a of w_a u_a
+
+F_p as in `local`. With s = 1 the point is where the material is; with s < 1 it is nearer to the nodes that it follows,
+which is where a wall is put that comes to light inside something: nodes lie deeper in the body than its walls. Affine
+motions of the place X_s are reproduced, and sum w_a = 1, at any s.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix, diags
+
+from ..simplices import is_split
+from .build import Split
+from .follow import Follow
+from .skeleton import Skeleton
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+class Drawn:
+    """Places of n points at shares of their arms.
+
+    Attributes:
+        share: (n,) s.    rest: (n, d) X_s, m.    weights: (n, nodes) w.    copies: (k,) points that have arms.
+    """
+
+    share: Values
+    rest: Values
+    weights: csr_matrix
+
+    def __init__(self, mean: csr_matrix, middle: Values, arms: csr_matrix, out: Values) -> None:
+        """`mean` (n, nodes) over the parents, `middle` (n, d) theirs, m; `arms` (n, nodes) times gradients, `out` (n, d)
+        mean arm, m."""
+        self._mean, self._middle, self._arms, self._out = mean, middle, arms, out
+        self.copies: Ints = np.flatnonzero(np.any(out != 0, axis=1))
+        self.draw_in(np.ones(len(middle)))
+
+    def draw_in(self, share: Values) -> None:
+        """Have the arms times `share` (n,)."""
+        self.share, self.rest = share, self._middle + share[:, None] * self._out
+        self.weights = (self._mean + diags(share) @ self._arms).tocsr()
+
+    def places(self, u: Values, points: Ints, share: Values) -> Values:
+        """(k, d) x of some points at other shares (k,); u (nodes, d), m."""
+        middle = self._middle[points] + self._mean[points] @ u
+        return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
+
+
+def middles(points: Values, follow: Follow) -> Values:
+    """(n, d) means of the parents of reference `points` (n, d), m."""
+    start = follow.start
+    result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
+    return result
+
+
+def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], places: Values) -> Drawn:
+    """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
+    that has the whole mesh."""
+    d, count, follow = skeleton.dim, len(made.points), made.follow
+    parents = np.diff(follow.start)
+    rows = np.repeat(np.arange(count), parents)
+    share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
+    mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
+    corners = skeleton.cells[~is_split(d)[pattern]]
+    X = skeleton.points[corners]
+    volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
+    around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
+    at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
+    gradients = csr_matrix((values, (at, of)), shape=(d * follow.nodes, follow.nodes))
+    of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
+    arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
+                      shape=(count, d * follow.nodes))  # fmt: skip
+    middle = np.asarray(mean @ skeleton.points)
+    return Drawn(mean, middle, (arms @ gradients).tocsr(), places - middle)
+
+
+def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:
+    """Entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
+
+    `X` (cells, d + 1, d) corners, `number` (cells, d + 1) of their nodes, `share` (cells, d + 1) of each cell in the
+    average around each of its nodes.
+    """
+    d = X.shape[2]
+    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
+    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
+    entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
+    at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
+    of = np.broadcast_to(number[:, None, None, :], entries.shape)
+    return at.reshape(-1), of.reshape(-1), entries.reshape(-1)
