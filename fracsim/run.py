@@ -97,7 +97,7 @@ class Run:
         self.history = History(self.comm, folder / "history.csv", names, step)
         self._watch(notes)
         self.frames = FrameFiles(
-            folder, self.scene.balance.stress, self.scene.fracture, self.breaks,
+            folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), resume_at=t,
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)

@@ -265,24 +265,6 @@ def test_closed_crack_carries_load(dim):
     assert all(len(pairs.overlaps(each)) == 0 for each in closed)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_crowded_walls_wait_until_they_are_apart(dim):
-    """Sides of a crack that meet as they appear, because the body is bent: left out they do nothing, then they part."""
-    mesh = lattice(*[3] * dim)
-    skeleton = Skeleton(mesh)
-    made = torn(mesh, separated(skeleton, mesh.points[:, 0] > 1.5))
-    rest = receded(made, 0.03)
-    x = rest + np.random.default_rng(1).uniform(-0.03, 0.03, rest.shape)
-    whole = Pairs(rest, made.elements, distance=0.03, stiffness=1.0)
-    assert len(whole.overlaps(x)) > 0
-    crowded = whole.crowded(x)
-    part = Pairs(rest, made.elements[~crowded], distance=0.03, stiffness=1.0)
-    assert part.energy(x) == 0
-    assert len(part.overlaps(x)) == 0
-    apart = x + np.outer(mesh.points[made.follow.first_parent, 0] > 1.5, np.eye(dim)[0])
-    assert not whole.crowded(apart).any()
-
-
 def shortest(mesh: MeshData) -> float:
     ends = mesh.points[Skeleton(mesh).edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min())

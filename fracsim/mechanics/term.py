@@ -19,6 +19,8 @@ import ufl
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from ..mesh.split.places import Places
+
 Values = npt.NDArray[np.float64]
 type Form = ufl.Form | int  # 0: none
 
@@ -57,6 +59,7 @@ class Term:
 
     name: ClassVar[str] = ""
     symmetric: bool = True  # whether its share of the tangent is
+    keeps_apart: ClassVar[bool] = False  # whether it has a say in where the points of the split surface are: `apart`
 
     def begin(self, level: Level) -> None:
         """A step (or a look at a state) begins. Collective."""
@@ -142,6 +145,11 @@ class Term:
         """Work from outside in the step that has ended which `applied` does not show, and what of it is lost, this
         rank's share, J; asked once a step (collective)."""
         return 0.0, 0.0
+
+    def apart(self, at: Places, u: Values, t: float) -> Places:
+        """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
+        it keeps apart is apart; `at`: where it is without. Asked of rank 0, for what is drawn (not collective)."""
+        return at
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

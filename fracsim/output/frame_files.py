@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..mechanics.stress import Stress
+from ..mechanics.balance import Balance
 from ..stepping.state import State
 from .breaks import Breaks
 from .fields import Frames
@@ -27,7 +27,7 @@ class FrameFiles:
     def __init__(
         self,
         folder: Path,
-        stress: Stress,
+        balance: Balance,
         breaking: Breaking | None,
         breaks: Breaks,
         *,
@@ -39,10 +39,11 @@ class FrameFiles:
 
         Raises CannotWrite.
         """
+        stress = balance.stress
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
         self._values, source = Frames(stress, fields, breaking), stress.domain.source
         self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
-        self.surface = _surface(folder, stress, breaks, resume_at) if surface else None
+        self.surface = _surface(folder, balance, breaks, resume_at) if surface else None
 
     def write(self, state: State) -> None:
         """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
@@ -56,8 +57,9 @@ class FrameFiles:
             self.fields.write(t, fields)
 
 
-def _surface(folder: Path, stress: Stress, breaks: Breaks, resume_at: float | None) -> SurfaceOutput:
+def _surface(folder: Path, balance: Balance, breaks: Breaks, resume_at: float | None) -> SurfaceOutput:
     """The split surface: imported, built and kept only where it is wanted."""
     from .surface.output import SurfaceOutput
 
-    return SurfaceOutput(folder, stress.domain, stress.material.density, breaks.record, resume_at=resume_at)
+    density, apart = balance.stress.material.density, [term.apart for term in balance.terms if term.keeps_apart]
+    return SurfaceOutput(folder, balance.domain, density, breaks.record, apart=apart, resume_at=resume_at)

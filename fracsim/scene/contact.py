@@ -32,7 +32,7 @@ def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: Materi
 def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
     """The term of a body that touches itself (collective). InputError without ipctk."""
     try:
-        from ..mechanics.contact import itself
+        from ..mechanics.contact import crowd, itself
     except ImportError:
         raise InputError(
             "[contact] needs ipctk, which this environment lacks: pip install fracsim[contact], or itself = false"
@@ -40,7 +40,7 @@ def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material:
     distance = contact.distance or DISTANCE_ITSELF * domain.mean_edge
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep = contact.creep or CREEP * domain.size
-    return itself.SelfContact(domain, u, itself.Law(distance, stiffness, contact.friction, creep))
+    return itself.SelfContact(domain, u, crowd.Law(distance, stiffness, contact.friction, creep))
 
 
 def _obstacle(entry: Placing, number: int) -> Obstacle:

@@ -8,30 +8,52 @@ import numpy.typing as npt
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 NONE: Ints = np.empty((0, 2), np.int64)
 
 
 def crossings(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    """(k, 2) elements at x (n, d), m; one by one, which is no matter: overlaps are few, or end the run."""
+    """(k, 2) elements at x (n, d), m, of which neither is a neighbour of the other."""
     phase = ipctk.LBVH()
     phase.build(x, mesh.edges, mesh.faces, 0.0)
     return _of_triangles(phase, mesh, x) if x.shape[1] == 3 else _of_segments(phase, mesh, x)
 
 
 def _of_segments(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = [(each.edge0_id, each.edge1_id) for each in phase.detect_edge_edge_candidates()]
-    ends = x[mesh.edges]
-    cut = [pair for pair in near if ipctk.segment_segment_intersect(*ends[pair[0]], *ends[pair[1]])]
-    return np.array(cut, np.int64).reshape(-1, 2)
+    near = _pairs([(each.edge0_id, each.edge1_id) for each in phase.detect_edge_edge_candidates()])
+    (a, b), (c, d) = (x[mesh.edges[near[:, k]]].transpose(1, 0, 2) for k in range(2))
+    return near[_part(a, b, c, d) & _part(c, d, a, b)]
+
+
+def _part(a: Values, b: Values, c: Values, d: Values) -> Flags:
+    """(k,) whether the line through a and b parts c from d, (k, 2) each."""
+    (way_x, way_y), to = (b - a).T, [(each - a).T for each in (c, d)]
+    side = [way_x * y - way_y * x for x, y in to]
+    return np.asarray(side[0] * side[1] <= 0)
 
 
 def _of_triangles(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = [(each.edge_id, each.face_id) for each in phase.detect_edge_face_candidates()]
-    ends, corners = x[mesh.edges], x[mesh.faces]
-    cut = [pair for pair in near if ipctk.is_edge_intersecting_triangle(*ends[pair[0]], *corners[pair[1]])]
-    pairs: Ints = np.array(cut, np.int64).reshape(-1, 2)
+    near = _pairs([(each.edge_id, each.face_id) for each in phase.detect_edge_face_candidates()])
+    near = near[_pierced(x[mesh.edges[near[:, 0]]], x[mesh.faces[near[:, 1]]])]
     of_edge = np.empty(len(mesh.edges), np.int64)  # a triangle of each edge
     of_edge[mesh.faces_to_edges.ravel()] = np.repeat(np.arange(len(mesh.faces)), 3)
-    pairs[:, 0] = of_edge[pairs[:, 0]]
-    return np.unique(np.sort(pairs, axis=1), axis=0)
+    near[:, 0] = of_edge[near[:, 0]]
+    return np.unique(np.sort(near, axis=1), axis=0)
+
+
+def _pierced(ends: Values, corners: Values) -> Flags:
+    """(k,) whether edges (k, 2, 3) go through triangles (k, 3, 3): their ends are on both sides, and the edge turns the
+    same way about all three sides."""
+    start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    above = [np.einsum("ij,ij->i", ends[:, k] - corners[:, 0], normal) for k in range(2)]
+    turns = [
+        np.einsum("ij,ij->i", way, np.cross(corners[:, k] - start, corners[:, (k + 1) % 3] - start)) for k in range(3)
+    ]
+    same = np.all(np.array(turns) >= 0, axis=0) | np.all(np.array(turns) <= 0, axis=0)
+    return np.asarray((above[0] * above[1] <= 0) & (above[0] != above[1]) & same)
+
+
+def _pairs(found: list[tuple[int, int]]) -> Ints:
+    return np.array(found, np.int64).reshape(-1, 2)

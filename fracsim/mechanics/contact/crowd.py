@@ -1,9 +1,9 @@
 """The surface of a body that touches itself, with room for walls that come to light where it is crowded (rank 0).
 
 The sides of a new crack recede (recede); where that is not enough, in a body that is squeezed or for a crumb that has
-lost its deformation gradient, walls are drawn in towards their nodes until no barrier presses harder on them than before
-the edge broke: no energy comes from nothing. What is crowded even so is left out. With every step walls go out again,
-and those left out come back, where nothing acts on them.
+lost its deformation gradient, walls are drawn in towards their nodes until no barrier presses harder on them than
+before the edge broke: no energy comes from nothing. What is crowded even so is left out. With every step walls go out
+again, and those left out come back, where nothing acts on them.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scipy.sparse import csr_matrix, kron
 
 from ...errors import InputError
 from ...mesh.split.build import Split, split
-from ...mesh.split.drawn import whole
 from ...mesh.split.identity import found_again, identity
+from ...mesh.split.places import whole
 from ...mesh.split.skeleton import Skeleton
 from ...meshes.words import format_point
 from .pairs import Pairs
@@ -27,8 +27,9 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 GAP = 2.0  # between the sides of a new crack, in distances of the barrier (recede)
-IN, ROUNDS = 0.7, 8  # what is left of an arm, and how often it may be shortened: to a twentieth
-ROUND_OFF = 1e-6  # of a force
+IN, LEAST = 0.7, 0.2  # what is left of an arm each time that it is shortened, and in all
+NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
+ROUND_OFF = 1e-6  # of a pressure
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,14 @@ class Surface:
         copies[self.at.copies] = True
         self._walls = np.flatnonzero(copies[self.made.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
-        self.pairs, self._out = self._all_pairs(), np.empty(0, np.int64)
+        self.pairs = self._all_pairs()
+        self._out: Ints = np.empty(0, np.int64)
         if before is None:
             _check_apart(self.pairs, self.made)
         else:
             share, load = self._known(before, u)
-            self.at.draw_in(share)
-            self._leave_out(self._draw_in(u, load))
+            self.at = self.at.drawn_in(share)
+            self._settle(u, load)
 
     def _all_pairs(self) -> Pairs:
         return Pairs(self._rest, self.made.elements, **self._how)
@@ -85,7 +87,7 @@ class Surface:
         """Be again what `memory` gave of this surface."""
         share, out = memory
         if share is not self.at.share:
-            self.at.draw_in(share)
+            self.at = self.at.drawn_in(share)
         if out is not self._out:
             self.pairs = self._all_pairs()
             self._leave_out(out)
@@ -96,64 +98,69 @@ class Surface:
         return identity(self.made, self.at.copies, np.arange(self._nodes), self._size)
 
     def _known(self, before: Surface, u: Values) -> tuple[Values, Values]:
-        """(n,) shares and forces, N, that points had before; of new ones 1 and 0."""
+        """(n,) shares and pressures, Pa, that points had before; of new ones 1 and 0. Nodes have kept their numbers."""
         share, load = np.ones(len(self.made.points)), np.zeros(len(self.made.points))
-        force = before.pairs.load(before.places(u))
-        old = before.at.copies
-        which = np.flatnonzero((force[old] > 0) | (before.at.share[old] < 1))
+        pressure, old = before.pairs.pressure(before.at(u)), before.at.copies
+        which = np.flatnonzero((pressure[old] > 0) | (before.at.share[old] < 1))
         again = found_again(before._identity()[which], self._identity())
         at = self.at.copies[again[again >= 0]]
-        share[at], load[at] = before.at.share[old[which]][again >= 0], force[old[which]][again >= 0]
+        share[at], load[at] = before.at.share[old[which]][again >= 0], pressure[old[which]][again >= 0]
+        nodes = min(old.min(initial=len(pressure)), self.at.copies.min(initial=len(load)))
+        load[:nodes] = pressure[:nodes]
         return share, load
 
-    def _crowded(self, x: Values, load: Values, pairs: Pairs) -> Ints:
-        """Walls that are pressed harder than with `load` (n,) N, at a corner, or cut something."""
-        elements = self.made.elements[self._walls]
-        flags = (pairs.load(x) > load * (1 + ROUND_OFF))[elements].any(axis=1)
+    def _crowded(self, u: Values, most: Values, pairs: Pairs) -> Ints:
+        """Walls that are pressed harder than `most` (n,) Pa at a corner, or cut something."""
+        x, elements = self.at(u), self.made.elements[self._walls]
+        flags = (pairs.pressure(x) > most * (1 + ROUND_OFF))[elements].any(axis=1)
         cut = np.zeros(len(self.made.elements), bool)
         cut[pairs.overlaps(x)] = True
         return self._walls[flags | cut[self._walls]]
 
-    def _draw_in(self, u: Values, load: Values) -> Ints:
-        """Draw in crowded walls; those that stay so."""
-        for _ in range(ROUNDS):
-            crowded = self._crowded(self.places(u), load, self.pairs)
-            if not len(crowded):
+    def _settle(self, u: Values, load: Values) -> None:
+        """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
+        so. Pairs are those of all elements."""
+        start = self.at.share
+        while len(crowded := self._crowded(u, load, self.pairs)):
+            share, tight = self.at.share.copy(), np.unique(self.made.elements[crowded])
+            share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
+            if np.array_equal(share, self.at.share):
                 break
-            share = self.at.share.copy()
-            share[np.unique(self.made.elements[crowded])] *= IN
-            self.at.draw_in(share)
-        return self._crowded(self.places(u), load, self.pairs) if len(crowded) else crowded
+            self.at = self.at.drawn_in(share)
+        if len(crowded):
+            crowded = self._crowded(u, np.maximum(load, NEAR * self._how["stiffness"]), self.pairs)
+        self._leave_out(crowded)
+        if len(crowded):  # what is out is to come back as it was, not smaller each time
+            gone = np.ones(len(start), bool)
+            gone[np.delete(self.made.elements, crowded, axis=0)] = False
+            self.at = self.at.drawn_in(np.where(gone, start, self.at.share))
 
     def make_room(self, u: Values) -> None:
         """A step begins at u (nodes, d), m: what was drawn in or left out comes back where there is room."""
-        load = self.pairs.load(self.places(u))
-        if (self.at.share < 1).any():
+        inside = self.at.share < 1
+        if not (inside.any() or len(self._out)):
+            return
+        load = self.pairs.pressure(self.at(u))
+        if inside.any():
             self._let_out(u, load)
         if len(self._out):
-            crowded = self._crowded(self.places(u), load, self._all_pairs())
-            if len(still := np.intersect1d(self._out, crowded)) < len(self._out):
-                self._leave_out(still)
+            self.pairs = self._all_pairs()
+            self._settle(u, load)
 
     def _let_out(self, u: Values, load: Values) -> None:
         before = self.at.share
-        self.at.draw_in(np.minimum(before / IN, 1.0))
+        self.at = self.at.drawn_in(np.minimum(before / IN, 1.0))
         for _ in range(2):  # what stays in may be in the way of its neighbours
-            crowded = self._crowded(self.places(u), load, self.pairs)
+            crowded = self._crowded(u, load, self.pairs)
             if not len(crowded):
                 return
-            share = self.at.share.copy()
-            tight = np.unique(self.made.elements[crowded])
+            share, tight = self.at.share.copy(), np.unique(self.made.elements[crowded])
             share[tight] = before[tight]
-            self.at.draw_in(share)
-        if len(self._crowded(self.places(u), load, self.pairs)):
-            self.at.draw_in(before)
+            self.at = self.at.drawn_in(share)
+        if len(self._crowded(u, load, self.pairs)):
+            self.at = self.at.drawn_in(before)
 
     # --- from nodes to points and back ---
-
-    def places(self, u: Values) -> Values:
-        """(n, d) x of nodal displacements (nodes, d), m."""
-        return np.asarray(self.at.rest + self.at.weights @ u)
 
     def handed_down(self, forces: Values) -> Values:
         """(nodes, d) of forces (n, d) at the points, N."""

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix
 
 from ...mesh.domain import Domain
 from ...mesh.ranks import from_root, on_root
+from ...mesh.split.places import Places
 from ...mesh.split.skeleton import Skeleton
 from ..coupling import Coupling
 from ..term import Level, Term
@@ -23,10 +24,12 @@ from .slip import Friction
 
 Values = npt.NDArray[np.float64]
 
+
 class SelfContact(Term):
     """A body that cannot pass through itself."""
 
     name = "contact"
+    keeps_apart = True
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
         """InputError where the surface at rest cuts itself (collective)."""
@@ -61,6 +64,12 @@ class SelfContact(Term):
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
         return self._domain.gather_nodes(np.asarray(u).reshape(-1, self._domain.dim))
 
+    def apart(self, at: Places, u: Values, t: float) -> Places:
+        """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
+        assert self._surface is not None
+        own = self._surface.at
+        return own.drawn_in(np.minimum(own.share, at.share))
+
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """New walls may touch from here on, drawn in where they are crowded as they appear (collective)."""
         self._pattern = pattern
@@ -80,12 +89,12 @@ class SelfContact(Term):
     def saved(self) -> dict[str, Values]:
         """Shares of arms, and numbers of elements that are left out."""
         share, out = (np.empty(0), np.empty(0)) if self._surface is None else self._surface.memory()
-        return {"share": share, "left_out": out}
+        return {"share": share, "left_out": np.asarray(out, float)}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         if self._surface is not None:
-            self._surface.recall((saved["share"], saved["left_out"]))
+            self._surface.recall((saved["share"], saved["left_out"].astype(np.int64)))
 
     def begin(self, level: Level) -> None:
         """A step begins: friction is that of its start."""
@@ -95,7 +104,7 @@ class SelfContact(Term):
         nodal = self._gathered(level.u)
         if self._surface is not None and nodal is not None:
             self._surface.make_room(nodal)
-            self._start = self._surface.places(nodal)
+            self._start = self._surface.at(nodal)
         if self.law.friction and self._surface is not None and self._start is not None:
             x, slip = self._start, self.law.creep * level.dt
             self._rubbing = self._surface.pairs.lag_friction(x, x, slip)
@@ -115,7 +124,7 @@ class SelfContact(Term):
     def _placed(self, u: Values) -> Values | None:
         """(n, d) x of the owned displacements u, on rank 0 (collective)."""
         nodal = self._gathered(u)
-        return None if self._surface is None or nodal is None else self._surface.places(nodal)
+        return None if self._surface is None or nodal is None else self._surface.at(nodal)
 
     # --- what it adds to the balance ---
 

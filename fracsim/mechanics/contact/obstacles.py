@@ -25,6 +25,7 @@ from ...mesh.domain import Domain
 from ...mesh.ranks import total
 from ...mesh.split.identity import found_again
 from ...mesh.split.local import Following, LocalSurface
+from ...mesh.split.places import Places
 from ...meshes.words import AXES
 from ..coupling import Coupling
 from ..term import Level, Term
@@ -37,7 +38,9 @@ from .room import Known, drawn_in, let_out
 from .touch import Grip, Touch, grip, touch
 
 Values = npt.NDArray[np.float64]
+TINY = float(np.finfo(float).tiny)
 Ints = npt.NDArray[np.int64]
+
 
 @dataclass(frozen=True)
 class Law:
@@ -56,6 +59,7 @@ class Obstacles(Term):
     """
 
     name = "obstacles"
+    keeps_apart = True
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
@@ -219,6 +223,12 @@ class Obstacles(Term):
 
     # --- what breaks, and what is told ---
 
+    def apart(self, at: Places, u: Values, t: float) -> Places:
+        """Drawn in where it would lie in an obstacle, as the points are that touch."""
+        gaps = partial(_gaps, [each.placed(t) for each in self.obstacles])
+        inside = at.copies[gaps(at(u))[at.copies] <= 0]
+        return drawn_in(at, u, inside, at.share[inside], np.full(len(inside), TINY), gaps)[0] if len(inside) else at
+
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """New walls are part of the surface, drawn in where they would lie in an obstacle (collective)."""
         placed, width = self._placed, self.law.barrier.width
@@ -231,7 +241,8 @@ class Obstacles(Term):
         self.follow = Following(self._domain, self._surface)
         at, nodal = self._surface.at, self.follow.nodal(u)
         share, gap = known.again(self._surface.identity(), width)
-        self._leave_out(drawn_in(at, nodal, at.copies, share, gap, partial(_gaps, placed)))
+        self._surface.at, out = drawn_in(at, nodal, at.copies, share, gap, partial(_gaps, placed))
+        self._leave_out(out)
         self._grips, self._touches = [None] * len(self.obstacles), None
 
     def memory(self) -> tuple[Values, Values]:
@@ -242,7 +253,7 @@ class Obstacles(Term):
         """Be again what `memory` gave of this surface (not collective)."""
         share, area = cast("tuple[Values, Values]", memory)
         if share is not self._surface.at.share:
-            self._surface.at.draw_in(share)
+            self._surface.at = self._surface.at.drawn_in(share)
         self.area = area
 
     def saved(self) -> dict[str, Values]:
@@ -261,7 +272,7 @@ class Obstacles(Term):
         place = found_again(rows[:, :-2], self._surface.identity())
         which, share = at.copies[place[place >= 0]], np.ones(len(at.share))
         share[which] = rows[place >= 0, -2]
-        at.draw_in(share)
+        self._surface.at = at.drawn_in(share)
         self._leave_out(which[rows[place >= 0, -1] > 0])
 
     def _leave_out(self, points: Ints) -> None:
@@ -270,11 +281,12 @@ class Obstacles(Term):
 
     def _make_room(self, nodal: Values, obstacles: Sequence[Placed]) -> None:
         """Points that were drawn in or left out come back as far as there is room."""
-        at, width, gaps = self._surface.at, self.law.barrier.width, partial(_gaps, obstacles)
-        let_out(at, nodal, width, gaps)
-        out = np.flatnonzero(self.area == 0)
-        if len(out):
-            self._leave_out(drawn_in(at, nodal, out, np.ones(len(out)), np.full(len(out), width), gaps))
+        width, gaps = self.law.barrier.width, partial(_gaps, obstacles)
+        at = let_out(self._surface.at, nodal, width, gaps)
+        if len(out := np.flatnonzero(self.area == 0)):
+            at, out = drawn_in(at, nodal, out, np.ones(len(out)), np.full(len(out), width), gaps)
+            self._leave_out(out)
+        self._surface.at = at
 
     def readings(self) -> dict[str, Callable[[], Values]]:
         """contact_NAME_AXIS: (1,) forces of the body on each obstacle, this rank's share, N (collective)."""

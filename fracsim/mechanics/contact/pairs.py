@@ -59,6 +59,7 @@ class Pairs:
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction = friction
+        self._area = _areas(rest, elements)
 
     # --- the barrier ---
 
@@ -122,6 +123,15 @@ class Pairs:
         on = self._mesh.vertices(x)
         return crossings(self._mesh, on) if ipctk.has_intersections(self._mesh, on, ipctk.LBVH()) else NONE
 
-    def load(self, x: Values) -> Values:
-        """(n,) size of the barrier's force on each point, N."""
-        return np.asarray(np.linalg.norm(self.gradient(x), axis=1))
+    def pressure(self, x: Values) -> Values:
+        """(n,) the barrier's force on each point by its share of the reference surface, Pa; 0 where it has none."""
+        force, area = np.linalg.norm(self.gradient(x), axis=1), self._area
+        return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
+
+
+def _areas(x: Values, elements: Ints) -> Values:
+    """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
+    side, d = x[elements[:, 1:]] - x[elements[:, :1]], x.shape[1]
+    spanned = side[:, 0] if d == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
+    measure = np.linalg.norm(spanned, axis=1)
+    return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)

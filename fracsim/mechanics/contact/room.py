@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...mesh.split.drawn import Drawn
 from ...mesh.split.identity import found_again
+from ...mesh.split.places import Places
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -48,30 +48,28 @@ class Known:
 
 
 def drawn_in(
-    at: Drawn, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
-) -> Ints:
-    """Draw points `which` (k,) in from `share` (k,) until gaps(x) reach `wanted` (k,), m; those that have no room, whose
-    shares stay. `u`: (nodes, d) displacements, m."""
+    at: Places, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
+) -> tuple[Places, Ints]:
+    """Points `which` (k,) drawn in from `share` (k,) until gaps(x) reach `wanted` (k,), m; and those that have no room,
+    whose shares stay. `u`: (nodes, d) displacements, m."""
     found, left = at.share.copy(), np.arange(len(which))
     found[which] = share
     for part in SHARES:
         trial = part * share[left]
-        fits = gaps(at.places(u, which[left], trial)) >= wanted[left] * (1 - 1e-9)  # of what does not move: round-off
+        fits = gaps(at.some(u, which[left], trial)) >= wanted[left] * (1 - 1e-9)  # of what does not move: round-off
         found[which[left[fits]]] = trial[fits]
         left = left[~fits]
         if not len(left):
             break
-    if (found != at.share).any():
-        at.draw_in(found)
-    return which[left]
+    return at if np.array_equal(found, at.share) else at.drawn_in(found), which[left]
 
 
-def let_out(at: Drawn, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> None:
-    """Let points that were drawn in go out by OUT where gaps stay `wanted`, m."""
+def let_out(at: Places, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> Places:
+    """Points that were drawn in go out by OUT where gaps stay `wanted`, m."""
     inside = np.flatnonzero(at.share < 1)
     if not len(inside):
-        return
+        return at
     trial, share = np.minimum(at.share[inside] + OUT, 1.0), at.share.copy()
-    fits = gaps(at.places(u, inside, trial)) >= wanted
+    fits = gaps(at.some(u, inside, trial)) >= wanted
     share[inside[fits]] = trial[fits]
-    at.draw_in(share)
+    return at.drawn_in(share)

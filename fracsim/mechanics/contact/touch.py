@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +38,7 @@ class Touch:
     Attributes:
         points: (k,) of the surface, with a gap below the barrier's width or gripped by friction.
         energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.    friction_energy: J.
-        stiffness: (k, d, d) minus the derivative of the forces, positive semi-definite, N/m.
+        make_stiffness: gives `stiffness`, once it is asked for.
     """
 
     points: Ints
@@ -44,7 +46,12 @@ class Touch:
     normal: Values
     friction: Values
     friction_energy: float
-    stiffness: Values
+    make_stiffness: Callable[[], Values]
+
+    @cached_property
+    def stiffness(self) -> Values:
+        """(k, d, d) minus the derivative of the forces, positive semi-definite, N/m."""
+        return self.make_stiffness()
 
 
 def grip(x: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
@@ -68,15 +75,19 @@ def touch(
     points = np.flatnonzero(near)
     gap, share, at = gap[points], area[points], x[points]
     normal, slope = placed.normal(at), barrier.slope(gap)
-    bent = barrier.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    stiffness = share[:, None, None] * positive(bent + slope[:, None, None] * placed.curvature(at))
     rubbed, stored = np.zeros_like(at), 0.0
     if friction is not None and held is not None and len(held.points):
         moved = x[held.points] - held.start - way
-        row = np.searchsorted(points, held.points)
-        rubbed[row] = -friction.gradient(held.force, held.normal, moved)
-        stiffness[row] += friction.hessian(held.force, held.normal, moved)
+        rubbed[np.searchsorted(points, held.points)] = -friction.gradient(held.force, held.normal, moved)
         stored = float(friction.energy(held.force, held.normal, moved).sum())
+
+    def stiffness() -> Values:
+        bent = barrier.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        found = share[:, None, None] * positive(bent + slope[:, None, None] * placed.curvature(at))
+        if friction is not None and held is not None and len(held.points):
+            found[np.searchsorted(points, held.points)] += friction.hessian(held.force, held.normal, moved)
+        return np.asarray(found)
+
     energy = float(share @ barrier.energy(gap))
     return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, stored, stiffness)
 

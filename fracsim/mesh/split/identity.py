@@ -14,8 +14,8 @@ GRID = 7.31e-9  # no mesh has its points half-way between two of its steps
 
 
 def identity(made: Split, which: Ints, number: Ints, size: float) -> Values:
-    """(k, 2 d + 1) rows of the points `which` (k,): the place of each, and the `number` (nodes,) of its parents, descending,
-    then -1.
+    """(k, 2 d + 1) rows of the points `which` (k,): the place of each, and the `number` (nodes,) of its parents,
+    descending, then -1.
 
     A copy at the same place whose group has lost nodes is another point. Places are in steps of GRID of the
     body's `size`, m: with numbers of the input mesh rows are the same on all ranks.

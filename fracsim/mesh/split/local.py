@@ -24,8 +24,8 @@ from ..domain import Domain
 from ..ranks import offset
 from ..simplices import is_split
 from .build import Split, split
-from .drawn import Drawn, gradient_entries, middles
 from .identity import identity
+from .places import Places, gradient_entries, middles
 from .skeleton import CRACK, Skeleton
 
 Ints = npt.NDArray[np.int64]
@@ -58,7 +58,8 @@ class LocalSurface:
             matrices.append(self._arms(made, pattern, rows, nodes, values, self._touching))
         self.columns, (mean, *arms) = _on_columns(matrices)
         middle = middles(made.points, made.follow)[self._touching]
-        self.at = Drawn(mean, middle, *(arms or [csr_matrix(mean.shape)]), made.points[self._touching] - middle)
+        out = made.points[self._touching] - middle
+        self.at = Places(mean, middle, arms[0] if arms else csr_matrix(mean.shape), out)
 
     def identity(self) -> Values:
         """(k, 2 d + 1) rows that tell the copies `at.copies` from all others, whatever breaks (split.identity)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ...errors import NotConverged
 from ...mesh.split.build import Split, split
 from ...mesh.split.follow import Rotations
+from ...mesh.split.places import Places, whole
 from ...mesh.split.skeleton import BODY, Skeleton
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
@@ -20,6 +21,7 @@ from .fragments import Fragments, PieceNames, fragments, sums, volumes
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Arrays = dict[str, npt.NDArray[np.generic]]
+type Apart = Callable[[Places, Values, float], Places]  # of where points are, u and t
 FARTHEST = float(np.finfo(np.float32).max)  # viewers draw in single precision
 
 
@@ -91,20 +93,29 @@ class Surface:
         self._volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.pieces)
         self._rotations = Rotations(self.skeleton, self._pattern, made.follow.turning)
         self._piece = self.names[piece]
+        self._linear: Places | None = None
         self.builds += 1
 
     def at(
-        self, t: float, u: Values, v: Values, *, broken_at: Values | None = None, fields: Iterable[Field] = ()
+        self,
+        t: float,
+        u: Values,
+        v: Values,
+        *,
+        broken_at: Values | None = None,
+        fields: Iterable[Field] = (),
+        apart: Sequence[Apart] = (),
     ) -> Frame:
         """The surface at time t (s) for nodal displacement u (N, d) in m and velocity v (N, d) in m/s.
 
         Point velocity is the mean of the parents', without their turning. `fields` come along: nodal ones as the mean
         of the parents, cell ones as in the cell behind the element. `broken_at`: (E,) s, for the age of the crack.
+        `apart`: what changes where points are, so that nothing is drawn inside something else.
         NotConverged, naming piece and cell, where a node has gone astray.
         """
         self._check(t, u, v)
         made, follow = self.split, self.split.follow
-        moved = follow.displacement(u, self._rotations(u))
+        moved = self._moved(t, u, apart)
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
         at_points: Arrays = {"displacement": moved, "velocity": follow.mean(v), "piece": self._piece.astype(np.int32)}
         at_points |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
@@ -114,6 +125,18 @@ class Surface:
         figures = fragments(self.names, made.piece_of_node, self.mass, self._volume, self.skeleton.points + u, v)
         points, origins = made.points + moved, self.skeleton.origins
         return Frame(t, points, triangles, segments, at_points, at_elements, origins, figures)
+
+    def _moved(self, t: float, u: Values, apart: Sequence[Apart]) -> Values:
+        """(n, d) displacements of the points, m."""
+        made = self.split
+        if not apart:
+            return made.follow.displacement(u, self._rotations(u))
+        if self._linear is None:
+            self._linear = whole(made, self.skeleton, self._pattern, made.points)
+        at = self._linear
+        for each in apart:
+            at = each(at, u, t)
+        return at(u) - made.points
 
     def _elements(self) -> tuple[Ints, Ints, Ints, Arrays]:
         """Triangles, segments, the cell of each, and the fields that do not move."""

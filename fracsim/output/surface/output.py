@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ...stepping.state import State
 from ..fields_file import Field
 from ..writing import written
 from .files import SurfaceFiles
-from .frame import Surface
+from .frame import Apart, Surface
 
 Values = npt.NDArray[np.float64]
 
@@ -35,10 +36,11 @@ class SurfaceOutput:
         density: PerCell,
         record: EdgeRecord | None,
         *,
+        apart: Sequence[Apart] = (),
         resume_at: float | None = None,
     ) -> None:
         """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint."""
-        self._domain, self.record = domain, record
+        self._domain, self.record, self._apart = domain, record, apart
         everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         broken = self.record.gathered() if self.record is not None else None
 
@@ -69,6 +71,6 @@ class SurfaceOutput:
             if broken is not None and pattern is not None:
                 at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
                 surface.update(pattern, cut)
-            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields))
+            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields, apart=self._apart))
 
         written(domain.comm, self._path, work)

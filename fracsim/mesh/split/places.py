@@ -9,6 +9,8 @@ motions of the place X_s are reproduced, and sum w_a = 1, at any s.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, diags
@@ -22,30 +24,38 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-class Drawn:
-    """Places of n points at shares of their arms.
+class Places:
+    """Where n points are, at shares of their arms; never changed.
 
     Attributes:
-        share: (n,) s.    rest: (n, d) X_s, m.    weights: (n, nodes) w.    copies: (k,) points that have arms.
+        share: (n,) s.    rest: (n, d) X_s, m.    copies: (k,) points that have arms.
     """
 
-    share: Values
-    rest: Values
-    weights: csr_matrix
-
-    def __init__(self, mean: csr_matrix, middle: Values, arms: csr_matrix, out: Values) -> None:
-        """`mean` (n, nodes) over the parents, `middle` (n, d) theirs, m; `arms` (n, nodes) times gradients, `out` (n, d)
-        mean arm, m."""
+    def __init__(
+        self, mean: csr_matrix, middle: Values, arms: csr_matrix, out: Values, share: Values | None = None
+    ) -> None:
+        """`mean` (n, nodes) over the parents, `middle` (n, d) theirs, m; `arms` (n, nodes) times gradients, `out`
+        (n, d) mean arm, m; `share` 1 where it is not given."""
         self._mean, self._middle, self._arms, self._out = mean, middle, arms, out
-        self.copies: Ints = np.flatnonzero(np.any(out != 0, axis=1))
-        self.draw_in(np.ones(len(middle)))
+        self.share = np.ones(len(middle)) if share is None else share
+        self.rest: Values = middle + self.share[:, None] * out
+        # a point in the middle of its nodes has arms that cancel each other until the body is deformed
+        self.copies: Ints = np.flatnonzero(np.any(out != 0, axis=1) | (np.asarray(abs(arms).sum(axis=1)).ravel() > 0))
 
-    def draw_in(self, share: Values) -> None:
-        """Have the arms times `share` (n,)."""
-        self.share, self.rest = share, self._middle + share[:, None] * self._out
-        self.weights = (self._mean + diags(share) @ self._arms).tocsr()
+    @cached_property
+    def weights(self) -> csr_matrix:
+        """(n, nodes) w."""
+        return (self._mean + diags(self.share) @ self._arms).tocsr()
 
-    def places(self, u: Values, points: Ints, share: Values) -> Values:
+    def drawn_in(self, share: Values) -> Places:
+        """The points with `share` (n,) of their arms."""
+        return Places(self._mean, self._middle, self._arms, self._out, share)
+
+    def __call__(self, u: Values) -> Values:
+        """(n, d) x of nodal displacements (nodes, d), m."""
+        return np.asarray(self.rest + self.weights @ u)
+
+    def some(self, u: Values, points: Ints, share: Values) -> Values:
         """(k, d) x of some points at other shares (k,); u (nodes, d), m."""
         middle = self._middle[points] + self._mean[points] @ u
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
@@ -58,7 +68,7 @@ def middles(points: Values, follow: Follow) -> Values:
     return result
 
 
-def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], places: Values) -> Drawn:
+def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.integer], places: Values) -> Places:
     """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
     that has the whole mesh."""
     d, count, follow = skeleton.dim, len(made.points), made.follow
@@ -66,7 +76,9 @@ def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], place
     rows = np.repeat(np.arange(count), parents)
     share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
     mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
-    corners = skeleton.cells[~is_split(d)[pattern]]
+    armed = np.zeros(follow.nodes, bool)
+    armed[follow.parents[np.any(arm != 0, axis=1)]] = True
+    corners = skeleton.cells[~is_split(d)[pattern] & armed[skeleton.cells].any(axis=1)]
     X = skeleton.points[corners]
     volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
     around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
@@ -76,7 +88,7 @@ def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], place
     arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
                       shape=(count, d * follow.nodes))  # fmt: skip
     middle = np.asarray(mean @ skeleton.points)
-    return Drawn(mean, middle, (arms @ gradients).tocsr(), places - middle)
+    return Places(mean, middle, (arms @ gradients).tocsr(), places - middle)
 
 
 def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:

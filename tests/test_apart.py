@@ -1,0 +1,75 @@
+"""Nothing is drawn inside something else: the files of a run, looked at with VTK's reader and plain geometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fracsim.mechanics.contact.itself import SelfContact
+from fracsim.mechanics.contact.obstacles import Obstacles
+from fracsim.run import Run
+from fracsim.scene import build_scene
+from support.scenes import make_study
+from support.vtu import Drawn, frames
+
+FLOOR, TOP, RADIUS, SPEED = -0.001, 0.132, 0.03, 3.0
+
+
+def crushed(**change: Any) -> dict[str, Any]:
+    """A soft plate between a hammer and a floor, which breaks to crumbs under it."""
+    body: dict[str, Any] = {
+        "mesh": {"builder": "box", "size": [0.2, 0.1], "h": 0.012, "pattern": "unstructured"},
+        "material": {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0},
+        "fracture": {"strength": 5e4, "radius": 0.02},
+        "contact": {},
+        "obstacle": [
+            {"name": "floor", "shape": "plane", "at": [0.0, FLOOR], "normal": [0.0, 1.0]},
+            {"name": "hammer", "shape": "sphere", "radius": RADIUS, "at": [0.1, TOP], "velocity": [0.0, -SPEED]},
+        ],
+        "time": {"scheme": "backward-euler", "step": 4e-4, "end": 0.0132},
+        "output": {"interval": 4e-4, "picture": False},
+    }
+    return body | change
+
+
+def crossings(drawn: Drawn) -> int:
+    """Pairs of segments without a common point that cut each other, by the signs of areas."""
+    a, b = (drawn.points[drawn.segments[:, k], :2] for k in range(2))
+    i, j = np.triu_indices(len(a), 1)
+    apart = (drawn.segments[i][:, :, None] != drawn.segments[j][:, None, :]).all(axis=(1, 2))
+    i, j = i[apart], j[apart]
+
+    def side(p: Any, q: Any, r: Any) -> Any:
+        return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
+
+    one = side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0
+    return int((one & (side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) < 0)).sum())
+
+
+def test_crumbs_between_hammer_and_floor(tmp_path: Path) -> None:
+    """In no frame is a point below the floor or in the hammer, and no crumb overlaps another; and as edges break the
+    energy of the barriers does not rise."""
+    run = Run(build_scene(MPI.COMM_SELF, make_study(**crushed())), tmp_path / "out")
+    terms = [term for term in run.scene.balance.terms if isinstance(term, Obstacles | SelfContact)]
+    rose: list[float] = []
+    for term in terms:
+
+        def watched(pattern: Any, term: Any = term, go: Any = term.edges_broke) -> None:
+            before = term.stored()
+            go(pattern)
+            rose.append(term.stored() - before)
+
+        term.edges_broke = watched  # type: ignore[method-assign]
+    run()
+    drawn = frames(tmp_path / "out")
+    assert len(drawn) > 20 and len(rose) > 10
+    assert drawn[-1].pieces > 3
+    for each in drawn:
+        used = each.points[np.unique(each.segments), :2]
+        assert used[:, 1].min() > FLOOR
+        assert np.linalg.norm(used - [0.1, TOP - SPEED * each.t], axis=1).min() > RADIUS
+        assert crossings(each) == 0
+    assert max(rose) < 1e-3 * run.state.elastic
