@@ -22,7 +22,7 @@ Contact of a body with itself, by ipctk:
 itself            the term of the balance
 pairs             barrier and friction between the elements of a surface; how far points may go
 near, slip        which elements are near each other; friction between them
-room, crowd       walls that come to light where there is no room: before obstacles, and on rank 0 before the body itself
+room, crowd       walls that come to light where there is no room: before obstacles; before the body itself
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
 
