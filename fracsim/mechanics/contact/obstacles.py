@@ -69,19 +69,23 @@ class Obstacles(Term):
         self._surface, self._coupling = LocalSurface(domain), Coupling(domain)
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
+        self._touches: list[Touch] | None = None
+        self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
         check_apart(self.comm, self._surface.at.rest, self.obstacles)
 
     # --- a step ---
 
     def begin(self, level: Level) -> None:
         """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
-        self._level, late = level, 1 - level.share
+        self._level, self._touches, late = level, None, 1 - level.share
         end = level.t + late * level.dt
+        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
+            return  # a look at what a step has ended with: grips and ways are still those of the step
+        self._end, self._dt = end, level.dt
         self._placed = [each.placed(end) for each in self.obstacles]
         self._at_start = [each.placed(end - level.dt) for each in self.obstacles]
         self._ways = [each.way(end - level.dt, end) for each in self.obstacles]
         self._grips: list[Grip | None] = [None] * len(self.obstacles)
-        self._touches: list[Touch] | None = None
         self._gone = 1.0  # share of their way
         if level.dt:
             self._start_of_step(late)
@@ -118,7 +122,7 @@ class Obstacles(Term):
 
     def _touch(self, number: int) -> Touch:
         obstacle, held = self.obstacles[number], self._grips[number]
-        rub = Friction(obstacle.friction, self.law.creep * self._level.dt) if held is not None else None
+        rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
         way = self._ways[number][: self._domain.dim]
         return touch(self.x, self.area, self._placed[number], self.law.barrier, held, rub, way)
 
