@@ -247,8 +247,10 @@ def wanted_fields(study: Study) -> list[str]:
 
 
 def wants_surface(study: Study) -> bool:
-    """Whether the split surface is written: as the study says, or where something breaks."""
-    return study.fracture is not None if study.output.surface is None else study.output.surface
+    """Whether the split surface is written: as the study says, or where something breaks or stands in the way."""
+    if study.output.surface is None:
+        return study.fracture is not None or bool(study.obstacle)
+    return study.output.surface
 
 
 def run_study(

@@ -138,8 +138,8 @@ def test_a_press_reads_hookes_law(rotate: bool) -> None:
 
 @pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha"))
 def test_a_step_that_balances_inside_books_what_its_obstacle_did(scheme: str) -> None:
-    """A rubbing platen presses a block: its work is stored in the block but for what the scheme damps away (1 %), and the
-    force that it reads has friction in it, whatever level of the step forces balance at."""
+    """A rubbing platen presses a block: its work is stored in the block but for what the scheme damps away (1 %), and
+    the force that it reads has friction in it, whatever level of the step forces balance at."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT, boundary=[{"on": "bottom", "fix": "xy"}],
         obstacle=[floor(0.53, normal=[0.0, -1.0], velocity=[0.05, -0.2], friction=0.3)], solver=FINE,

@@ -4,6 +4,7 @@ term                what a term is, and what it is told at the begin of a step
 balance             the sum: residual, tangent, reactions
 stress              the stress of a body as damage and flow leave it: a term
 inertia, damping    M a and its mass matrix; drag and viscosity: terms
+drawn               what is drawn beside the body
 coupling            stiffness between nodes that share no cell
 contact             analytic obstacles, the gaps to them, barrier and friction
 loads               dead loads and following pressure: terms

@@ -20,6 +20,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from ..mesh.split.places import Places
+from .drawn import Drawn
 
 Values = npt.NDArray[np.float64]
 type Form = ufl.Form | int  # 0: none
@@ -60,6 +61,7 @@ class Term:
     name: ClassVar[str] = ""
     symmetric: bool = True  # whether its share of the tangent is
     keeps_apart: ClassVar[bool] = False  # whether it has a say in where the points of the split surface are: `apart`
+    visible: ClassVar[bool] = False  # whether it is `drawn`
 
     def begin(self, level: Level) -> None:
         """A step (or a look at a state) begins. Collective."""
@@ -150,6 +152,10 @@ class Term:
         """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
         it keeps apart is apart; `at`: where it is without. Asked of rank 0, for what is drawn (not collective)."""
         return at
+
+    def drawn(self, t: float) -> dict[str, Drawn]:
+        """Surfaces beside the body's at the time t of the state, s, by name; the same on all ranks (not collective)."""
+        return {}
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

@@ -61,5 +61,8 @@ def _surface(folder: Path, balance: Balance, breaks: Breaks, resume_at: float | 
     """The split surface: imported, built and kept only where it is wanted."""
     from .surface.output import SurfaceOutput
 
-    density, apart = balance.stress.material.density, [term.apart for term in balance.terms if term.keeps_apart]
-    return SurfaceOutput(folder, balance.domain, density, breaks.record, apart=apart, resume_at=resume_at)
+    density, terms = balance.stress.material.density, balance.terms
+    return SurfaceOutput(
+        folder, balance.domain, density, breaks.record, resume_at=resume_at,
+        apart=[term.apart for term in terms if term.keeps_apart], beside=[term for term in terms if term.visible],
+    )  # fmt: skip

@@ -17,7 +17,7 @@ from ..errors import InputError
 HEAD = ("fracsim", "dolfinx", "petsc", "python", "ranks")  # first words of the comments at the head of study.toml
 STUDY, CHECKPOINT, NEW = "study.toml", "checkpoint/state.h5", ".new"
 FILES = ("history.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json", "last.png", CHECKPOINT)
-FRAME = re.compile(r"surface_\d{6,}\.vtu")
+FRAME = re.compile(r"(?:surface|obstacle_[A-Za-z][A-Za-z0-9-]*)_\d{6,}\.vtu")
 BESIDE = (
     "log.txt",
     STUDY + NEW,

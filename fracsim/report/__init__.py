@@ -2,6 +2,7 @@
 
 runs                a run folder as it is read
 picture, colouring  `fracsim render`: the split surface off-screen, and which numbers colour it
+obstacles           obstacles in a picture
 screen              a screen for VTK on machines that have none
 sweep, outcome      `fracsim sweep`: a run for each combination of values; how each ended
 make                `fracsim report`

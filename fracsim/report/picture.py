@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..output.surface.files import read_collection
+from ..output.surface.collection import Entry, read_entries
 from .colouring import select, shown_range
+from .obstacles import add_obstacles, with_obstacles
 from .screen import display
 
 Values = npt.NDArray[np.float64]
@@ -94,13 +95,14 @@ class Shot:
     t: float
     file: Path
     index: int  # of the frame in fields.h5, -1: a VTU of the surface
+    beside: tuple[Path, ...] = ()  # VTUs of the obstacles
 
 
 def find_frames(folder: Path) -> list[Shot]:
     """Frames of surface.pvd, or else of fields.h5. InputError where there are none."""
     pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
     if pvd.exists():
-        shots = [Shot(t, folder / name, -1) for t, name in read_collection(pvd)]
+        shots = _of_surface(folder, read_entries(pvd))
         if shots:
             return shots
     if not h5.exists():
@@ -110,6 +112,15 @@ def find_frames(folder: Path) -> list[Shot]:
     if not times:
         raise InputError(f"{h5} has no frame yet")
     return [Shot(t, h5, index) for index, t in enumerate(times)]
+
+
+def _of_surface(folder: Path, entries: list[Entry]) -> list[Shot]:
+    beside: dict[float, list[Path]] = {}
+    for entry in entries:
+        if entry.part:
+            beside.setdefault(entry.t, []).append(folder / entry.file)
+    bodies = [entry for entry in entries if not entry.part]
+    return [Shot(each.t, folder / each.file, -1, tuple(beside.get(each.t, ()))) for each in bodies]
 
 
 def load(shot: Shot) -> Any:
@@ -144,8 +155,9 @@ def _draw(plotter: Any, shot: Shot, look: Look) -> Values:
         grid.points = exploded(np.asarray(grid.points, float), grid.point_data["piece"], look.explode)
     flat = bool(np.ptp(grid.points[:, 2]) == 0)
     _add(plotter, grid, look, lighting=not flat)
+    add_obstacles(plotter, shot.beside, flat=flat)
     plotter.add_text(f"t = {shot.t:.4g} s", font_size=11, color="black", name="time")
-    return _worth_seeing(grid)
+    return with_obstacles(_worth_seeing(grid), shot.beside)
 
 
 def _add(plotter: Any, grid: Any, look: Look, *, lighting: bool) -> None:
@@ -236,7 +248,7 @@ def _aim(plotter: Any, bounds: Values, look: Look) -> None:
 
 def _animate(plotter: Any, frames: list[Shot], look: Look, target: Path) -> None:
     """All frames from one place that sees the first and the last."""
-    ends = [_worth_seeing(load(shot)) for shot in (frames[0], frames[-1])]
+    ends = [with_obstacles(_worth_seeing(load(shot)), shot.beside) for shot in (frames[0], frames[-1])]
     bounds = np.where(np.arange(6) % 2 == 0, np.minimum(*ends), np.maximum(*ends))
     plotter.open_gif(str(target), fps=12)
     for shot in frames:

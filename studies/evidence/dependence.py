@@ -83,7 +83,7 @@ def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
     Lengths in 2D (m^2 for a thickness of 1 m), areas in 3D, of the last frame of the split surface.
     """
     from fracsim.mesh.split.skeleton import CRACK
-    from fracsim.output.surface.files import read_collection
+    from fracsim.output.surface.collection import read_collection
 
     grid = read_surface(run / read_collection(run / "surface.pvd")[-1][1])
     points = np.asarray(grid.points, float) - np.asarray(grid.point_data["displacement"], float)

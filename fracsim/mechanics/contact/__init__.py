@@ -11,6 +11,7 @@ plane, ball       half space; sphere and capsule (in 2D disk and stadium)
 box, cylinder     with rounded edges, so that the distance is C1 outside
 corner            distance to a quadrant or octant: what boxes and cylinders share
 moments           volume and second moments of rounded bodies, by slices
+drawing           what is drawn of an obstacle at its pose
 outlines, axes    triangles and segments to draw a shape with; frames about an axis
 pose, placed      where a rigid obstacle is, and derivatives of the distance to it with respect to its pose
 motion            points and obstacle on their way: gaps, and bounds of how fast they close

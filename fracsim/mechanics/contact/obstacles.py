@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import cast
 
 import numpy as np
@@ -28,8 +28,10 @@ from ...mesh.split.local import Following, LocalSurface
 from ...mesh.split.places import Places
 from ...meshes.words import AXES
 from ..coupling import Coupling
+from ..drawn import Drawn
 from ..term import Level, Term
 from .barrier import Barrier
+from .drawing import Drawing
 from .friction import Friction
 from .obstacle import Obstacle
 from .placed import Placed
@@ -60,6 +62,7 @@ class Obstacles(Term):
 
     name = "obstacles"
     keeps_apart = True
+    visible = True
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
@@ -303,6 +306,16 @@ class Obstacles(Term):
     def _on_obstacle(self, number: int, axis: int) -> Values:
         found = self._touching()[number]
         return -(found.normal + found.friction)[:, axis].sum(keepdims=True)
+
+    @cached_property
+    def _drawings(self) -> list[Drawing]:
+        lower, upper = self._domain.lower, self._domain.upper
+        return [Drawing(each.placed(0.0), lower, upper) for each in self.obstacles]
+
+    def drawn(self, t: float) -> dict[str, Drawn]:
+        """Each obstacle at time t, s, by its name."""
+        each = zip(self.obstacles, self._drawings, strict=True)
+        return {obstacle.name: drawing(obstacle.placed(t)) for obstacle, drawing in each}
 
     def driven(self) -> tuple[float, float]:
         """Work of the obstacles' own motion in the step on this rank, and what of it friction takes, J (collective).

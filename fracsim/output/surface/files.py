@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..fields_file import TENSOR, padded
+from ...mechanics.drawn import Drawn
 from ..own_files import FRAME
 from ..writing import append, replace_text
+from .collection import Entry, collection_text, read_entries
 from .fragments import Fragments
 from .frame import Frame
-
-_HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-_TAIL = "  </Collection>\n</VTKFile>\n"
-_ENTRY = re.compile(r'timestep="([^"]+)" file="([^"]+)"')
-_TRIANGLE, _LINE = 5, 3  # VTK's numbers
+from .vtu import grid_of, grid_of_elements, write_vtu
 
 
 class SurfaceFiles:
@@ -35,35 +29,46 @@ class SurfaceFiles:
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
         self._columns = columns(dim)
         self._entries = self._kept(resume_at) if resume_at is not None and self._pvd.exists() else []
+        self._last: dict[str, tuple[Drawn, str]] = {}  # what was drawn beside the body, and its file
         rows = self._kept_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
-        keep = {name for _, name in self._entries}
+        keep = {entry.file for entry in self._entries}
         self._write_pvd()
         replace_text(self._csv, _csv_text([self._columns, *rows]))
-        for path in (folder / "surface").glob("surface_*.vtu"):
+        for path in (folder / "surface").glob("*.vtu"):
             if FRAME.fullmatch(path.name) and f"surface/{path.name}" not in keep:
                 path.unlink()
 
     @property
     def times(self) -> list[float]:
-        return [t for t, _ in self._entries]
+        return [entry.t for entry in self._entries if not entry.part]
 
-    def write(self, frame: Frame) -> Path:
-        """The VTU first, then the files that name it."""
-        name = f"surface/surface_{len(self._entries):06d}.vtu"
-        write_vtu(self._folder / name, frame)
+    def write(self, frame: Frame, beside: dict[str, Drawn] | None = None) -> Path:
+        """The VTUs first, then the files that name them; `beside`: by the names of obstacles."""
+        number = len(self.times)
+        body = Entry(frame.t, f"surface/surface_{number:06d}.vtu")
+        write_vtu(self._folder / body.file, grid_of(frame))
+        others = [(name, self._drawn(name, drawn, number)) for name, drawn in (beside or {}).items()]
         append(self._csv, _csv_text(_rows(frame.t, frame.pieces)).encode())
-        self._entries.append((frame.t, name))
+        self._entries += [body, *(Entry(frame.t, file, part, name) for part, (name, file) in enumerate(others, 1))]
         self._write_pvd()
-        return self._folder / name
+        return self._folder / body.file
+
+    def _drawn(self, name: str, drawn: Drawn, number: int) -> str:
+        """The file of what stands beside the body: the last one for as long as it does not move."""
+        before, file = self._last.get(name, (None, ""))
+        if before is None or not np.array_equal(before.points, drawn.points):
+            file = f"surface/obstacle_{name}_{number:06d}.vtu"
+            write_vtu(self._folder / file, grid_of_elements(drawn.points, drawn.triangles, drawn.segments))
+            self._last[name] = drawn, file
+        return file
 
     def _write_pvd(self) -> None:
-        entries = (f'    <DataSet timestep="{t:.12g}" file="{name}"/>\n' for t, name in self._entries)
-        replace_text(self._pvd, _HEAD + "".join(entries) + _TAIL)
+        replace_text(self._pvd, collection_text(self._entries))
 
-    def _kept(self, until: float) -> list[tuple[float, str]]:
-        entries = read_collection(self._pvd)
-        return [(t, name) for t, name in entries if t <= until * (1 + 1e-9) and (self._folder / name).exists()]
+    def _kept(self, until: float) -> list[Entry]:
+        entries = read_entries(self._pvd)
+        return [each for each in entries if each.t <= until * (1 + 1e-9) and (self._folder / each.file).exists()]
 
     def _kept_rows(self) -> list[list[str]]:
         """Whole rows of the frames that are kept."""
@@ -73,11 +78,6 @@ class SurfaceFiles:
         with self._csv.open(newline="") as file:
             rows = list(csv.reader(file))[1:]
         return [row for row in rows if len(row) == len(self._columns) and row[0] in times]
-
-
-def read_collection(pvd: Path) -> list[tuple[float, str]]:
-    """(time in s, file relative to the folder) of every frame of a surface.pvd."""
-    return [(float(t), name) for t, name in _ENTRY.findall(pvd.read_text())]
 
 
 def _csv_text(rows: list[list[str]]) -> str:
@@ -100,52 +100,3 @@ def _rows(t: float, pieces: Fragments) -> list[list[str]]:
         [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
         for piece in np.argsort(pieces.name)
     ]
-
-
-def write_vtu(path: Path, frame: Frame) -> None:
-    """One unstructured grid of triangles and segments, data appended and compressed (VTK's own writer).
-
-    Through memory: VTK on a full disk prints what it thinks of it and does not say why.
-    """
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.WriteToOutputStringOn()
-    writer.SetInputData(_grid(frame))
-    writer.SetDataModeToAppended()
-    writer.SetCompressionLevel(1)  # level 5 is half as fast and saves 4 %
-    if not writer.Write():
-        raise OSError("VTK cannot write it")
-    path.write_text(writer.GetOutputString())
-
-
-def _grid(frame: Frame) -> Any:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
-
-    def array(values: npt.NDArray[np.generic], name: str = "") -> Any:
-        made = numpy_to_vtk(np.ascontiguousarray(padded(values)), deep=True)
-        made.SetName(name)
-        for i, axes in enumerate(TENSOR if made.GetNumberOfComponents() == len(TENSOR) else ()):
-            made.SetComponentName(i, axes)  # ParaView would take them for xx yy zz xy yz xz
-        return made
-
-    grid, points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
-    points.SetData(array(frame.points))
-    grid.SetPoints(points)
-    sizes = np.repeat([3, 2], [len(frame.triangles), len(frame.segments)])
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    corners = np.concatenate([frame.triangles.ravel(), frame.segments.ravel()]).astype(np.int64)
-    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True))
-    grid.SetCells(array(np.where(sizes == 3, _TRIANGLE, _LINE).astype(np.uint8)), cells)
-    for name, values in frame.at_points.items():
-        grid.GetPointData().AddArray(array(values, name))
-    for name, values in frame.at_elements.items():
-        grid.GetCellData().AddArray(array(values, name))
-    names = vtkStringArray()
-    names.SetName("origins")
-    for origin in frame.origins:
-        names.InsertNextValue(origin)
-    grid.GetFieldData().AddArray(names)
-    return grid

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ...fracture.record import EdgeRecord
 from ...mechanics.material import PerCell
+from ...mechanics.term import Term
 from ...mesh.domain import Domain
 from ...stepping.state import State
 from ..fields_file import Field
@@ -37,10 +38,14 @@ class SurfaceOutput:
         record: EdgeRecord | None,
         *,
         apart: Sequence[Apart] = (),
+        beside: Sequence[Term] = (),
         resume_at: float | None = None,
     ) -> None:
-        """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint."""
-        self._domain, self.record, self._apart = domain, record, apart
+        """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint.
+
+        `beside`: terms that are drawn with the body.
+        """
+        self._domain, self.record, self._apart, self._beside = domain, record, apart, beside
         everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         broken = self.record.gathered() if self.record is not None else None
 
@@ -71,6 +76,7 @@ class SurfaceOutput:
             if broken is not None and pattern is not None:
                 at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
                 surface.update(pattern, cut)
-            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields, apart=self._apart))
+            beside = {name: drawn for term in self._beside for name, drawn in term.drawn(state.t).items()}
+            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields, apart=self._apart), beside)
 
         written(domain.comm, self._path, work)

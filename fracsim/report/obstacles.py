@@ -1,0 +1,46 @@
+"""Obstacles in pictures: half-transparent, without the sides that face away, to hide nothing; in 2D filled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Values = npt.NDArray[np.float64]
+
+COLOUR, EDGE = "#c2b393", "#6e6350"
+OPACITY = 0.5
+ROOM = 0.25  # of the body's diagonal: what of an obstacle is in the picture on each side
+TRIANGLE, LINE = 5, 3  # VTK's numbers
+
+
+def add_obstacles(plotter: Any, files: Iterable[Path], *, flat: bool) -> None:
+    """Draw those of a frame."""
+    import pyvista
+
+    for file in files:
+        grid = pyvista.read(file)
+        for kind in (TRIANGLE, LINE):
+            part = np.flatnonzero(grid.celltypes == kind)
+            if not len(part):
+                continue
+            how: dict[str, Any] = {"color": EDGE, "line_width": 2} if kind == LINE else {"color": COLOUR}
+            if not flat:
+                how |= {"opacity": OPACITY, "smooth_shading": True, "split_sharp_edges": True, "culling": "back"}
+            plotter.add_mesh(grid.extract_cells(part), lighting=not flat, **how)
+
+
+def with_obstacles(bounds: Values, files: Iterable[Path]) -> Values:
+    """(6,) bounds of a body grown by what is near it of its obstacles."""
+    import pyvista
+
+    lower, upper = bounds[::2], bounds[1::2]
+    room = ROOM * float(np.linalg.norm(upper - lower)) * (upper > lower)  # a flat body stays flat
+    least, most = lower.copy(), upper.copy()
+    for file in files:
+        box = np.array(pyvista.read(file).bounds)
+        least, most = np.minimum(least, box[::2]), np.maximum(most, box[1::2])
+    return np.stack([np.maximum(least, lower - room), np.minimum(most, upper + room)], axis=1).reshape(-1)
