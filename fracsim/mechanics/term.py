@@ -143,6 +143,15 @@ class Term:
         """Columns of history.csv, each with a function that gives this rank's share, (1,)."""
         return {}
 
+    def least(self) -> dict[str, Callable[[], float]]:
+        """Columns of history.csv, each with a function of which the least over ranks counts (collective)."""
+        return {}
+
+    def works(self) -> dict[str, Callable[[], float]]:
+        """Columns of history.csv that are summed over steps, each with a function that gives this rank's share of the
+        last step, J."""
+        return {}
+
     def driven(self) -> tuple[float, float]:
         """Work from outside in the step that has ended which `applied` does not show, and what of it is lost, this
         rank's share, J; asked once a step (collective)."""

@@ -28,6 +28,8 @@ COLUMNS = (
 )  # fmt: skip
 
 Reading = Callable[[], npt.NDArray[np.float64]]
+Figure = Callable[[], float]
+WORK = "work_"  # columns that are summed over steps
 
 
 @dataclass(frozen=True)
@@ -49,16 +51,28 @@ class Probes:
         axes = AXES[: self._domain.dim]
         self.names = [f"{kinds[probe.quantity]}_{probe.name}_{axis}" for probe in probes for axis in axes]
         self._readings = [self._reading(probe) for probe in probes]
+        readings: dict[str, Reading] = {}
+        works: dict[str, Figure] = {}
+        least: dict[str, Figure] = {}
         for term in balance.terms:
-            for name, reading in term.readings().items():
-                self.names.append(name)
-                self._readings.append(reading)
+            readings |= term.readings()
+            works |= term.works()
+            least |= term.least()
+        self.names += [*readings, *works, *least]
+        self._readings += readings.values()
+        self._works, self._least = list(works.values()), list(least.values())
 
     def __call__(self) -> npt.NDArray[np.float64]:
-        """All readings in the order of `names` (collective)."""
+        """All readings in the order of `names`; work_NAME is that of the last step (collective)."""
         if not self._readings:
             return np.empty(0)
-        return total(self._domain.comm, np.concatenate([reading() for reading in self._readings]))
+        parts = [reading() for reading in self._readings] + [np.array([each() for each in self._works])]
+        sums = total(self._domain.comm, np.concatenate(parts))
+        if not self._least:
+            return sums
+        least = np.array([each() for each in self._least])
+        self._domain.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
+        return np.concatenate([sums, least])
 
     def _reading(self, probe: Probe) -> Reading:
         owned = probe.nodes[probe.nodes < self._domain.node_count]
@@ -82,6 +96,7 @@ class History:
 
     Attributes:
         peaks: name -> greatest absolute value of each reaction so far, N.        step: of the last row.
+        worked: name -> sum of the work of each obstacle so far, J.
     """
 
     def __init__(self, comm: MPI.Comm, path: Path, probe_names: list[str], resume_at: int | None = None) -> None:
@@ -90,6 +105,7 @@ class History:
         self.columns = history_columns(probe_names)
         self.step = resume_at or 0
         self.peaks = dict.fromkeys((name for name in probe_names if name.startswith("reaction_")), 0.0)
+        self.worked = dict.fromkeys((name for name in probe_names if name.startswith(WORK)), 0.0)
         self._file: RawIOBase | None = written(comm, path, lambda: self._open(resume_at))
 
     def _open(self, resume_at: int | None) -> RawIOBase:
@@ -101,13 +117,15 @@ class History:
         self, state: State, report: StepReport, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
     ) -> None:
         """One row; `damage` is (broken edges, split cells, pieces). Raises CannotWrite (collective)."""
-        values = [
+        values: list[int | float] = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
             report.solve.newton, report.solve.krylov, report.seconds, *probes,
         ]  # fmt: skip
         row = dict(zip(self.columns, values, strict=True))
         self.peaks = {name: max(peak, abs(float(row[name]))) for name, peak in self.peaks.items()}
-        line = _line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in values])
+        self.worked = {name: done + float(row[name]) for name, done in self.worked.items()}
+        row |= self.worked
+        line = _line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in row.values()])
         written(self.comm, self._path, lambda: self._write(line.encode()))
         self.step = state.step
 

@@ -67,7 +67,8 @@ class Monitors:
 
     def saved(self) -> dict[str, Any]:
         """For a checkpoint (collective)."""
-        watched = self.inverted.monitors() | self.gained.monitors() | {"peak_reactions": self.history.peaks}
+        watched = self.inverted.monitors() | self.gained.monitors()
+        watched |= {"peak_reactions": self.history.peaks, "worked": self.history.worked}
         return watched | self.meter.read()
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -75,6 +76,7 @@ class Monitors:
         for monitor in (self.inverted, self.gained, self.meter):
             monitor.restore(saved)
         self.history.peaks |= saved["peak_reactions"]
+        self.history.worked |= saved.get("worked", {})
 
     def summary(self) -> dict[str, Any]:
         """Their part of summary.json (collective)."""

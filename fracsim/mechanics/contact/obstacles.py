@@ -73,6 +73,7 @@ class Obstacles(Term):
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
         self._touches: list[Touch] | None = None
+        self._worked = [0.0] * len(self.obstacles)  # J, of each in the last step
         self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
         check_apart(self.comm, self._surface.at.rest, self.obstacles)
 
@@ -303,6 +304,18 @@ class Obstacles(Term):
             for place, axis in enumerate(AXES[: self._domain.dim])
         }
 
+    def least(self) -> dict[str, Callable[[], float]]:
+        """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none."""
+        return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
+
+    def works(self) -> dict[str, Callable[[], float]]:
+        """work_NAME: what each obstacle has done on the body in the step that has ended, J."""
+        return {f"work_{each.name}": partial(self._worked.__getitem__, k) for k, each in enumerate(self.obstacles)}
+
+    def _gap(self, number: int) -> float:
+        self._touching()
+        return float(self._placed[number].distance(self.x)[self.area > 0].min(initial=np.inf))
+
     def _on_obstacle(self, number: int, axis: int) -> Values:
         found = self._touching()[number]
         return -(found.normal + found.friction)[:, axis].sum(keepdims=True)
@@ -322,13 +335,13 @@ class Obstacles(Term):
 
         Friction's `drag` counts the way of the body; the slip is that way less the obstacle's.
         """
-        work = lost = 0.0
+        lost = 0.0
         for number, way in enumerate(self._ways):
             shift, found = way[: self._domain.dim], self._touching()[number]
             pushed, rubbed = found.normal.sum(axis=0), float(found.friction.sum(axis=0) @ shift)
-            work += float((pushed + self._pushed[number]) @ shift) / 2 + rubbed
+            self._worked[number] = float((pushed + self._pushed[number]) @ shift) / 2 + rubbed
             lost += rubbed
-        return work, lost
+        return sum(self._worked), lost
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
