@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -30,6 +30,10 @@ from .stepping.stepper import StepReport
 from .study import Study
 from .study.file import study_text
 
+if TYPE_CHECKING:
+    from .output.meetings import Meetings
+    from .output.passing import Passing
+
 FRAMES = 50  # of a run whose study says neither every nor interval
 
 
@@ -39,7 +43,8 @@ class Run:
     Attributes:
         scene, folder: what is stepped, and where it is written.    state: where it has come to.
         history: the rows of history.csv.    frames: what is written from time to time.    breaks: the edges that broke.
-        inverted, gained: what makes a result doubtful.    monitors: they, and what the run has used.
+        inverted, gained, meetings, passing: what makes a result doubtful, the last two None where nothing can.
+        monitors: they, and what the run has used.
         interrupt: what may end the run early.
     """
 
@@ -98,7 +103,7 @@ class Run:
         self._watch(notes)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
-            fields=wanted_fields(study), surface=wants_surface(study), resume_at=t,
+            fields=wanted_fields(study), surface=wants_surface(study), passing=self.passing, resume_at=t,
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
@@ -110,9 +115,25 @@ class Run:
         stress = self.scene.balance.stress
         self.inverted = InvertedCells(stress, self.scene.fracture)
         self.gained = EnergyGain(at_rest=self.scene.study.initial is None, floor=worth_telling(stress))
-        self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter)
+        self.meetings, self.passing = self._contact_watched()
+        others = [each for each in (self.meetings, self.passing) if each is not None]
+        self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter, others)
         if notes is not None:
             self.monitors.restore(notes.monitors)
+
+    def _contact_watched(self) -> tuple[Meetings | None, Passing | None]:
+        """What watches obstacles, and pieces that nothing keeps apart: each only where it can tell anything."""
+        study, meetings, passing = self.scene.study, None, None
+        if study.obstacle:
+            from .mechanics.contact.obstacles import Obstacles
+            from .output.meetings import Meetings
+
+            meetings = Meetings(next(term for term in self.scene.balance.terms if isinstance(term, Obstacles)))
+        if wants_surface(study) and (study.contact is None or not study.contact.itself):
+            from .output.passing import Passing
+
+            passing = Passing()
+        return meetings, passing
 
     # --- one step, one frame, one checkpoint ---
 
@@ -121,7 +142,11 @@ class Run:
         self.state, report = self.scene.stepper.advance(self.state)
         if report.broken:
             self.note_breaks()
-        self.history.append(self.state, report, self.breaks.figures, self.scene.probes())
+        probes = self.scene.probes()
+        self.history.append(self.state, report, self.breaks.figures, probes)
+        if self.meetings is not None:
+            figures = {name: float(value) for name, value in zip(self.scene.probes.names, probes, strict=True)}
+            self.meetings.look(self.state, report.dt, figures)
         self.gained.look(report, self.state)
         return report
 
@@ -200,7 +225,12 @@ class Run:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
-        say(self.comm, self.monitors.notes(self.scene.study.material.energy, self.scene.study.time.scheme))
+        notes = self.monitors.notes(self.scene.study.material.energy, self.scene.study.time.scheme)
+        if self.meetings is not None:
+            notes += self.meetings.notes(done=outcome == "done")
+        if self.passing is not None:
+            notes += self.passing.notes(implicit=self.scene.study.time.kind.implicit)
+        say(self.comm, notes)
         return summary
 
     def _summary(self, outcome: str) -> dict[str, Any]:

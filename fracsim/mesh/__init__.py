@@ -8,6 +8,7 @@ simplices       edges of a triangle or tetrahedron, and what every pattern of br
 small_matrices  arrays of 2 x 2 and 3 x 3 matrices
 edges           the edges of the mesh and their integrity
 pieces, bodies  connected components under intact edges; of the mesh as it was built
+overlap         nodes of one piece in cells of another
 dolfinx_calls   calls of DOLFINx that a newer version touches
 split           geometry of the split surface
 """

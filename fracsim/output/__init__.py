@@ -10,6 +10,8 @@ checkpoint       state.h5, on any number of ranks
 summary          summary.json
 energy_gain      energy from nowhere
 inverted_cells   cells turned inside out
+passing          pieces that pass through each other where nothing keeps them apart
+meetings         obstacles that never met the body, or met it too fast
 progress         a line on the terminal
 interrupt        signals and the wall-time limit
 folder           the output folder, and when a frame is due

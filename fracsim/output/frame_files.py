@@ -14,6 +14,7 @@ from .writing import written
 
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
+    from .passing import Passing
     from .surface.output import SurfaceOutput
 
 
@@ -33,9 +34,11 @@ class FrameFiles:
         *,
         fields: list[str],
         surface: bool,
+        passing: Passing | None = None,
         resume_at: float | None = None,
     ) -> None:
-        """`fields`: by the names of output.fields; `resume_at`: keep the frames up to this time, s (collective).
+        """`fields`: by the names of output.fields; `passing`: watches pieces that nothing keeps apart; `resume_at`:
+        keep the frames up to this time, s (collective).
 
         Raises CannotWrite.
         """
@@ -43,7 +46,7 @@ class FrameFiles:
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
         self._values, source = Frames(stress, fields, breaking), stress.domain.source
         self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
-        self.surface = _surface(folder, balance, breaks, resume_at) if surface else None
+        self.surface = _surface(folder, balance, breaks, passing, resume_at) if surface else None
 
     def write(self, state: State) -> None:
         """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
@@ -57,12 +60,14 @@ class FrameFiles:
             self.fields.write(t, fields)
 
 
-def _surface(folder: Path, balance: Balance, breaks: Breaks, resume_at: float | None) -> SurfaceOutput:
+def _surface(
+    folder: Path, balance: Balance, breaks: Breaks, passing: Passing | None, resume_at: float | None
+) -> SurfaceOutput:
     """The split surface: imported, built and kept only where it is wanted."""
     from .surface.output import SurfaceOutput
 
     density, terms = balance.stress.material.density, balance.terms
     return SurfaceOutput(
-        folder, balance.domain, density, breaks.record, resume_at=resume_at,
+        folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at,
         apart=[term.apart for term in terms if term.keeps_apart], beside=[term for term in terms if term.visible],
     )  # fmt: skip

@@ -39,6 +39,13 @@ class Drawing:
         return Drawn(placed.pose.points_to_space(self._points), self._triangles, self._segments)
 
 
+def least_extent(shape: Shape) -> float:
+    """The least side of the box around a shape, m; infinite of a plane and of a hollow one."""
+    if isinstance(shape, Plane) or not shape.convex:
+        return float("inf")
+    return float(np.ptp(shape.outline()[0], axis=0).min())
+
+
 def slab(normal: Values, middle: Values, side: float) -> tuple[Values, Ints]:
     """Outline (triangles; in 2D segments) of a slab of that side behind the plane n . x = 0, over the point `middle`
     (d,), m."""

@@ -31,7 +31,7 @@ from ..coupling import Coupling
 from ..drawn import Drawn
 from ..term import Level, Term
 from .barrier import Barrier
-from .drawing import Drawing
+from .drawing import Drawing, least_extent
 from .friction import Friction
 from .obstacle import Obstacle
 from .placed import Placed
@@ -85,7 +85,7 @@ class Obstacles(Term):
         end = level.t + late * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: grips and ways are still those of the step
-        self._end, self._dt = end, level.dt
+        self._end, self._dt, self._began_with = end, level.dt, level.v
         self._placed = [each.placed(end) for each in self.obstacles]
         self._at_start = [each.placed(end - level.dt) for each in self.obstacles]
         self._ways = [each.way(end - level.dt, end) for each in self.obstacles]
@@ -311,6 +311,25 @@ class Obstacles(Term):
     def works(self) -> dict[str, Callable[[], float]]:
         """work_NAME: what each obstacle has done on the body in the step that has ended, J."""
         return {f"work_{each.name}": partial(self._worked.__getitem__, k) for k, each in enumerate(self.obstacles)}
+
+    def closings(self) -> list[float]:
+        """How far each obstacle and the points of this rank that touch it at the end of the step would have come closer
+        in it, had nothing stopped them, m (collective)."""
+        moved, result = self._dt * self.follow(self._began_with), []
+        for way, placed, found in zip(self._ways, self._placed, self._touching(), strict=True):
+            pushed = found.points[found.normal.any(axis=1)]  # and not merely rubbed
+            closer = np.einsum("ni,ni->n", way[: self._domain.dim] - moved[pushed], placed.normal(self.x[pushed]))
+            result.append(float(closer.max(initial=0.0)))
+        return result
+
+    def sizes(self) -> list[float]:
+        """The least extent of each obstacle, m; infinite of a plane and of one that the body is in."""
+        return [least_extent(each.shape) for each in self.obstacles]
+
+    @property
+    def edge(self) -> float:
+        """Of the body's mesh in the mean, m (collective)."""
+        return self._domain.mean_edge
 
     def _gap(self, number: int) -> float:
         self._touching()

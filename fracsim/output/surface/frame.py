@@ -79,6 +79,11 @@ class Surface:
         self._build(cut)
         return True
 
+    @property
+    def whole(self) -> npt.NDArray[np.bool_]:
+        """(C,) cells without a broken edge."""
+        return self._pattern == 0
+
     def replay(self, broken_at: Values, times: Iterable[float]) -> None:
         """Name the pieces as frames at earlier times did, from the times (E,) at which edges broke (restart)."""
         for t in times:

@@ -15,6 +15,7 @@ from ...mechanics.term import Term
 from ...mesh.domain import Domain
 from ...stepping.state import State
 from ..fields_file import Field
+from ..passing import Passing
 from ..writing import written
 from .files import SurfaceFiles
 from .frame import Apart, Surface
@@ -39,13 +40,14 @@ class SurfaceOutput:
         *,
         apart: Sequence[Apart] = (),
         beside: Sequence[Term] = (),
+        passing: Passing | None = None,
         resume_at: float | None = None,
     ) -> None:
         """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint.
 
-        `beside`: terms that are drawn with the body.
+        `beside`: terms that are drawn with the body.    `passing`: where nothing keeps its pieces apart.
         """
-        self._domain, self.record, self._apart, self._beside = domain, record, apart, beside
+        self._domain, self.record, self._apart, self._beside, self._passing = domain, record, apart, beside, passing
         everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         broken = self.record.gathered() if self.record is not None else None
 
@@ -78,5 +80,7 @@ class SurfaceOutput:
                 surface.update(pattern, cut)
             beside = {name: drawn for term in self._beside for name, drawn in term.drawn(state.t).items()}
             files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields, apart=self._apart), beside)
+            if self._passing is not None:
+                self._passing.look(state.t, surface, gathered[0])
 
         written(domain.comm, self._path, work)
