@@ -70,6 +70,21 @@ def test_check_tells_the_size_of_a_file_in_its_own_unit(tmp_path: Path, source: 
     assert count in lines[0]
 
 
+def test_check_tells_what_contact_costs(tmp_path: Path) -> None:
+    """Of a mesh file its facets: 2 (4 2 + 4 2 + 2 2) squares of two triangles; of a builder no more than there are."""
+    box = {"builder": "box", "size": [0.4, 0.2, 0.2], "h": 0.1}
+    floor = {"name": "floor", "shape": "plane", "at": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}
+    made = build_mesh(study(BAR, mesh=box).mesh)
+    meshio.Mesh(made.points, [("tetra", made.cells)]).write(tmp_path / "bar.vtu")
+    for mesh, facets in ((box, "58 facets or more"), ({"file": str(tmp_path / "bar.vtu")}, "80 facets")):
+        data = BAR | {"mesh": mesh, "boundary": [], "probe": [], "obstacle": [floor], "contact": {"friction": 0.3}}
+        told = {line.split()[0]: line for line in check_study(validate(data, "test.toml"))}
+        assert f"touched by the points of {facets}, and of cracks" in told["touched"]
+        assert "nothing is gathered" in told["touched"]
+        assert "friction 0.3; gathered and detected on one rank" in told["contact"]
+        assert f"its surface has {facets}" in told["its"]
+
+
 def test_check_tells_of_fracture() -> None:
     lines = check_study(study(STRIP, fracture={"radius": 0.1}))
     assert "fracture    degraded energy (chi), strength 20000 Pa, average over 0.1 m (linear)" in lines

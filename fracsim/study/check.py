@@ -6,8 +6,9 @@ answer comes in a second.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..mesh.bodies import bodies_of, not_held
 from ..mesh.names import check_group, check_regions
 from ..mesh.places import Group, Place
 from ..meshes.data import MeshData
-from ..meshes.topology import signed_measures
+from ..meshes.topology import boundary_facets, signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Obstacle, Study
 from .conditions import conditions, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
@@ -37,6 +38,7 @@ class Anatomy:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     size: str  # how many cells, in words
+    surface: Callable[[], str]  # how many facets, in words; counted when asked
     volume: float | None = None  # m^d, where it is known
     notes: tuple[str, ...] = ()  # what was mended while reading
 
@@ -65,12 +67,14 @@ def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
     builder = find_builder(study.mesh)
     if builder is not None:
         lower, upper = builder.bounds()
-        size = f"about {builder.cells_estimate():,} cells"
-        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size)
+        count = builder.cells_estimate()
+        size, facets = f"about {count:,} cells", partial(_at_least, count, len(lower))
+        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size, facets)
     if surface is not None:
-        size = f"about {cells_inside(study.mesh, surface):,} cells in {len(surface.triangles):,} triangles"
+        count = cells_inside(study.mesh, surface)
+        size, facets = f"about {count:,} cells in {len(surface.triangles):,} triangles", partial(_at_least, count, 3)
         lower, upper = (tuple(corner.tolist()) for corner in (surface.points.min(axis=0), surface.points.max(axis=0)))
-        return Anatomy(3, ("surface",), (), lower, upper, size, surface.volume, surface.notes)
+        return Anatomy(3, ("surface",), (), lower, upper, size, facets, surface.volume, surface.notes)
     return None
 
 
@@ -80,7 +84,24 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
     volume = float(signed_measures(mesh.points, mesh.cells).sum())
-    return Anatomy(mesh.dim, tuple(mesh.facet_groups), tuple(mesh.regions), lower, upper, size, volume, mesh.notes)
+    groups, regions, facets = tuple(mesh.facet_groups), tuple(mesh.regions), partial(_counted, mesh)
+    return Anatomy(mesh.dim, groups, regions, lower, upper, size, facets, volume, mesh.notes)
+
+
+def _counted(mesh: MeshData) -> str:
+    return f"{len(boundary_facets(mesh.cells)):,} facets"
+
+
+# facets of the surface over cells^((d-1)/d): 2.3 to 4 of the 2D builders; 2.8 to 4.8 of the 3D ones, but 10 to 12 of a
+# thin plate and the vase
+LEAST_FACETS = {2: 2.3, 3: 2.8}
+
+
+def _at_least(cells: int, dim: int) -> str:
+    """The facets of a mesh that is not there yet, to two digits."""
+    count = int(LEAST_FACETS[dim] * cells ** ((dim - 1) / dim))
+    unit = 10 ** max(0, len(str(count)) - 2)
+    return f"{count // unit * unit:,} facets or more"
 
 
 def _check(study: Study, anatomy: Anatomy) -> None:
@@ -159,14 +180,24 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
     if study.obstacle:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
+        yield f"            touched by the points of {anatomy.surface()}, {_MORE}; {_PRICE_OF_OBSTACLES}"
     if study.contact is not None and study.contact.itself:
-        yield f"contact     of the body with itself, friction {study.contact.friction:g}; detected on one rank"
+        yield f"contact     of the body with itself, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
+        yield f"            its surface has {anatomy.surface()}, {_MORE}"
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
     yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+# Measured of boxes of 25,000 and 207,000 tetrahedra, of which nothing touched anything: two obstacles and a body alone.
+_MORE = "and of cracks as they open"
+_PRICE_OF_OBSTACLES = "nothing is gathered; some 2 % of a step until they touch"
+_PRICE_OF_CONTACT = (
+    "gathered and detected on one rank: some tenth of a step until something touches, on n ranks n times that share"
+)
 
 
 def _motion(obstacle: Obstacle) -> str:
