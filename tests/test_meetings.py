@@ -171,6 +171,28 @@ def test_pieces_pass_through_each_other(tmp_path: Path, capsys: pytest.CaptureFi
     assert seen["time"] == pytest.approx(0.75) and seen["pieces"] == [0, 1] and 0.85 < seen["place"][0] < 1
 
 
+def test_pieces_are_told_of_after_a_restart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Stopped once it was seen: not looked for again, and told at the end all the same."""
+    tables = two_bodies(tmp_path)
+    stopped = begun(tables, tmp_path / "out")
+    stopped.interrupt.reason = lambda: "the test" if stopped.state.t > 0.7 else ""  # type: ignore[method-assign]
+    with pytest.raises(Stopped):
+        stopped()
+    assert "first seen at t = 0.75 s" in capsys.readouterr().err
+    begun(tables, tmp_path / "out", restart=True)()
+    assert "first seen at t = 0.75 s" in capsys.readouterr().err
+
+
+def test_one_piece_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("fracsim.mesh.overlap.overlap", never)
+    one = begun(STRIP, tmp_path)
+    assert one.passing is not None
+    one()
+
+
 @pytest.mark.parametrize("more", [{"output": PAIR["output"] | {"surface": False}}, {"contact": {}}])
 def test_nothing_is_looked_for_where_it_is_not_wanted(more: Tables, tmp_path: Path) -> None:
     assert begun(two_bodies(tmp_path) | more, tmp_path / "out").passing is None

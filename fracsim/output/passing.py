@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.overlap import overlap
 from ..meshes.words import format_point
 
 if TYPE_CHECKING:
@@ -32,6 +31,8 @@ class Passing:
         pieces = surface.split.piece_of_node
         if self.seen or surface.split.pieces == 1:
             return
+        from ..mesh.overlap import overlap
+
         x = surface.skeleton.points + u
         found = overlap(x, surface.skeleton.cells[surface.whole], pieces)
         if found is not None:

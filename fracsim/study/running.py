@@ -111,7 +111,7 @@ class Output(Table):
     every: Annotated[int, Field(ge=1, strict=True)] | None = None  # steps
     interval: Positive | None = None  # s
     fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
-    surface: Flag | None = None  # the split surface and pieces.csv; default: where the study has [fracture]
+    surface: Flag | None = None  # the split surface and pieces.csv; default: with [fracture] or an [[obstacle]]
     cut: Literal["middle", "forces"] = "middle"  # where broken edges are cut: in proportion to the nodal forces
     picture: Flag = True  # a PNG of the last frame
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
