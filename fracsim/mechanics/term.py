@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,10 @@ import ufl
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from ..mesh.split.places import Places
 from .drawn import Drawn
+
+if TYPE_CHECKING:
+    from ..mesh.split.places import Places
 
 Values = npt.NDArray[np.float64]
 type Form = ufl.Form | int  # 0: none
