@@ -251,9 +251,18 @@ class Balance:
 
     def potential(self) -> tuple[float, float]:
         """The incremental potential, whose derivative is r, at the current u, and the size of what it is the sum of,
-        J (collective)."""
+        J (collective).
+
+        psi is a difference of terms as large as the moduli: 4 eps Y V of it is round-off, with ROUND_OFF of the solver.
+        """
         parts = total(self.domain.comm, np.array([term.potential() or 0.0 for term in self.terms]))
-        return float(parts.sum()), float(np.abs(parts).sum())
+        return float(parts.sum()), float(np.abs(parts).sum()) + 4e-4 * self._stored_at_strain_one
+
+    @cached_property
+    def _stored_at_strain_one(self) -> float:
+        """Y V, J (collective)."""
+        domain = self.domain
+        return float(total(domain.comm, np.sum(self.stress.material.young * domain.volumes))[0])
 
     @cached_property
     def conservative(self) -> bool:

@@ -83,7 +83,7 @@ class Solver:
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
-        self._first, self._height = 0.0, np.inf
+        self._first, self._height, self._sets_out = 0.0, np.inf, True
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -219,13 +219,15 @@ class Solver:
         """The incremental potential at x, J: what the line search goes down with contact.
 
         On the norm of r, which a barrier makes steep, it cuts good steps to nothing. Near the solution potentials
-        differ by round-off alone: those are returned as the same, so that whole steps are taken there.
+        differ by round-off alone: such a step counts as one downwards, so that it is taken whole.
         """
         self.balance.displace_to(x)
         potential, size = self.balance.potential()
-        if not abs(potential - self._height) <= ROUND_OFF * size:
-            self._height = potential
-        return self._height
+        if self._sets_out:  # PETSc's line search first asks where it starts
+            self._height, self._sets_out = potential, False
+            return potential
+        slack = ROUND_OFF * size
+        return self._height - slack if abs(potential - self._height) <= slack else potential
 
     # --- linear solves by themselves ---
 
@@ -278,6 +280,7 @@ class Solver:
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
+        self._sets_out = True
         share = self.balance.longest_step(-y.array_r)
         if share < 1:
             y.scale(share)
