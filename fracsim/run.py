@@ -114,7 +114,7 @@ class Run:
         """What is watched from step to step, going on from where there are notes."""
         stress = self.scene.balance.stress
         self.inverted = InvertedCells(stress, self.scene.fracture)
-        self.gained = EnergyGain(at_rest=self.scene.study.initial is None, floor=worth_telling(stress))
+        self.gained = EnergyGain(at_rest=self.scene.study.at_rest, floor=worth_telling(stress))
         self.meetings, self.passing = self._contact_watched()
         others = [each for each in (self.meetings, self.passing) if each is not None]
         self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter, others)

@@ -33,7 +33,17 @@ FULL: Data = changed(
     load={"gravity": [0.0, -9.81]},
     initial={"velocity": [1.0, 0.0]},
     contact={"friction": 0.2},
-    obstacle=[{"name": "floor", "shape": "plane", "at": [0.0, -1.0], "normal": [0.0, 1.0]}],
+    obstacle=[
+        {"name": "floor", "shape": "plane", "at": [0.0, -1.0], "normal": [0.0, 1.0]},
+        {
+            "name": "bob",
+            "shape": "sphere",
+            "at": [0.0, 9.0],
+            "radius": 1.0,
+            "mass": 1.0,
+            "hinge": {"point": [0.0, 12.0]},
+        },
+    ],
     boundary=[
         {"on": {"box": [[0, 0], [1, 1]]}, "fix": "xy"},
         {"on": {"point": [1, 0], "normal": [1, 0]}, "pressure": {"time": [0, 1], "value": [0, 1]}},

@@ -41,6 +41,7 @@ class Balance:
         motion: dofs whose motion is prescribed.    mass: the mass matrix.
         scheme: where in a step forces balance, and the rates there.    c_a, c_v: those of the last step.
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
+        low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
 
@@ -64,6 +65,7 @@ class Balance:
         self.motion, self.mass, self.scheme = motion, mass, scheme
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
+        self.low_rank: list[tuple[Values, Values]] = []
         self.vector = assembler.vector()
         self._kept = assembler.vector()
         self.reactions: Values = np.zeros(self.owned)
@@ -93,6 +95,11 @@ class Balance:
         return np.flatnonzero(touched[self.domain.cell_nodes].any(axis=1)).astype(np.int32)
 
     # --- a step, or a look at a state ---
+
+    def arrive(self) -> None:
+        """The step is solved (collective)."""
+        for term in self.terms:
+            term.arrive()
 
     def begin(self, t: float, dt: float, u: Values, v: Values, a: Values) -> None:
         """A step of dt to t begins at the owned state u, v, a (collective)."""
@@ -207,6 +214,9 @@ class Balance:
             term.add_stiffness(K)
             if (coupling := term.coupling()) is not None:
                 self._couple(K, coupling)
+        self.low_rank = [part for term in self.terms for part in term.low_rank()]
+        for U, _ in self.low_rank:
+            U[self.motion.owned] = 0.0
 
     def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat) -> None:
         """K += a matrix of another pattern, but for prescribed dofs (collective)."""
@@ -223,6 +233,11 @@ class Balance:
         """Global numbers of the prescribed dofs of this rank."""
         first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
         return np.asarray(self.motion.owned + first * d, PETSc.IntType)
+
+    @property
+    def condenses(self) -> bool:
+        """Whether K may lack a part of low rank."""
+        return any(term.condenses for term in self.terms)
 
     @cached_property
     def limits_steps(self) -> bool:
@@ -325,8 +340,8 @@ class Balance:
     # --- figures ---
 
     def kinetic_energy(self, v: Values) -> float:
-        """This rank's share of 1/2 v . M v, J."""
-        return 0.5 * float(v @ self.mass.times(v))
+        """This rank's share of 1/2 v . M v and of what terms move beside the body, J."""
+        return 0.5 * float(v @ self.mass.times(v)) + sum(term.kinetic() for term in self.terms)
 
     def applied(self) -> Values:
         """(owned dofs,) forces on the body from outside at the current u, N; a copy (collective)."""

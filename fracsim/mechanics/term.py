@@ -101,6 +101,13 @@ class Term:
         """
         return None
 
+    condenses: ClassVar[bool] = False  # whether it has unknowns of its own that it eliminates: `low_rank`
+
+    def low_rank(self) -> list[tuple[Values, Values]]:
+        """What the tangent loses with unknowns that the term has eliminated: U C U^T of U (owned dofs, k) and C (k, k),
+        summed over ranks (collective)."""
+        return []
+
     def stored(self) -> float:
         """Energy that it stores at the current u, this rank's share, J."""
         return 0.0
@@ -167,6 +174,13 @@ class Term:
     def drawn(self, t: float) -> dict[str, Drawn]:
         """Surfaces beside the body's at the time t of the state, s, by name; the same on all ranks (not collective)."""
         return {}
+
+    def kinetic(self) -> float:
+        """Energy of motion of what it moves beside the body, this rank's share, J."""
+        return 0.0
+
+    def arrive(self) -> None:
+        """The step is solved: be what it ends with, until a past is recalled (collective)."""
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

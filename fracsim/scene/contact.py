@@ -7,15 +7,16 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
+from ..forms.schemes import Scheme
 from ..mechanics.contact.barrier import Barrier
 from ..mechanics.contact.obstacle import Obstacle
 from ..mechanics.contact.obstacles import Law, Obstacles
-from ..mechanics.contact.shapes import SHAPES
+from ..mechanics.contact.shapes import SHAPES, Shape
 from ..mechanics.material import MaterialFields
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..study import Contact, Study
-from ..study.conditions import Placing, obstacles
+from ..study.conditions import Loose, Placing, obstacles
 
 DISTANCE = 0.05  # of the mean edge: a hundredth of it is where a press of a hundredth of Young's modulus holds
 STIFFNESS = 0.1  # of Young's modulus
@@ -23,10 +24,15 @@ DISTANCE_ITSELF, STIFFNESS_ITSELF = 0.03, 0.03  # the same: ipctk's barrier pres
 CREEP = 1e-3  # of the body's size, a second
 
 
-def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Obstacles:
+def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
     entries = [_obstacle(each, number) for number, each in enumerate(obstacles(study, domain.dim))]
-    return Obstacles(domain, u, entries, _law(study.contact or Contact(), domain, material))
+    law = _law(study.contact or Contact(), domain, material)
+    if not any(each.free for each in study.obstacle):
+        return Obstacles(domain, u, entries, law)
+    from ..mechanics.contact.free_obstacles import FreeObstacles
+
+    return FreeObstacles(domain, u, entries, law, scheme)
 
 
 def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
@@ -48,7 +54,25 @@ def _obstacle(entry: Placing, number: int) -> Obstacle:
         shape = SHAPES[entry.shape](**entry.geometry)
     except InputError as error:
         raise InputError(f"obstacle.{number}: {error}") from None
+    if entry.loose is not None:
+        return _free_obstacle(entry, entry.loose, shape)
     return Obstacle(entry.name, shape, entry.at, entry.moved, entry.friction)
+
+
+def _free_obstacle(entry: Placing, loose: Loose, shape: Shape) -> Obstacle:
+    """One with a mass; on a hinge it is placed, and turns, about that."""
+    from ..mechanics.contact.free_obstacle import FreeObstacle
+    from ..mechanics.contact.shifted import Shifted
+
+    density = loose.density or (loose.mass or 0.0) / shape.volume
+    at, centre = entry.at, 0 * entry.at
+    if loose.hinge is not None:
+        at, centre = loose.hinge, entry.at - loose.hinge
+        shape = Shifted(shape, centre)
+    return FreeObstacle(
+        entry.name, shape, at, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
+        ways=loose.ways, centre=centre, gravity=loose.gravity, rate=loose.rate,
+    )  # fmt: skip
 
 
 def _law(contact: Contact, domain: Domain, material: MaterialFields) -> Law:

@@ -80,7 +80,7 @@ def _obstacles(parts: Parts) -> Term | None:
         return None
     from .contact import obstacles_of
 
-    return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material)
+    return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
 
 def _contact(parts: Parts) -> Term | None:

@@ -7,6 +7,7 @@ quasi_static       load steps: balance and breaking in turn until nothing change
 explicit           steps without a system
 after_step         what flows and breaks at the end of a step; empty parts where nothing does
 memory             damage and flow as values in the state
+condensed          a tangent less what terms have eliminated
 energy_book        work and viscous loss of a step
 stress_release     what broken edges no longer hold
 newton             one nonlinear solve, and what is tried where it fails

@@ -88,8 +88,12 @@ class Solver:
 
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
-        tangent = self.balance.tangent
-        self.snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), tangent, tangent)
+        tangent = self._operator = self.balance.tangent
+        if self.balance.condenses:
+            from .condensed import Condensed
+
+            self._operator = Condensed(tangent, lambda: self.balance.low_rank).matrix()
+        self.snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), self._operator, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
 
@@ -260,7 +264,7 @@ class Solver:
         """K correction = balance.vector at the present u; whether it was solved."""
         tangent, ksp = self.balance.tangent, self.snes.ksp
         self._assemble_tangent(tangent)
-        ksp.setOperators(tangent)
+        ksp.setOperators(self._operator, tangent)
         ksp.solve(self.balance.vector, self._correction)
         return bool(ksp.reason > 0)
 
@@ -270,6 +274,8 @@ class Solver:
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
         self._assemble(tangent)
+        if self.balance.low_rank and self.snes.ksp.getType() == "preonly":
+            self.snes.ksp.setType("gmres")  # factors are of the rest
         if self.balance.pattern_changed:
             self._preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
         self._preconditioner.refresh(tangent)

@@ -21,7 +21,7 @@ class State:
         easy: steps in a row that went without halving.
         elastic: stored energy at t on this rank, J.
         forces: loads and reactions where the last step balanced them, N.    drag: damping forces there, N.
-        memory: what parts of the body remember of their past, by name (damage, flow): see stepping.memory.
+        memory: what parts of the body remember of their past, by name (damage, flow, terms): see stepping.memory.
         out_of_balance: (owned dofs,) residual that the last step ended with, N; None: none but the solver's tolerance.
         before: (displacement a step ago, size of that step), from which a load path is extrapolated; None: unknown.
     """

@@ -175,7 +175,8 @@ class BalanceStepper:
         self.balance.damage_changed()
 
     def _begin(self, state: State, dt: float) -> None:
-        """The step begins, for the first time or once more: with what the body had flowed at its start."""
+        """The step begins, for the first time or once more: with what the body had flowed at its start, and terms as
+        they were there."""
         if "flow" in state.memory:
             self.flow.recall(state.memory["flow"])
         if terms := state.memory.get("terms"):
@@ -255,6 +256,7 @@ class BalanceStepper:
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
         balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned
+        balance.arrive()
         x = balance.u.x.array[: balance.owned].copy()
         u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
         if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:

@@ -201,6 +201,10 @@ _PRICE_OF_CONTACT = (
 
 
 def _motion(obstacle: Obstacle) -> str:
+    if obstacle.free:
+        much = f"{obstacle.mass:g} kg" if obstacle.mass is not None else f"{obstacle.density:g} kg/m^3"
+        how = " on a hinge" if obstacle.hinge is not None else f" along {obstacle.guide}" if obstacle.guide else ""
+        return f"free{how}, {much},"
     return "fixed" if obstacle.displacement is None and obstacle.velocity is None else "driven"
 
 

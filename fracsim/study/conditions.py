@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
 from ..mesh.places import Group, InBox, OnPlane, Place
 from ..meshes.words import AXES
-from . import MOTIONS, Boundary, Box, Obstacle, Plane, Study, TimeTable
+from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, TimeTable
 
 Flags = npt.NDArray[np.bool_]
 
@@ -58,6 +58,25 @@ class Placing:
     at: Values
     moved: TimeFunction | None
     friction: float
+    loose: Loose | None = None
+
+
+@dataclass(frozen=True)
+class Loose:
+    """What an entry of [[obstacle]] says of one that is free; d = 2 or 3, r = 1 or 3, p = d + r.
+
+    Attributes:
+        mass: kg, or density: kg/m^3.    hinge: (d,) the point that it turns about, m; None: its centre moves.
+        ways: (p, k) what it may do: increments of its pose.    rate: (k,) how fast at the start, m/s and rad/s.
+        gravity: (d,) m/s^2.
+    """
+
+    mass: float | None
+    density: float | None
+    hinge: Values | None
+    ways: Values
+    rate: Values
+    gravity: Values
 
 
 def conditions(study: Study, dim: int) -> list[Condition]:
@@ -80,10 +99,10 @@ def _condition(entry: Boundary, dim: int, key: str) -> Condition:
     return Condition(key, entry.kind, place, function, components)
 
 
-def _named(axes: str, dim: int, key: str) -> Flags:
+def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
     """(d,) the components that `fix` names."""
     if beyond := set(axes) - set(AXES[:dim]):
-        raise InputError(f'{key}.fix = "{axes}": a {dim}D mesh has no {min(beyond)}')
+        raise InputError(f'{key}.{word} = "{axes}": a {dim}D mesh has no {min(beyond)}')
     return np.array([axis in axes for axis in AXES[:dim]])
 
 
@@ -113,10 +132,12 @@ def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
 
 def obstacles(study: Study, dim: int) -> list[Placing]:
     """All entries of [[obstacle]]. InputError where one does not fit the dimension."""
-    return [_placing(entry, dim, f"obstacle.{i}") for i, entry in enumerate(study.obstacle)]
+    load = volume_loads(study, dim)
+    gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(dim)
+    return [_placing(entry, dim, f"obstacle.{i}", gravity) for i, entry in enumerate(study.obstacle)]
 
 
-def _placing(entry: Obstacle, dim: int, key: str) -> Placing:
+def _placing(entry: Obstacle, dim: int, key: str, gravity: Values) -> Placing:
     given = entry.geometry
     for name in {"normal", "axis", "size"} & set(given):
         given[name] = _vector(given[name], dim, f"{key}.{name}")
@@ -131,9 +152,45 @@ def _placing(entry: Obstacle, dim: int, key: str) -> Placing:
     moved: TimeFunction | None = None
     if entry.displacement is not None:
         moved = in_time(entry.displacement, f"{key}.displacement", dim)
-    elif entry.velocity is not None:
+    elif entry.velocity is not None and not entry.free:
         moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
-    return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction)
+    loose = _loose(entry, dim, key, gravity) if entry.free else None
+    return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction, loose)
+
+
+def _loose(entry: Obstacle, dim: int, key: str, gravity: Values) -> Loose:
+    """What is free of an entry, and how it starts."""
+    turns = 1 if dim == 2 else 3
+    velocity = np.zeros(dim) if entry.velocity is None else of_size(entry.velocity, dim, f"{key}.velocity")  # type: ignore[arg-type]
+    ways, hinge = np.eye(dim + turns), None
+    spin = [0.0] * (turns if entry.hinge is None else 1) if entry.spin is None else entry.spin
+    if entry.hinge is not None:
+        hinge = of_size(entry.hinge.point, dim, f"{key}.hinge.point")
+        ways, turns = _about(entry.hinge, dim, f"{key}.hinge.axis"), 1
+    rate = np.concatenate([velocity, of_size(spin, turns, f"{key}.spin")])
+    if entry.hinge is not None:
+        rate = rate[dim:]
+    elif entry.guide is not None:
+        along = _named(entry.guide, dim, key, "guide")
+        if np.any(velocity[~along]):
+            raise InputError(f"{key}.velocity = {velocity.tolist()}: it moves along {entry.guide} alone")
+        ways, rate = ways[:, :dim][:, along], velocity[along]
+    return Loose(entry.mass, entry.density, hinge, ways, rate, gravity)
+
+
+def _about(hinge: Hinge, dim: int, key: str) -> Values:
+    """(p, 1) increment of the pose about a hinge."""
+    if dim == 2:
+        if hinge.axis is not None:
+            raise InputError(f"{key} = {hinge.axis}: in 2D bodies turn in the plane; remove axis")
+        return np.array([[0.0], [0.0], [1.0]])
+    if hinge.axis is None:
+        raise InputError(f"{key} is missing: in 3D a hinge has a point and an axis")
+    axis = of_size(hinge.axis, dim, key)
+    length = float(np.linalg.norm(axis))
+    if not length > 0:
+        raise InputError(f"{key} = {hinge.axis} is no direction: give 3 numbers that are not all zero")
+    return np.concatenate([np.zeros(3), axis / length])[:, None]
 
 
 def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None] | None:

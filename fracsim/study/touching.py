@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .values import Flag, InTime, NonNegative, Positive, Table, Vector
+from .values import Finite, Flag, InTime, NonNegative, Positive, Table, TimeTable, Vector
 
 # shape -> (keys that it needs, keys that it may have)
 OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -19,8 +19,18 @@ OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 GEOMETRY = ("normal", "radius", "length", "axis", "size", "rounding", "hollow")
 
 
+FREE = ("spin", "hinge", "guide")  # of a free obstacle alone
+
+
+class Hinge(Table):
+    """What a free obstacle turns about: a point, in 3D an axis through it."""
+
+    point: Vector  # m
+    axis: Vector | None = None  # 3D
+
+
 class Obstacle(Table):
-    """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity."""
+    """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity; free where it has a mass."""
 
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9-]*$")]
     shape: Literal["plane", "sphere", "capsule", "cylinder", "box"]
@@ -33,7 +43,12 @@ class Obstacle(Table):
     rounding: Positive | None = None  # m, of the edges; default 5 % of the smallest radius or half side
     hollow: Flag = False  # the body is inside: a bowl, a container
     displacement: InTime[Vector] | None = None  # m
-    velocity: InTime[Vector] | None = None  # m/s
+    velocity: InTime[Vector] | None = None  # m/s; of a free obstacle at the start
+    mass: Positive | None = None  # kg (2D: per metre of thickness): it moves freely
+    density: Positive | None = None  # kg/m^3, in place of the mass
+    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None  # rad/s at the start, if free
+    hinge: Hinge | None = None  # free to turn about it
+    guide: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # free to move along these axes, without turning
     friction: NonNegative = 0.0  # Coulomb's coefficient
 
     @model_validator(mode="after")
@@ -47,6 +62,39 @@ class Obstacle(Table):
         if self.displacement is not None and self.velocity is not None:
             raise ValueError("give displacement or velocity, not both")
         return self
+
+    @model_validator(mode="after")
+    def _is_free_or_not(self) -> Obstacle:
+        if not self.free:
+            if given := [key for key in FREE if getattr(self, key) is not None]:
+                raise ValueError(f"{given[0]} is for an obstacle that moves freely: give mass or density, or remove it")
+            return self
+        if self.mass is not None and self.density is not None:
+            raise ValueError("give mass or density, not both")
+        if self.shape == "plane":
+            raise ValueError("a plane is a half space without end, so it cannot move freely: remove mass and density")
+        if self.hollow:
+            raise ValueError(f"a hollow {self.shape} has walls without thickness, so it cannot move freely: hold it")
+        if self.displacement is not None:
+            raise ValueError("it is driven by displacement and, with a mass, free: give one or the other")
+        if isinstance(self.velocity, TimeTable):
+            raise ValueError("the velocity of a free obstacle is the one it starts with: give one vector, not a table")
+        return self
+
+    @model_validator(mode="after")
+    def _is_held_in_one_way(self) -> Obstacle:
+        if self.hinge is not None and self.guide is not None:
+            raise ValueError("give hinge or guide, not both")
+        if self.hinge is not None and self.velocity is not None:
+            raise ValueError("on a hinge its velocity follows from the spin: give spin alone")
+        if self.guide is not None and self.spin is not None:
+            raise ValueError("along a guide it does not turn: remove spin")
+        return self
+
+    @property
+    def free(self) -> bool:
+        """Whether it moves by itself."""
+        return self.mass is not None or self.density is not None
 
     @property
     def geometry(self) -> dict[str, Any]:

@@ -154,6 +154,21 @@ class Study(Table):
         return self
 
     @model_validator(mode="after")
+    def _free_obstacles_have_inertia(self) -> Study:
+        loose = [number for number, each in enumerate(self.obstacle) if each.free]
+        if loose and not self.time.kind.inertia:
+            raise ValueError(
+                f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
+                'choose time.scheme = "backward-euler", or drive it by displacement'
+            )
+        return self
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves at the start."""
+        return self.initial is None and not any(each.free and (each.velocity or each.spin) for each in self.obstacle)
+
+    @model_validator(mode="after")
     def _rest_has_no_velocity(self) -> Study:
         if not self.time.kind.inertia and self.initial is not None:
             raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")

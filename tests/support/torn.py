@@ -252,6 +252,14 @@ RUNS: dict[str, dict[str, Any]] = {
                       "friction": 0.3}],
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.0}, "probe": [{"name": "grip", "on": "left"}],
     },
+    # broken by a stone that flies, falls, spins and rubs
+    "thrown": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xy"}],
+        "fracture": {"strength": 0.15, "radius": 0.1}, "load": {"gravity": [0.0, -0.1]},
+        "obstacle": [{"name": "stone", "shape": "sphere", "radius": 0.15, "at": [0.8, 0.76], "velocity": [0.05, -0.5],
+                      "spin": [1.0], "mass": 0.5, "friction": 0.3}],
+        "time": {"scheme": "generalized-alpha", "step": 0.05, "end": 0.3},
+    },
     # torn, then pushed together until its pieces touch one another
     "shut": {
         "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},

@@ -2,6 +2,9 @@
 
 obstacles         the term of the balance
 obstacle          one that is held or driven
+free_obstacles    the term with obstacles that move by themselves; free_obstacle, shifted: one of them, on a hinge
+rigid_step, push  its pose in a step as the least of an incremental potential; what contact does to the pose
+turn              rotation vectors that are not small
 touch             barrier and friction at the points of a surface
 reach             how far points may go, first guesses that have passed through nothing
 
@@ -27,7 +30,7 @@ room, crowd       walls that come to light where there is no room: before obstac
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
 
-All but the two terms and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
+All but the terms and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
 
 IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
 distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.

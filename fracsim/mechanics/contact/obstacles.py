@@ -56,7 +56,7 @@ class Obstacles(Term):
     """Obstacles that the body cannot pass through.
 
     Attributes:
-        obstacles: held or driven.    law: how they act.
+        obstacles: held or driven (or free: free_obstacles).    law: how they act.    led: numbers of the former.
         area: (n,) of the points of this rank's surface, m^2; 0 of those left out.    follow: from nodes to points.
     """
 
@@ -67,6 +67,7 @@ class Obstacles(Term):
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
         self.obstacles, self.law = tuple(obstacles), law
+        self.led = self._known()
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._surface, self._coupling = LocalSurface(domain), Coupling(domain)
@@ -77,6 +78,10 @@ class Obstacles(Term):
         self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
         check_apart(self.comm, self._surface.at.rest, self.obstacles)
 
+    def _known(self) -> list[int]:
+        """Those whose way is known: all that are held or driven."""
+        return list(range(len(self.obstacles)))
+
     # --- a step ---
 
     def begin(self, level: Level) -> None:
@@ -86,19 +91,23 @@ class Obstacles(Term):
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: grips and ways are still those of the step
         self._end, self._dt, self._began_with = end, level.dt, level.v
-        self._placed = [each.placed(end) for each in self.obstacles]
-        self._at_start = [each.placed(end - level.dt) for each in self.obstacles]
-        self._ways = [each.way(end - level.dt, end) for each in self.obstacles]
+        self._take_places(end - level.dt, end)
         self._grips: list[Grip | None] = [None] * len(self.obstacles)
         self._gone = 1.0  # share of their way
         if level.dt:
             self._start_of_step(late)
 
+    def _take_places(self, start: float, end: float) -> None:
+        """Where obstacles are at the ends of a step, s."""
+        self._placed = [each.placed(end) for each in self.obstacles]
+        self._at_start = [each.placed(start) for each in self.obstacles]
+        self._ways = [each.way(start, end) for each in self.obstacles]
+
     def _start_of_step(self, late: float) -> None:
         at = self._at_start
         self._make_room(self.follow.nodal(self._level.u), at)
         x = self.places(self._level.u)
-        held = [grip(x, self.area, placed, self.law.barrier) for placed in at]
+        held = self._starts = [grip(x, self.area, placed, self.law.barrier) for placed in at]
         self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
         pushed = [each.force[:, None] * each.normal for each in held]
         self._pushed = [forces.sum(axis=0) for forces in pushed]
@@ -127,8 +136,11 @@ class Obstacles(Term):
     def _touch(self, number: int) -> Touch:
         obstacle, held = self.obstacles[number], self._grips[number]
         rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
-        way = self._ways[number][: self._domain.dim]
-        return touch(self.x, self.area, self._placed[number], self.law.barrier, held, rub, way)
+        return touch(self.x, self.area, self._placed[number], self.law.barrier, held, rub, self._under(number))
+
+    def _under(self, number: int) -> Values:
+        """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
+        return np.asarray(self._ways[number][: self._domain.dim])
 
     # --- what it adds to the balance ---
 
@@ -180,13 +192,18 @@ class Obstacles(Term):
     def longest_step(self, change: Values) -> float:
         """Share of a change of u that closes no gap by more than nine tenths (collective)."""
         self._touching()
-        moved, rest = self.follow(np.divide(change, self._level.share)), np.zeros_like(self._ways[0])
-        shares = [safe_shares(placed, self.x, moved, rest)[self.area > 0] for placed in self._placed]
+        moved = self.follow(np.divide(change, self._level.share))
+        along = zip(self._placed, self._taken_along(moved), strict=True)
+        shares = [safe_shares(placed, self.x, moved, q)[self.area > 0] for placed, q in along]
         return float(min(share.min(initial=1.0) for share in shares))
 
+    def _taken_along(self, moved: Values) -> list[Values]:
+        """(p,) how each obstacle gives way to a change `moved` (n, d) of the points, m (collective)."""
+        return [np.zeros_like(way) for way in self._ways]
+
     def ways(self) -> list[tuple[Placed, Values]]:
-        """Where each obstacle is at the start of the step, and its way (p,) to the end."""
-        return list(zip(self._at_start, self._ways, strict=True))
+        """Where each obstacle whose way is known is at the start of the step, and its way (p,) to the end."""
+        return [(self._at_start[number], self._ways[number]) for number in self.led]
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
@@ -219,21 +236,23 @@ class Obstacles(Term):
     def _go_on(self, x: Values) -> None:
         """A share of the rest of the way that is safe with points at x (n, d)."""
         rest, still = 1 - self._gone, np.zeros_like(x)
-        here = [placed.pose.moved(self._gone * q) for placed, q in self.ways()]
-        shares = [
-            safe_shares(Placed(each.shape, pose), x, still, rest * q)[self.area > 0].min(initial=1.0)
-            for each, pose, q in zip(self.obstacles, here, self._ways, strict=True)
-        ]
-        share = self.comm.allreduce(float(min(shares)), op=MPI.MIN)
+        here = [(Placed(placed.shape, placed.pose.moved(self._gone * q)), q) for placed, q in self.ways()]
+        shares = [safe_shares(placed, x, still, rest * q)[self.area > 0].min(initial=1.0) for placed, q in here]
+        share = self.comm.allreduce(float(min(shares, default=1.0)), op=MPI.MIN)
         self._gone = 1.0 if share == 1 else self._gone + share * rest
-        self._placed = [Placed(placed.shape, placed.pose.moved(self._gone * q)) for placed, q in self.ways()]
+        for number, (placed, q) in zip(self.led, self.ways(), strict=True):
+            self._placed[number] = Placed(placed.shape, placed.pose.moved(self._gone * q))
         self._touches = None
 
     # --- what breaks, and what is told ---
 
+    def where(self, t: float) -> list[Placed]:
+        """Each obstacle at the time t of the state, s (not collective)."""
+        return [each.placed(t) for each in self.obstacles]
+
     def apart(self, at: Places, u: Values, t: float) -> Places:
         """Drawn in where it would lie in an obstacle, as the points are that touch."""
-        gaps = partial(_gaps, [each.placed(t) for each in self.obstacles])
+        gaps = partial(_gaps, self.where(t))
         inside = at.copies[gaps(at(u))[at.copies] <= 0]
         return drawn_in(at, u, inside, at.share[inside], np.full(len(inside), TINY), gaps)[0] if len(inside) else at
 
@@ -253,7 +272,7 @@ class Obstacles(Term):
         self._leave_out(out)
         self._grips, self._touches = [None] * len(self.obstacles), None
 
-    def memory(self) -> tuple[Values, Values]:
+    def memory(self) -> object:
         """Shares of arms, and areas."""
         return self._surface.at.share, self.area
 
@@ -346,8 +365,8 @@ class Obstacles(Term):
 
     def drawn(self, t: float) -> dict[str, Drawn]:
         """Each obstacle at time t, s, by its name."""
-        each = zip(self.obstacles, self._drawings, strict=True)
-        return {obstacle.name: drawing(obstacle.placed(t)) for obstacle, drawing in each}
+        each = zip(self.obstacles, self._drawings, self.where(t), strict=True)
+        return {obstacle.name: drawing(placed) for obstacle, drawing, placed in each}
 
     def driven(self) -> tuple[float, float]:
         """Work of the obstacles' own motion in the step on this rank, and what of it friction takes, J (collective).
@@ -355,12 +374,12 @@ class Obstacles(Term):
         Friction's `drag` counts the way of the body; the slip is that way less the obstacle's.
         """
         lost = 0.0
-        for number, way in enumerate(self._ways):
-            shift, found = way[: self._domain.dim], self._touching()[number]
+        for number in self.led:
+            shift, found = self._ways[number][: self._domain.dim], self._touching()[number]
             pushed, rubbed = found.normal.sum(axis=0), float(found.friction.sum(axis=0) @ shift)
             self._worked[number] = float((pushed + self._pushed[number]) @ shift) / 2 + rubbed
             lost += rubbed
-        return sum(self._worked), lost
+        return sum(self._worked[number] for number in self.led), lost
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

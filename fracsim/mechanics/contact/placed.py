@@ -58,13 +58,13 @@ class Placed:
         y, n, H = x - self.pose.centre, self.normal(x), self.curvature(x)
         G = turning(y)
         mixed = turning(n) - H @ G
-        twice = G.transpose(0, 2, 1) @ H @ G + _second_order_turn(n, y)
+        twice = G.transpose(0, 2, 1) @ H @ G + second_order_turn(n, y)
         upper = np.concatenate([H, mixed], axis=2)
         lower = np.concatenate([mixed.transpose(0, 2, 1), twice], axis=2)
         return np.concatenate([upper, lower], axis=1)
 
 
-def _second_order_turn(n: Values, y: Values) -> Values:
+def second_order_turn(n: Values, y: Values) -> Values:
     """(n, p, p) second derivative of n . exp(-w) y at w = 0."""
     along = np.einsum("ni,ni->n", n, y)[:, None, None]
     if n.shape[1] == 2:

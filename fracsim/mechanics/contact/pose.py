@@ -48,6 +48,12 @@ class Pose:
         """(n, d, d) R A R^T."""
         return np.asarray(self.rotation @ A @ self.rotation.T)
 
+    def turned(self) -> Values:
+        """(1,) or (3,) angle or rotation vector of R, rad, at most half a turn."""
+        if self.dim == 3:
+            return np.asarray(Rotation.from_matrix(self.rotation).as_rotvec())
+        return np.arctan2(self.rotation[1:, 0], self.rotation[:1, 0])
+
     def moved(self, q: Values) -> Pose:
         """The pose after an increment q = (t, w); the rotation stays one to round-off however often this is done."""
         t, w = q[: self.dim], q[self.dim :]

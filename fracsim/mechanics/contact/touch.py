@@ -38,7 +38,7 @@ class Touch:
     Attributes:
         points: (k,) of the surface, with a gap below the barrier's width or gripped by friction.
         energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.    friction_energy: J.
-        make_stiffness: gives `stiffness`, once it is asked for.
+        make_parts: gives `exact` and `stick`, once they are asked for.
     """
 
     points: Ints
@@ -46,12 +46,26 @@ class Touch:
     normal: Values
     friction: Values
     friction_energy: float
-    make_stiffness: Callable[[], Values]
+    make_parts: Callable[[], tuple[Values, Values]]
+
+    @cached_property
+    def _parts(self) -> tuple[Values, Values]:
+        return self.make_parts()
+
+    @property
+    def exact(self) -> Values:
+        """(k, d, d) minus the derivative of the normal forces, N/m."""
+        return self._parts[0]
+
+    @property
+    def stick(self) -> Values:
+        """(k, d, d) that of friction, positive semi-definite, N/m."""
+        return self._parts[1]
 
     @cached_property
     def stiffness(self) -> Values:
         """(k, d, d) minus the derivative of the forces, positive semi-definite, N/m."""
-        return self.make_stiffness()
+        return positive(self.exact) + self.stick
 
 
 def grip(x: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
@@ -64,7 +78,8 @@ def grip(x: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
 def touch(
     x: Values, area: Values, placed: Placed, barrier: Barrier, held: Grip | None, friction: Friction | None, way: Values
 ) -> Touch:
-    """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, m.
+    """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, or (k, d) of its places under
+    the points that are held, m.
 
     The barrier's energy is the integral of b(gap) over the surface, each point with its area.
     """
@@ -81,15 +96,16 @@ def touch(
         rubbed[np.searchsorted(points, held.points)] = -friction.gradient(held.force, held.normal, moved)
         stored = float(friction.energy(held.force, held.normal, moved).sum())
 
-    def stiffness() -> Values:
+    def parts() -> tuple[Values, Values]:
         bent = barrier.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
-        found = share[:, None, None] * positive(bent + slope[:, None, None] * placed.curvature(at))
+        exact = share[:, None, None] * (bent + slope[:, None, None] * placed.curvature(at))
+        stick = np.zeros_like(exact)
         if friction is not None and held is not None and len(held.points):
-            found[np.searchsorted(points, held.points)] += friction.hessian(held.force, held.normal, moved)
-        return np.asarray(found)
+            stick[np.searchsorted(points, held.points)] = friction.hessian(held.force, held.normal, moved)
+        return exact, stick
 
     energy = float(share @ barrier.energy(gap))
-    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, stored, stiffness)
+    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, stored, parts)
 
 
 def positive(blocks: Values) -> Values:

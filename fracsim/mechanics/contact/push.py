@@ -1,0 +1,87 @@
+"""What contact does to the pose of an obstacle: energy of the points in touch, and its derivatives.
+
+Points see the obstacle through x - c alone, turned with it. With D the energy of a point as a function of its place
+seen from the obstacle, y its arm and J = [-1, G(y)] (pose), the derivative by an increment (t, w) is J^T D', the second
+one J^T D'' J and, of forces D' that turn with the obstacle, G(D') between t and w and `second_order_turn` in w.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .placed import second_order_turn
+from .pose import Pose, Values, turning
+from .touch import Grip, Touch
+
+
+@dataclass(frozen=True)
+class Push:
+    """Of one obstacle, summed over its points.
+
+    Attributes:
+        energy: of barrier and friction, J.    gradient: (p,) by an increment of the pose.    hessian: (p, p).
+        stiffness: (p, p) the part of the Hessian that is sure to be positive semi-definite.
+    """
+
+    energy: float
+    gradient: Values
+    hessian: Values
+    stiffness: Values
+
+
+def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) -> Push:
+    """Of points in touch at x (n, d), m; friction holds the places of the obstacle that were under them at its pose at
+    the `start` of the step, not those that are there now."""
+    arm = x[found.points] - pose.centre
+    J, gradient = _by_pose(arm), -found.normal
+    stiffness, hessian = (_summed(J, blocks) for blocks in (found.stiffness, found.exact))
+    hessian = hessian + _turning_with(gradient, arm)
+    total = np.einsum("ndp,nd->p", J, gradient)
+    if held is not None and len(held.points):
+        arm = arm.copy()
+        arm[np.searchsorted(found.points, held.points)] = (held.start - start.centre) @ (
+            pose.rotation @ start.rotation.T
+        ).T
+        J = _by_pose(arm)
+        total = total - np.einsum("ndp,nd->p", J, found.friction)
+        hessian = hessian + _summed(J, found.stick)
+        d = pose.dim
+        hessian[d:, d:] += second_order_turn(found.friction, arm).sum(axis=0)
+    return Push(found.energy + found.friction_energy, total, hessian, stiffness)
+
+
+def on_obstacle(found: Touch, x: Values, pose: Pose) -> Values:
+    """(p,) force and moment of the body on the obstacle about its reference point, N and N m: action and reaction at
+    the points themselves."""
+    return resultant(-(found.normal + found.friction), x[found.points] - pose.centre)
+
+
+def resultant(force: Values, arm: Values) -> Values:
+    """(p,) sums of forces (n, d) and of their moments arm x force."""
+    moment = -np.einsum("ndr,nd->r", turning(arm), force)
+    return np.concatenate([force.sum(axis=0), moment])
+
+
+def by_point_and_pose(found: Touch, x: Values, pose: Pose) -> Values:
+    """(k, d, p) derivative of minus the forces on the points by an increment of the pose, as `stiffness` has it."""
+    return np.asarray(found.stiffness @ _by_pose(x[found.points] - pose.centre))
+
+
+def _by_pose(arm: Values) -> Values:
+    """(n, d, p) J."""
+    still = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
+    return np.concatenate([still, turning(arm)], axis=2)
+
+
+def _summed(J: Values, blocks: Values) -> Values:
+    """(p, p) sum of J^T B J."""
+    return np.asarray(np.einsum("nip,nij,njq->pq", J, blocks, J))
+
+
+def _turning_with(gradient: Values, arm: Values) -> Values:
+    """(p, p) of normal forces, which turn with the obstacle."""
+    d = arm.shape[1]
+    mixed, twice = turning(gradient).sum(axis=0), second_order_turn(gradient, arm).sum(axis=0)
+    return np.block([[np.zeros((d, d)), mixed], [mixed.T, twice]])

@@ -1,0 +1,329 @@
+"""Obstacles that move freely, with the body: momentum, energy, closed forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from mpi4py import MPI
+from pydantic import ValidationError
+
+from fracsim.errors import InputError
+from fracsim.mechanics.contact.free_obstacles import FreeObstacles
+from fracsim.run import Run
+from fracsim.scene import Scene, build_scene
+from fracsim.study.check import check_study
+from support.scenes import Walk, each_step, make_scene, make_study, march, positions
+
+Values = npt.NDArray[np.float64]
+
+FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
+SOFT = {"energy": "neo-hookean", "young": 1e5, "poisson": 0.3, "density": 100.0}
+SCHEMES = ("backward-euler", "newmark", "generalized-alpha")
+G = 10.0
+
+
+def ball(**more: Any) -> dict[str, Any]:
+    """A disk above a body that ends at y = 0.3."""
+    return {"name": "it", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.42], "mass": 5.0} | more
+
+
+def contact_of(scene: Scene) -> FreeObstacles:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacles)]
+    return found
+
+
+def told(scene: Scene) -> dict[str, float]:
+    """The columns of history.csv."""
+    return dict(zip(scene.probes.names, scene.probes(), strict=True))
+
+
+def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
+    """(d,) linear and (1,) or (3,) angular momentum about the origin of body and obstacle."""
+    d, (flight,) = scene.domain.dim, contact_of(scene).flights.values()
+    mass = scene.balance.mass.lumped.reshape(-1, d)[:, :1]
+    x, v = positions(scene) + state.u.reshape(-1, d), state.v.reshape(-1, d)
+    rows = [(x, mass * v), (flight.pose.centre[None], flight.momentum[None, :d])]
+    linear = sum((p.sum(axis=0) for _, p in rows), np.zeros(d))
+    angular = sum((_cross(x, p).sum(axis=0) for x, p in rows), flight.momentum[d:])
+    return linear, angular
+
+
+def _cross(x: Values, p: Values) -> Values:
+    return np.cross(x, p) if x.shape[1] == 3 else (x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0])[:, None]
+
+
+def carried(scene: Scene, state: Walk) -> float:
+    """int rho u_y dV of the body, kg m."""
+    return float((scene.balance.mass.lumped * state.u).reshape(-1, scene.domain.dim)[:, 1].sum())
+
+
+# --- by itself ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_free_flight_is_the_parabola_of_the_scheme(scheme: str) -> None:
+    """y = v t - g t^2 / 2, of backward Euler v t - g t (t + dt) / 2; motion gains the work of gravity, less
+    m (g dt)^2 / 2 a step of backward Euler."""
+    scene, state = make_scene(
+        obstacle=[ball(at=[3.0, 5.0], velocity=[1.0, 2.0], spin=[3.0])], load={"gravity": [0.0, -G]},
+        material=SOFT, boundary=[{"on": "bottom", "fix": "xy"}], time={"scheme": scheme, "step": 0.02, "end": 0.4},
+    )  # fmt: skip
+    started = 0.5 * 5.0 * 5.0 + 0.5 * 0.5 * 5.0 * 0.1**2 * 9.0
+    march(scene, state)
+    row, t = told(scene), state.t
+    late = 0.02 if scheme == "backward-euler" else 0.0
+    assert row["position_it_x"] == pytest.approx(3 + t, abs=1e-12)
+    assert row["position_it_y"] == pytest.approx(5 + 2 * t - G * t * (t + late) / 2, abs=1e-12)
+    assert [row["velocity_it_y"], row["turn_it_z"], row["spin_it_z"]] == pytest.approx([2 - G * t, 3 * t, 3.0])
+    assert state.work == pytest.approx(-5.0 * G * (row["position_it_y"] - 5) - G * carried(scene, state))
+    assert row["kinetic_it"] - started == pytest.approx(-5.0 * G * (row["position_it_y"] - 5) - 2.5 * G**2 * late * t)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_pendulum_swings_in_its_period(dim: int) -> None:
+    """T = 2 pi sqrt(I / (m g l)) at 0.1 rad, which lengthens it by 0.06 %: zero crossings of the turn, 1 % of T."""
+    tail = [0.3] * (dim - 2)
+    hinge = {"point": [3.0, 5.0, *tail]} | ({"axis": [0.0, 0.0, 2.0]} if dim == 3 else {})
+    inertia = (0.5 if dim == 2 else 0.4) * 0.1**2 + 0.4**2
+    period = 2 * np.pi * np.sqrt(inertia / (G * 0.4))
+    at = [3 + 0.4 * np.sin(0.1), 5 - 0.4 * np.cos(0.1), *tail]
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 1.0}, load={"gravity": [0.0, -G, 0.0][:dim]},
+        material={"energy": "linear", "young": 1e5, "poisson": 0.0, "density": 1.0},
+        boundary=[{"on": "bottom", "fix": "xyz"[:dim]}], obstacle=[ball(at=at, hinge=hinge)],
+        time={"scheme": "newmark", "step": period / 40, "end": 1.3 * period},
+    )  # fmt: skip
+    turns, times = [0.0], [0.0]
+    for _ in each_step(scene, state):
+        turns.append(told(scene)["turn_it_z"])
+        times.append(state.t)
+    swing, t = np.array(turns) + 0.1, np.array(times)
+    down = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
+    crossing = t[down] + swing[down] / (swing[down] - swing[down + 1]) * np.diff(t)[down]
+    assert np.diff(crossing) == pytest.approx([period], rel=1e-2)
+    assert swing.min() == pytest.approx(-0.1, rel=1e-2)
+
+
+# --- with the body --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_an_isolated_pair_keeps_its_momentum(scheme: str) -> None:
+    """A spinning, rubbing box thrown on a block that nothing holds: m v of both together stays to the solver's
+    tolerance while it is turned round; friction and the scheme take energy, and a blow within a few steps
+    adds 5 % at most, with backward Euler nothing."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.3], "h": 0.1}, material=SOFT, solver=FINE,
+        obstacle=[{"name": "it", "shape": "box", "size": [0.3, 0.1], "at": [0.7, 0.36], "velocity": [1.0, -2.0],
+                   "spin": [3.0], "mass": 5.0, "friction": 0.3}],
+        time={"scheme": scheme, "step": 2e-3, "end": 0.04},
+    )  # fmt: skip
+    before, _ = momenta(scene, state)
+    most = 1 + 1e-9 if scheme == "backward-euler" else 1.05
+    given = 0.0
+    for report in each_step(scene, state):
+        np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-8 * 10)
+        assert report.kinetic + report.elastic + state.dissipated < 12.69 * most
+        given += told(scene)["work_it"]
+    row = told(scene)
+    assert row["velocity_it_y"] > -0.1 and state.dissipated > 0.5
+    if scheme == "newmark":
+        assert given == pytest.approx(
+            12.69 - row["kinetic_it"], rel=4e-2
+        )  # its work on the body: trapezia, friction in full
+    assert row["gap_it"] > 0
+
+
+def test_angular_momentum_is_kept_to_the_order_of_the_scheme() -> None:
+    """Backward Euler loses dt sum m v_n+1 x v_n of it a step, as of the body's: less than a third at a quarter of the
+    step, in 3D, with all of an obstacle's freedoms at work."""
+    lost = []
+    for step in (8e-3, 2e-3):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 0.3, 0.5], "h": 0.25}, material=SOFT, solver=FINE,
+            obstacle=[{"name": "it", "shape": "box", "size": [0.3, 0.1, 0.2], "at": [0.7, 0.37, 0.3], "mass": 5.0,
+                       "velocity": [1.0, -2.0, 0.5], "spin": [3.0, -8.0, 2.0], "friction": 0.3}],
+            time={"scheme": "backward-euler", "step": step, "end": 0.032},
+        )  # fmt: skip
+        linear, angular = momenta(scene, state)
+        march(scene, state)
+        after = momenta(scene, state)
+        np.testing.assert_allclose(after[0], linear, atol=1e-8 * 10)
+        lost.append(np.abs(after[1] - angular).max())
+    assert np.linalg.norm(linear - contact_of(scene).flights[0].momentum[:3]) > 5  # most of it has changed hands
+    assert lost[1] < lost[0] / 3 and lost[1] < 5e-3 * np.linalg.norm(angular)
+
+
+@pytest.mark.parametrize("mass", (5e3, 0.1, 1e-5))
+def test_a_free_striker_faster_than_its_step_does_not_tunnel(mass: float) -> None:
+    """A disk at 100 m/s would cross a bar of 0.1 kg five times over in a step: it never enters it, whatever its mass;
+    both have the momentum that it brought, and they part no faster than they met."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.1], "h": 0.05}, solver=FINE,
+        material={"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1.0},
+        obstacle=[ball(at=[0.5, 0.3], velocity=[0.0, -100.0], mass=mass)],
+        time={"scheme": "backward-euler", "step": 5e-3, "end": 1e-2},
+    )  # fmt: skip
+    for _ in each_step(scene, state):
+        row, x = told(scene), positions(scene) + state.u.reshape(-1, 2)
+        centre = np.array([row["position_it_x"], row["position_it_y"]])
+        assert np.linalg.norm(x - centre, axis=1).min() > 0.1
+        assert x[:, 1].mean() < centre[1]
+        np.testing.assert_allclose(momenta(scene, state)[0], [0.0, -100.0 * mass], atol=1e-7 * max(100 * mass, 1.0))
+    assert -101 < state.v.reshape(-1, 2)[:, 1].mean() < -mass / (mass + 0.1) * 95
+
+
+def test_a_weight_dropped_on_a_block_comes_to_rest() -> None:
+    """Guided, on a damped block that is held: contact has given it m v + m g t in all, and carries m g in the end; what
+    gravity did is stored, or gone."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.3], "h": 0.1}, material=SOFT, solver=FINE, damping={"stiffness": 0.02},
+        boundary=[{"on": "bottom", "fix": "xy"}], load={"gravity": [0.0, -G]},
+        obstacle=[{"name": "it", "shape": "box", "size": [0.6, 0.2], "at": [0.5, 0.42], "density": 400.0, "guide": "y",
+                   "velocity": [0.0, -1.0]}],
+        time={"scheme": "backward-euler", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    mass, impulse = contact_of(scene).free[0].mass, 0.0
+    assert mass == pytest.approx(400 * 0.12, rel=1e-2)
+    for report in each_step(scene, state):
+        impulse += told(scene)["contact_it_y"] * report.dt
+    row = told(scene)
+    assert impulse == pytest.approx(mass * 1.0 + mass * G * state.t, rel=1e-3)
+    assert abs(row["velocity_it_y"]) < 1e-3 and row["position_it_x"] == 0.5
+    assert row["contact_it_y"] == pytest.approx(mass * G, rel=1e-3)
+
+
+@pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
+def test_the_condensed_tangent_is_the_derivative_of_the_force(scheme: str) -> None:
+    """Flat on flat along a guide, where nothing of a tangent is left out: K less its part of low rank times a change of
+    u, against differences of r, each with the obstacle where it then belongs; r against those of the potential."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.3], "h": 0.1}, material=SOFT, solver=FINE,
+        obstacle=[{"name": "it", "shape": "box", "size": [0.6, 0.1], "at": [0.5, 0.358], "mass": 0.5, "guide": "y",
+                   "velocity": [0.0, -1.0]}],
+        time={"scheme": scheme, "step": 5e-3, "end": 1.0},
+    )  # fmt: skip
+    balance, n = scene.balance, scene.balance.owned
+    balance.begin(5e-3, 5e-3, state.u, state.v, state.a)
+    u = balance.reachable(1e-4 * np.sin(1e3 * positions(scene)).reshape(-1))
+    balance.displace(u)
+    K, x, y = balance.tangent, balance.vector.duplicate(), balance.vector.duplicate()
+    balance.assemble_tangent(K)
+    change, h = np.cos(np.arange(n)), 1e-8
+    x.array_w[:] = change
+    K.mult(x, y)
+    ((U, C),) = balance.low_rank
+    found = y.array_r - U @ (C @ (U.T @ change))
+    sides = []
+    for sign in (1, -1):
+        balance.displace(u + sign * h * change)
+        sides.append((balance.forces().copy(), balance.potential()[0]))
+    slope = (sides[0][0] - sides[1][0]) / (2 * h)
+    np.testing.assert_allclose(found, slope, atol=1e-5 * np.abs(slope).max())
+    assert np.abs(U @ (C @ (U.T @ change))).max() > 0.01 * np.abs(slope).max()
+    balance.displace(u)
+    assert balance.forces() @ change == pytest.approx((sides[0][1] - sides[1][1]) / (2 * h), rel=1e-5)
+
+
+def test_a_light_ball_on_a_heavy_block_halves_no_step() -> None:
+    """A ten-thousandth of the block's mass: potentials differ by less than their round-off, and steps stay whole."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT | {"young": 1e4}, solver=FINE,
+        obstacle=[ball(at=[0.55, 0.63], velocity=[0.0, -2.0], mass=5e-3)],
+        time={"scheme": "backward-euler", "step": 5e-3, "end": 0.05},
+    )  # fmt: skip
+    before, _ = momenta(scene, state)
+    march(scene, state)
+    assert scene.stepper.trouble.steps_failed == 0
+    np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-8 * 0.01)
+    assert told(scene)["velocity_it_y"] > -0.6
+
+
+# --- states, restarts, refusals -------------------------------------------------------------------------------------
+
+STRUCK: dict[str, Any] = {
+    "mesh": {"builder": "box", "size": [1.0, 0.3], "h": 0.1}, "material": SOFT, "solver": FINE,
+    "obstacle": [ball(at=[0.45, 0.405], velocity=[0.5, -2.0], friction=0.3)],
+    "time": {"scheme": "generalized-alpha", "step": 2e-3, "end": 0.03}, "output": {"picture": False},
+}  # fmt: skip
+
+
+def test_a_step_from_an_earlier_state_is_the_same_step() -> None:
+    """Obstacles are part of the state: taken again from five steps before, all numbers are the same but for
+    what the solver leaves."""
+    scene, state = make_scene(**STRUCK)
+    march(scene, state, 3)
+    earlier = state.state
+    march(scene, state, 5)
+    first, velocity = told(scene), state.v
+    state.state = earlier
+    march(scene, state, 5)
+    assert told(scene) == pytest.approx(first, rel=1e-7, abs=1e-9)
+    np.testing.assert_allclose(state.v, velocity, atol=1e-8)
+    assert first["contact_it_y"] != 0 and first["spin_it_z"] != 0
+
+
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """Stopped in the middle of the blow: the same columns of history.csv, but for what the solver leaves."""
+    going, folder = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), tmp_path / "going"), tmp_path / "stopped"
+    stopped = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), folder)
+    for run in (going, stopped):
+        for _ in range(5):
+            run.step()
+    stopped.checkpoint()
+    again = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), folder, restart=True)
+    for run in (going, again):
+        for _ in range(3):
+            run.step()
+    assert told(again.scene) == pytest.approx(told(going.scene), rel=1e-9, abs=1e-9)
+    assert again.state.dissipated == pytest.approx(going.state.dissipated, rel=1e-9)
+    assert told(going.scene)["contact_it_y"] != 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"displacement": [0.0, 1.0]}, "driven by displacement and, with a mass, free"),
+        ({"velocity": {"time": [0.0], "value": [[0.0, 1.0]]}}, "the one it starts with"),
+        ({"density": 3.0}, "mass or density, not both"),
+        ({"hollow": True}, "walls without thickness"),
+        ({"shape": "plane", "normal": [0.0, 1.0], "radius": None}, "without end, so it cannot move freely"),
+        ({"mass": None, "spin": [1.0]}, "spin is for an obstacle that moves freely"),
+        ({"hinge": {"point": [0.0, 1.0]}, "guide": "y"}, "hinge or guide, not both"),
+        ({"hinge": {"point": [0.0, 1.0]}, "velocity": [0.0, 1.0]}, "follows from the spin"),
+        ({"guide": "y", "spin": [1.0]}, "does not turn"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(changes: dict[str, Any], words: str) -> None:
+    entry = {key: value for key, value in (ball() | changes).items() if value is not None}
+    with pytest.raises(ValidationError, match=words):
+        make_study(obstacle=[entry])
+
+
+def test_without_inertia_nothing_is_free() -> None:
+    with pytest.raises(ValidationError, match=r"obstacle\.0 has a mass .* a quasi-static study has none"):
+        make_study(obstacle=[ball()], time={"scheme": "quasi-static", "step": 0.1, "end": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"guide": "z"}, "a 2D mesh has no z"),
+        ({"guide": "y", "velocity": [1.0, 0.0]}, "it moves along y alone"),
+        ({"hinge": {"point": [0.0, 1.0], "axis": [0.0, 1.0]}}, "in 2D bodies turn in the plane"),
+        ({"spin": [1.0, 2.0, 3.0]}, "needs 1 number"),
+    ],
+)
+def test_what_does_not_fit_the_mesh_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        check_study(make_study(obstacle=[ball(at=[0.5, 1.2]) | changes]))
+
+
+def test_check_says_what_is_free() -> None:
+    other = {"name": "other", "shape": "sphere", "radius": 0.1, "at": [0.5, 2.0], "density": 7e3, "guide": "y"}
+    lines = check_study(make_study(obstacle=[ball(), other]))
+    assert "obstacles   it (free, 5 kg, sphere), other (free along y, 7000 kg/m^3, sphere)" in lines
