@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import basix.ufl
 import pytest
 import ufl
 from dolfinx import fem, mesh
@@ -14,6 +15,7 @@ from dolfinx.jit import get_options
 from mpi4py import MPI
 
 from fracsim.mechanics import kernels
+from fracsim.mesh.dolfinx_calls import coordinate_element
 
 
 def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -39,6 +41,29 @@ def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest
     (tmp_path / "libffcx_forms_0.c").touch()
     assert not kernels._clear_abandoned()
     assert (tmp_path / "libffcx_forms_0.c").exists()
+
+
+def test_a_kernel_is_looked_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What a process has loaded it finds without the folder that it came from; another form is not taken for it."""
+    monkeypatch.setattr(kernels, "jit_options", lambda: {"cache_dir": tmp_path / "a", "cffi_extra_compile_args": ["-O0"]})
+    square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
+    x = ufl.SpatialCoordinate(square)
+    for power in (4, 5):
+        for _ in range(2):  # compiled, then loaded
+            kernels.compile_form(x[0] ** power * ufl.dx)
+    (tmp_path / "a").rename(tmp_path / "b")
+    for power in (4, 5):
+        found = fem.assemble_scalar(kernels.compile_form(x[0] ** power * ufl.dx))
+        assert found == pytest.approx(1 / (power + 1))
+    assert not list((tmp_path / "a").glob("*"))
+
+
+def test_a_mesh_makes_its_cell_once() -> None:
+    """What FFCx is told of the element is what it is told of Basix's own, so that both are one kernel."""
+    for dim, shape in ((2, "triangle"), (3, "tetrahedron")):
+        element, other = coordinate_element(dim), basix.ufl.element("Lagrange", shape, 1, shape=(dim,))
+        assert element == other and repr(element) == repr(other) and hash(element) == hash(other)
+        assert element.cell is element.cell and element.cell == other.cell
 
 
 def test_an_expression_is_known_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

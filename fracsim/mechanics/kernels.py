@@ -22,9 +22,11 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.variable import Label
 
-from ..mesh.dolfinx_calls import bind_to_cells, evaluate
+from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels
 from ..mesh.domain import Domain
 from ..mesh.ranks import raise_together
+
+keep_kernels()
 
 _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 

@@ -12,6 +12,9 @@ Run with 0.9 alone; the rest is from the sources, release notes and pull request
 0.11        evaluate            Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
 after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is gone (4403).
 
+any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives the same element.
+            keep_kernels        takes the place of a function of FFCx 0.9; without it kernels are found alike, more slowly.
+
 Nothing was found of the others: assemble_into, apply_lifting, expanded_csr, create_matrix.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
@@ -19,23 +22,43 @@ Nothing was found of the others: assemble_into, apply_lifting, expanded_csr, cre
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
+import basix.ufl
 import dolfinx
 import numpy as np
 import numpy.typing as npt
-from basix.ufl import _ElementBase
+import ufl
+from basix.ufl import _BlockedElement, _ElementBase
 from dolfinx import fem, graph, la
 from dolfinx.cpp.la import SparsityPattern
 from dolfinx.cpp.la.petsc import create_matrix as create_petsc_matrix
 from dolfinx.fem import petsc as fem_petsc
 from dolfinx.io import distribute_entity_data
+from ffcx.codegeneration import jit
 from mpi4py import MPI
 from petsc4py import PETSc
 
 Ints = npt.NDArray[np.int32]
 
 # --- mesh -----------------------------------------------------------------------------------------------------------
+
+
+class KeptCell(_BlockedElement):
+    """An element that is asked for its cell a hundred times a scene, and makes one, with all its faces, edges and
+    vertices, once: a third of the time that a scene in 3D takes to set up."""
+
+    @cached_property
+    def cell(self) -> ufl.Cell:
+        """Cell of the element."""
+        return _BlockedElement.cell.fget(self)
+
+
+def coordinate_element(dim: int) -> KeptCell:
+    """Linear simplices."""
+    shape = "triangle" if dim == 2 else "tetrahedron"
+    return KeptCell(basix.ufl.element("Lagrange", shape, 1, dtype=np.float64), (dim,))
 
 
 def create_mesh(
@@ -62,6 +85,22 @@ def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
 
 
 # --- forms ----------------------------------------------------------------------------------------------------------
+
+
+def keep_kernels() -> None:
+    """Have FFCx look for a kernel once a process: it reads its folder through for each, 1 ms where it holds 1,000 files."""
+    look_up, kept = jit.get_cached_module, {}
+
+    def looked_up_once(name: str, objects: Sequence[str], folder: Any, timeout: int) -> tuple[Any, Any]:
+        key = name, tuple(objects), str(folder)
+        if key in kept:
+            return kept[key]
+        found: tuple[Any, Any] = look_up(name, objects, folder, timeout)
+        if found[0] is not None:  # None: it is compiled now
+            kept[key] = found
+        return found
+
+    jit.get_cached_module = looked_up_once
 
 
 def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import basix.ufl
 import dolfinx
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,7 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..meshes.words import format_point
-from .dolfinx_calls import create_mesh, facets_of_nodes
+from .dolfinx_calls import coordinate_element, create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
 from .ranks import Gather, total
@@ -208,9 +207,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
     dim, groups, region, region_names, lower, upper = comm.bcast(head)
     cells = data.cells if data is not None else np.empty((0, dim + 1), np.int64)
     points = data.points if data is not None else np.empty((0, dim))
-    shape = "triangle" if dim == 2 else "tetrahedron"
-    element = basix.ufl.element("Lagrange", shape, 1, shape=(dim,), dtype=np.float64)
-    mesh = create_mesh(comm, cells, points, element)
+    mesh = create_mesh(comm, cells, points, coordinate_element(dim))
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim - 1, dim)
     facets = {name: _group_facets(mesh, data.facet_groups[name] if data is not None else None) for name in groups}

@@ -7,6 +7,7 @@ import difflib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +43,7 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
             raise InputError(unknown_key(f"mesh.{key}", known))
     try:
         # through JSON: strict about numbers, and yet a list becomes a tuple
-        return TypeAdapter(kind).validate_json(json.dumps(parameters, default=str), strict=True)
+        return _reader(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
         raise InputError(explain(error.errors(), "mesh")) from None
     except ArithmeticError:  # the count of its cells overflows, or there are none
@@ -50,6 +51,12 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
         raise InputError(
             f"mesh: {kind.name} with {given}: numbers do not reach that far; take a larger h (lengths are in metres)"
         ) from None
+
+
+@cache
+def _reader(kind: type) -> TypeAdapter[Any]:
+    """What reads the parameters of a builder: pydantic takes longer to make one than to read with it."""
+    return TypeAdapter(kind)
 
 
 # keys beside the source, and what each of them is
