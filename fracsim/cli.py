@@ -10,9 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
-import typer
-
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
+
+# typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
+_kept_out = sys.modules.setdefault("rich", None) is None  # type: ignore[arg-type]
+import typer  # noqa: E402
+
+if _kept_out:
+    del sys.modules["rich"]
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from fracsim.meshes.data import MeshData
+from fracsim.study import Mesh, check
 from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
@@ -29,6 +33,27 @@ def on_ranks(tmp_path_factory: pytest.TempPathFactory) -> OnRanks:
         return run_on_ranks("support.every", ranks, folder), folder / f"every-{ranks}"
 
     return run
+
+
+@pytest.fixture(scope="session", autouse=True)
+def meshes_built_once() -> Iterator[None]:
+    """Scenes of one process with the same [mesh] table share its arrays, which no one may write to. What builders build
+    is tested by themselves."""
+    build, built = check.build_mesh, {}
+
+    def build_once(mesh: Mesh, *surface: Any) -> MeshData:
+        if mesh.builder is None:
+            return build(mesh, *surface)
+        key = repr(mesh)
+        if key not in built:
+            data = built[key] = build(mesh)
+            for values in (data.points, data.cells, *data.facet_groups.values(), *data.regions.values()):
+                values.flags.writeable = False
+        return replace(built[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(check, "build_mesh", build_once)
+        yield
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

@@ -243,7 +243,7 @@ def test_every_command_works_under_mpirun(tmp_path: Path) -> None:
 
 def test_the_package_is_light() -> None:
     assert package.__version__
-    heavy = (*HEAVY, "numpy", "pydantic")
+    heavy = (*HEAVY, "numpy", "pydantic", "rich")
     code = f"import sys, fracsim.cli; print([name for name in {heavy!r} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert result.stdout.strip() == "[]"
