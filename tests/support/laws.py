@@ -15,6 +15,7 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.algorithms.expand_indices import expand_indices
 from ufl.algorithms.transformer import strip_variables
+from ufl.utils.stacks import StackDict
 
 from fracsim.forms.energies import Energy, cauchy_stress, first_piola_kirchhoff, full_cauchy_stress
 from fracsim.mesh.simplices import local_edges
@@ -48,7 +49,7 @@ class Law:
         return _entries(full_cauchy_stress(*self._arguments))
 
     def psi(self, F: Tensor) -> float:
-        return float(self._psi((), self._values(F)))
+        return _value(self._psi, self._values(F))
 
     def P(self, F: Tensor) -> Tensor:
         return self._tensor(self._P, F)
@@ -64,7 +65,7 @@ class Law:
 
     def _tensor(self, expression: Any, F: Tensor) -> Tensor:
         values = self._values(F)
-        return np.array([[float(entry((), values)) for entry in row] for row in expression])
+        return np.array([[_value(entry, values) for entry in row] for row in expression])
 
 
 def _plain(expression: Any) -> Any:
@@ -73,6 +74,11 @@ def _plain(expression: Any) -> Any:
     Variables go first: expand_indices keeps one component of a tensor-valued variable for all (UFL 2024.2).
     """
     return expand_indices(strip_variables(apply_derivatives(apply_algebra_lowering(expression))))
+
+
+def _value(plain: Any, values: dict[Any, Tensor]) -> float:
+    """What calling the expression gives; that would look for derivatives in it first, each time."""
+    return float(plain.evaluate((), values, (), StackDict()))
 
 
 def _entries(tensor: Any) -> list[list[Any]]:
