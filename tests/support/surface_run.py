@@ -16,7 +16,7 @@ from fracsim.stepping.state import State
 
 
 class WrittenSurface:
-    """A frame at the start and at every tenth step."""
+    """A frame at the start and at every fourth step."""
 
     def __init__(self, scene: Scene, state: State, folder: Path) -> None:
         self._scene, self._steps = scene, 0
@@ -29,7 +29,7 @@ class WrittenSurface:
         self._steps += 1
         if broken:
             self._record.note(state.t)
-        if self._steps % 10 == 0:
+        if self._steps % 4 == 0:
             self._output.write(state, [])
 
     def result(self, name: str) -> dict[str, npt.NDArray[Any]]:
