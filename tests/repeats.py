@@ -21,6 +21,9 @@ REPEATS = (
     "test_ranks.py::test_a_rank_that_fails_alone_ends_all[1-not-converged",
     "test_ranks.py::test_a_rank_that_fails_alone_ends_all[1-exit",
     "test_ranks.py::test_a_rank_that_fails_alone_ends_all[0-disk",
+    # the same while Newton waits in a reduction; bad input on two ranks: their exit codes and words, in one start
+    "test_cli.py::test_a_fault_on_one_rank_ends_all",
+    "test_bad_input.py::test_one_message_of_two_processes",
     # sweeps: one that runs every case and then none, one that is stopped, the list
     "test_sweep.py::test_a_changed_study_is_run_again",
     "test_sweep.py::test_runs_on_two_ranks",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -322,14 +321,16 @@ def test_options_that_are_no_data_are_refused(options: Data, message: str) -> No
     assert "\n" not in str(refusal.value)
 
 
-def test_a_refused_option_runs_no_file(tmp_path: Path) -> None:
+def test_a_refused_option_runs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What used to: a class of Python beside the study, named by the study."""
     evil = tmp_path / "evil.py"
     evil.write_text("open('was-here', 'w').close()\nclass PC: pass\n")
     path = write_study(tmp_path / "bar.toml", BAR)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
     for name in ("check", "run"):
         options = ["--set", "solver.pc_type=python", "--set", "solver.pc_python_type=evil.PC"]
-        result = fracsim(name, path, *options, env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path)
+        result = fracsim(name, path, *options)
         assert result.returncode == 2
         assert result.stderr.count("fracsim: ") == 1 and 'solver.pc_type = "python"' in result.stderr
     assert sorted(each.name for each in tmp_path.iterdir() if each.name != "__pycache__") == ["bar.toml", "evil.py"]

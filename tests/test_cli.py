@@ -99,9 +99,10 @@ def test_check_tells_of_plasticity() -> None:
 # --- a scene costs only what it uses --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scheme", ("backward-euler", "explicit"))
-def test_a_scene_without_fracture_builds_none_of_it(tmp_path: Path, scheme: str) -> None:
-    bar = write_study(tmp_path / "bar.toml", BAR, time={"scheme": scheme})
+def test_a_scene_without_fracture_or_contact_builds_none_of_it(tmp_path: Path) -> None:
+    """Implicit and explicit."""
+    for scheme in (schemes := ("backward-euler", "explicit")):
+        write_study(tmp_path / f"{scheme}.toml", BAR, time={"scheme": scheme})
     code = f"""
 import sys
 from pathlib import Path
@@ -109,15 +110,18 @@ from mpi4py import MPI
 from fracsim.study.file import load_study
 from fracsim.run import Run
 from fracsim.scene import build_scene
-scene = build_scene(MPI.COMM_WORLD, load_study(Path({str(bar)!r})))
-Run(scene, Path({str(tmp_path / "out")!r}))()
+folder = Path({str(tmp_path)!r})
+for scheme in {schemes}:
+    scene = build_scene(MPI.COMM_WORLD, load_study(folder / (scheme + ".toml")))
+    Run(scene, folder / scheme)()
+    assert scene.balance.stress.chi is None and scene.fracture is None
 parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mechanics.plasticity")
 parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
 parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage")
-print(scene.balance.stress.chi, scene.fracture, [name for name in parts if "fracsim." + name in sys.modules])
+print([name for name in parts if "fracsim." + name in sys.modules], [name for name in sys.modules if "contact" in name])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout.splitlines()[-1] == "None None []"
+    assert result.stdout.splitlines()[-1] == "[] []"
 
 
 # --- mesh, list, render ---------------------------------------------------------------------------------------------

@@ -45,7 +45,9 @@ def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest
 
 def test_a_kernel_is_looked_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """What a process has loaded it finds without the folder that it came from; another form is not taken for it."""
-    monkeypatch.setattr(kernels, "jit_options", lambda: {"cache_dir": tmp_path / "a", "cffi_extra_compile_args": ["-O0"]})
+    monkeypatch.setattr(
+        kernels, "jit_options", lambda: {"cache_dir": tmp_path / "a", "cffi_extra_compile_args": ["-O0"]}
+    )
     square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
     x = ufl.SpatialCoordinate(square)
     for power in (4, 5):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, STRIP, changed, fracsim, study, write_study
+from cases import BAR, STRIP, changed, fracsim, fracsim_here, study, write_study
 from fracsim.errors import InputError
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
@@ -189,7 +189,7 @@ def test_a_sweep_of_another_study_does_not_throw_runs_away(tmp_path: Path) -> No
     write_study(bar, BAR, material={"young": 2e6})
     before = contents(out)
     for more in ((), ("--list",)):
-        refused = fracsim(*arguments, *more)
+        refused = fracsim_here(*arguments, *more)  # starts nothing
         assert refused.returncode == 2 and "a run of another study that has not ended left a" in refused.stderr
     assert contents(out) == before
     assert fracsim(*arguments, "--list", "--overwrite").stdout.strip().endswith("h-0.25 --overwrite")

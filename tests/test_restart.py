@@ -467,7 +467,7 @@ def test_monitors_go_on_with_a_restart(tmp_path: Path) -> None:
     assert found["peak_reactions"]["reaction_grip_x"] == part["peak_reactions"]["reaction_grip_x"] > 0
     for key in ("wall", "cpu"):
         assert found[key] > part[key] > 0, key
-    for key in ("setup", "solve", "energies", "output"):
+    for key in ("setup", "solve", "energies"):  # a checkpoint does not know how long it takes itself, which is output
         assert found["seconds"][key] >= part["seconds"][key] > 0, key  # equal where a stage takes less than is printed
     assert sum(found["seconds"].values()) > sum(part["seconds"].values())
     assert found["peak_memory_MiB"] >= part["peak_memory_MiB"]

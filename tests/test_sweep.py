@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from cases import BAR, command, fracsim, mpirun, write_study
+from cases import BAR, command, fracsim, fracsim_here, mpirun, write_study
 from fracsim.errors import InputError
 from fracsim.report.exit_status import last_words
 from fracsim.report.sweep import combinations, name_of, split_list
@@ -88,7 +88,7 @@ def test_a_sweep_runs_every_case_and_then_none_again(tmp_path: Path) -> None:
         summary = json.loads((out / row["case"] / "summary.json").read_text())
         assert float(row["peak_reaction_grip_x"]) == summary["peak_reactions"]["reaction_grip_x"] > 0
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
-    again = fracsim("sweep", bar, *keys, "-o", out)
+    again = fracsim_here("sweep", bar, *keys, "-o", out)  # starts nothing
     assert again.returncode == 0 and again.stdout.count("done before") == 2
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
 
@@ -128,7 +128,7 @@ def test_the_last_words_are_the_programs_own_where_it_spoke(log: str, words: str
 def test_nothing_runs_where_one_combination_is_wrong(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ("--set", "mesh.h=0.25,-1")
-    done = fracsim("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
+    done = fracsim_here("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
     assert done.returncode == 2 and "h--1" in done.stderr and "Nothing was run" in done.stderr
     assert not out.exists()
 

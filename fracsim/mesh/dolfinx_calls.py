@@ -12,8 +12,8 @@ Run with 0.9 alone; the rest is from the sources, release notes and pull request
 0.11        evaluate            Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
 after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is gone (4403).
 
-any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives the same element.
-            keep_kernels        takes the place of a function of FFCx 0.9; without it kernels are found alike, more slowly.
+any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
+            keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
 Nothing was found of the others: assemble_into, apply_lifting, expanded_csr, create_matrix.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
@@ -88,7 +88,7 @@ def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
 
 
 def keep_kernels() -> None:
-    """Have FFCx look for a kernel once a process: it reads its folder through for each, 1 ms where it holds 1,000 files."""
+    """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files."""
     look_up, kept = jit.get_cached_module, {}
 
     def looked_up_once(name: str, objects: Sequence[str], folder: Any, timeout: int) -> tuple[Any, Any]:
