@@ -73,9 +73,14 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_page_needs_nothing_else(runs: Path, tmp_path: Path) -> None:
-    target = make_report([runs / "sweep", runs / "strip"], tmp_path / "page.html", references=[])
-    text, page = target.read_text(), parsed(target)
+@pytest.fixture(scope="module")
+def whole(runs: Path) -> Path:
+    """The report of all of them."""
+    return make_report([runs / "sweep", runs / "strip"], runs / "whole" / "page.html", references=[])
+
+
+def test_the_page_needs_nothing_else(whole: Path) -> None:
+    text, page = whole.read_text(), parsed(whole)
     assert page.fetched == [] and "http" not in text and "<script" not in text and "@import" not in text
     assert "url(" not in re.sub(r"url\(#\w+\)", "", text)
     assert text.count("<svg") >= 8
@@ -84,9 +89,8 @@ def test_the_page_needs_nothing_else(runs: Path, tmp_path: Path) -> None:
     assert referred and all(page.ids.count(name) == 1 for name in referred)
 
 
-def test_the_numbers_are_those_of_the_runs(runs: Path, tmp_path: Path) -> None:
-    make_report([runs / "sweep", runs / "strip"], tmp_path / "page.html", references=[])
-    found = {row["run"]: row for row in table(tmp_path / "page" / "runs.csv")}
+def test_the_numbers_are_those_of_the_runs(runs: Path, whole: Path) -> None:
+    found = {row["run"]: row for row in table(whole.parent / "page" / "runs.csv")}
     assert len(found) == 3
     for name, folder in (("h-0.125", runs / "sweep" / "h-0.125"), ("strip", runs / "strip")):
         summary, row = json.loads((folder / "summary.json").read_text()), found[name]
