@@ -6,8 +6,7 @@
     check.check_mesh(mesh)                                  named or mended, before anything is solved
     quality.mesh_quality(mesh)                              numbers that tell a good mesh from a bad one
 
-Importing this needs NumPy only: gmsh, meshio and SciPy are imported by the modules that use them, gmsh and meshio only
-when called, on the process that calls.
+Importing this needs NumPy only: gmsh, meshio and SciPy are imported when they are called, on the process that calls.
 """
 
 from __future__ import annotations

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from .data import Indices
 
@@ -15,6 +13,10 @@ def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices
 
     Parts are numbered by their lowest node.
     """
+    # not by the process that fills a surface, which takes longer to import SciPy than most surfaces to be filled
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
     parts, label = connected_components(graph, directed=False)
     return int(parts), label.astype(np.int64)

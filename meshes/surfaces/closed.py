@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..components import components
 from ..contents import Block
@@ -138,6 +137,8 @@ def _check_points(points: Points, triangles: Indices, source: str) -> None:
 
 def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
     """Points at the same place made one (STL repeats every corner); triangles that collapse thereby are left out."""
+    from scipy.spatial import cKDTree  # as in components: not needed to fill what has been read
+
     used, triangles = np.unique(triangles, return_inverse=True)
     points, triangles = points[used], triangles.reshape(-1, 3)
     points, number = np.unique(points, axis=0, return_inverse=True)
