@@ -52,7 +52,7 @@ class KeptCell(_BlockedElement):
     @cached_property
     def cell(self) -> ufl.Cell:
         """Cell of the element."""
-        return _BlockedElement.cell.fget(self)
+        return super().cell
 
 
 def coordinate_element(dim: int) -> KeptCell:
@@ -89,7 +89,8 @@ def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
 
 def keep_kernels() -> None:
     """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files."""
-    look_up, kept = jit.get_cached_module, {}
+    look_up = jit.get_cached_module
+    kept: dict[tuple[str, tuple[str, ...], str], tuple[Any, Any]] = {}
 
     def looked_up_once(name: str, objects: Sequence[str], folder: Any, timeout: int) -> tuple[Any, Any]:
         key = name, tuple(objects), str(folder)
