@@ -9,7 +9,7 @@ import subprocess
 import tomllib
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from unittest import mock
 
 import pytest
@@ -135,6 +135,23 @@ def fracsim_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     with mock.patch("sys.argv", words), output[0], output[1], pytest.raises(SystemExit) as end:
         cli.main()
     return subprocess.CompletedProcess(words, int(end.value.code or 0), said.getvalue(), warned.getvalue())
+
+
+def swept_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """A sweep in this process, and its runs too: for tests of what it makes of their ends, not of how they start."""
+    with mock.patch("fracsim.report.sweep.subprocess.Popen", _RunHere):
+        return fracsim_here("sweep", *arguments)
+
+
+class _RunHere:
+    """What a sweep asks of a process."""
+
+    def __init__(self, work: list[str], stdout: IO[str], **_: Any) -> None:
+        self._done = fracsim_here(*work[1:])
+        stdout.write(self._done.stdout + self._done.stderr)
+
+    def wait(self) -> int:
+        return self._done.returncode
 
 
 def mpirun(ranks: int) -> list[str]:

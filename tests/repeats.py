@@ -24,8 +24,7 @@ REPEATS = (
     # the same while Newton waits in a reduction; bad input on two ranks: their exit codes and words, in one start
     "test_cli.py::test_a_fault_on_one_rank_ends_all",
     "test_bad_input.py::test_one_message_of_two_processes",
-    # sweeps: one that runs every case and then none, one that is stopped, the list
-    "test_sweep.py::test_a_changed_study_is_run_again",
+    # sweeps in processes of their own: one that is stopped
     "test_sweep.py::test_runs_on_two_ranks",
     # whose a folder is: on one process
     "test_own_files.py::test_a_folder_of_the_users_is_left_alone[2]",

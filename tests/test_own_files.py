@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, STRIP, changed, fracsim, fracsim_here, study, write_study
+from cases import BAR, STRIP, changed, fracsim, fracsim_here, study, swept_here, write_study
 from fracsim.errors import InputError
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
@@ -177,7 +177,7 @@ def test_a_sweep_leaves_folders_of_the_users_alone(tmp_path: Path) -> None:
     for name in ("log.txt", "mine.txt"):
         (out / "h-0.125" / name).write_text("mine")
     before = contents(out)
-    result = fracsim("sweep", bar, "--set", "mesh.h=0.25,0.125", "-o", out)
+    result = fracsim_here("sweep", bar, "--set", "mesh.h=0.25,0.125", "-o", out)  # starts nothing
     assert result.returncode == 2 and "h-0.125: the folder holds what fracsim did not write (mine.txt)" in result.stderr
     assert contents(out) == before
 
@@ -193,5 +193,5 @@ def test_a_sweep_of_another_study_does_not_throw_runs_away(tmp_path: Path) -> No
         assert refused.returncode == 2 and "a run of another study that has not ended left a" in refused.stderr
     assert contents(out) == before
     assert fracsim(*arguments, "--list", "--overwrite").stdout.strip().endswith("h-0.25 --overwrite")
-    assert fracsim(*arguments, "--overwrite").returncode == 0
+    assert swept_here(*arguments[1:], "--overwrite").returncode == 0
     assert json.loads((out / "h-0.25" / "summary.json").read_text())["outcome"] == "done"

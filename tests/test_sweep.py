@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from cases import BAR, command, fracsim, fracsim_here, mpirun, write_study
+from cases import BAR, command, fracsim, fracsim_here, mpirun, swept_here, write_study
 from fracsim.errors import InputError
 from fracsim.report.exit_status import last_words
 from fracsim.report.sweep import combinations, name_of, split_list
@@ -78,7 +78,7 @@ def test_what_is_no_sweep(sets: list[str], words: str, tmp_path: Path) -> None:
 def test_a_sweep_runs_every_case_and_then_none_again(tmp_path: Path) -> None:
     bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
     keys = ("--set", "mesh.h=0.25", "--set", "time.step=0.01,0.015")
-    done = fracsim("sweep", bar, *keys, "-o", out)
+    done = swept_here(bar, *keys, "-o", out)
     assert done.returncode == 0, done.stderr
     table = rows(out)
     assert [(row["mesh.h"], row["time.step"], row["steps"]) for row in table] == [
@@ -95,16 +95,16 @@ def test_a_sweep_runs_every_case_and_then_none_again(tmp_path: Path) -> None:
 
 def test_a_changed_study_is_run_again(tmp_path: Path) -> None:
     bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
-    fracsim("sweep", bar, "--set", "mesh.h=0.25", "-o", out)
+    swept_here(bar, "--set", "mesh.h=0.25", "-o", out)
     write_study(bar, BAR, material={"young": 2e6})
-    assert "done before" not in fracsim("sweep", bar, "--set", "mesh.h=0.25", "-o", out).stdout
+    assert "done before" not in swept_here(bar, "--set", "mesh.h=0.25", "-o", out).stdout
 
 
 def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
     """A solver that may take no Newton iteration does not converge; the next one does."""
     out = tmp_path / "out"
     options = ("--set", "solver.snes_max_it=0,20", "--set", "time.adapt=false")
-    done = fracsim("sweep", write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
+    done = swept_here(write_study(tmp_path / "bar.toml", BAR), *options, "-o", out)
     assert done.returncode == 3
     assert (
         "1 of 2 runs did not end well: snes_max_it-0_adapt-false (not converged: no solution at t = 0.01" in done.stderr
@@ -164,7 +164,7 @@ def test_a_stopped_sweep_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     named = fracsim(*arguments, "--set", "material.young=1e6", "--list").stdout
     assert "--restart" not in named, "the same study by another name has folders of its own"
     first = history.read_text().splitlines()[: steps + 1]
-    assert fracsim(*arguments).returncode == 0
+    assert swept_here(*arguments[1:]).returncode == 0
     assert history.read_text().splitlines()[: steps + 1] == first, "the rows before the stop are those of that run"
     assert json.loads((out / "end-0.05" / "summary.json").read_text())["steps"] == 500
 
