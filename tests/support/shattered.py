@@ -13,7 +13,7 @@ from .torn import MESHES, TIGHT, Found, result_of
 STONE = {"young": 1.0, "poisson": 0.2, "density": 1.0}
 JERK_2D = [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.05]}]
 JERK_3D = [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.2, 0.0, 0.05]}]
-STEPS = {"scheme": "newmark", "step": 0.05, "end": 0.4}  # surfaces start in the first four steps
+STEPS = {"scheme": "newmark", "step": 0.05, "end": 0.25}  # surfaces start in the first four steps
 RUNS: dict[str, dict[str, Any]] = {
     "averaged": {
         "mesh": MESHES["2d"], "material": STONE | {"energy": "corotated"}, "boundary": JERK_2D, "time": STEPS,
@@ -47,7 +47,7 @@ RUNS: dict[str, dict[str, Any]] = {
             {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [["free", 0.0], ["free", 0.1]]}},
         ],
         "fracture": {"strength": 0.1}, "brittle": {"surfaces": 3},
-        "time": {"scheme": "quasi-static", "step": 0.125, "end": 0.75},
+        "time": {"scheme": "quasi-static", "step": 0.125, "end": 0.625},
     },
 }  # fmt: skip
 
