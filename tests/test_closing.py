@@ -129,7 +129,7 @@ def test_equal_bars_exchange_their_velocities(approach: str, energy: str) -> Non
     mesh = {"builder": "box", "size": [1.0, 0.0625], "h": 1 / 15.0}
     speed = 1e-3
     scene, state = bar(
-        approach, energy, mesh=mesh, time={"scheme": "newmark", "step": 0.005, "end": 1.6}, boundary=[],
+        approach, energy, mesh=mesh, time={"scheme": "newmark", "step": 0.01, "end": 1.6}, boundary=[],
     )  # fmt: skip
     x = scene.domain.nodes[: scene.domain.node_count, 0]
     left = x < 0.5
@@ -269,7 +269,7 @@ def edge_strains(X: Values, edges: npt.NDArray[np.integer]) -> tuple[Values, Val
 
 @pytest.mark.parametrize(("approach", "unilateral"), [("edge", False), ("edge", True), ("chi", True)])
 def test_explicit_steps_stay_stable_with_damage(approach: str, unilateral: bool) -> None:
-    """A body with two fifths of its edges broken vibrates for 2000 steps without gaining energy."""
+    """A body with two fifths of its edges broken vibrates for 500 steps without gaining energy: a step too long by 1 % makes e^100 of it."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.125, "pattern": "unstructured"},
         material=SOFT | {"energy": "linear", "poisson": 0.3},
@@ -284,7 +284,7 @@ def test_explicit_steps_stay_stable_with_damage(approach: str, unilateral: bool)
     scene.fracture.degradation.restore()
     state.v[:] = rng.uniform(-1e-3, 1e-3, len(state.v))
     state.settle()
-    energies = [report.kinetic + report.elastic for report in march(scene, state, 2000)]
+    energies = [report.kinetic + report.elastic for report in march(scene, state, 500)]
     assert max(energies) < 1.5 * energies[0]
 
 

@@ -46,7 +46,7 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
 
 def smoother(planes: int, given: dict[str, Any]) -> str:
     """PETSc's name of the smoother after some steps of a bar with that many cracks."""
-    scene, _ = shattered(0.025, planes, given, 4)
+    scene, _ = shattered(0.025, planes, given, 3)
     return str(scene.solver.snes.ksp.pc.getMGSmoother(1).getType())  # type: ignore[union-attr]
 
 

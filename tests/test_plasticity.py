@@ -128,7 +128,7 @@ def test_a_staggered_bar_pulls_too_hard_by_one_step() -> None:
     The deviator returns at a held shape, eps_p = (sigma - sigma_y) / (3 mu), and over a step eps_p = d: the force is
     too high by 3 mu d, that is of first order. Solved with its flow the same bar is on the curve (above).
     """
-    for steps in (80, 160):
+    for steps in (40, 80):
         scene, state = pulled([0, 4 * TINY], steps, "corotated", update="staggered")
         march(scene, state)
         assert stress(scene) - TINY * YOUNG == pytest.approx(3 * MU * 4 * TINY / steps, rel=0.01)
@@ -301,7 +301,7 @@ def test_stress_beyond_yield_decays_with_the_flow_rate(energy: str) -> None:
     """Held in shear, q - Y falls like exp(-nu t) at any step: q(t) = Y + (q_0 - Y) exp(-nu t), at large strain too."""
     F, rate, Y = np.array([[1, 0.3, 0], [0, 1, 0], [0, 0, 1.0]]), 3.0, 0.05
     q_0 = von_mises_of(law_of(ENERGIES[energy](MU, LAMBDA), 3).cauchy(F))
-    for dt in (0.1, 0.05, 0.5):
+    for dt in (0.1, 0.5):
         scene, state = homogeneous(energy, yield_stress=Y, flow_rate=rate)
         deform(scene, F)
         for _ in range(round(0.5 / dt)):
@@ -344,7 +344,7 @@ def test_plastic_volume_is_kept(energy: str) -> None:
 def test_the_result_converges_with_the_step() -> None:
     """Along a winding path, where backward Euler's return is not exact: first order."""
     found = []
-    for steps in (50, 100, 200, 400, 800):
+    for steps in (50, 100, 200, 400):
         scene, _ = homogeneous("neo-hookean", yield_stress=2e-3, hardening=0.05)
         led(scene, winding, steps)
         found.append(plastic_strain(scene)[0])
@@ -421,7 +421,7 @@ def test_quasi_static_dissipation_is_the_plastic_work() -> None:
 def test_energy_balance(scheme: str) -> None:
     """Work = elastic + kinetic + dissipated as dt -> 0, with most of the work gone into flow."""
     gaps = []
-    for steps in (100, 200, 400):
+    for steps in (100, 200):
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
             material=MATERIAL | {"energy": "neo-hookean"},

@@ -37,6 +37,13 @@ TEARING: Data = changed(
     STRIP, solver=SOLVER, fracture={"radius": 0.2}, damping={"mass": 1.0, "stiffness": 1e-4},
     output={"fields": ["damage", "chi", "piece"]},
 )  # fmt: skip
+# breaks in its third step and in its fourth
+DUCTILE: Data = changed(
+    TEARING, **DUCTILE_TABLES, boundary=[
+        {"on": "left", "fix": "xy"},
+        {"on": "right", "velocity": {"time": [0.0, 0.02], "value": [[0.0, 0.0], [1.2, 0.0]]}},
+    ],
+)  # fmt: skip
 # kept apart from `wall_step`, which is a time, and the iteration counts, which depend on the preconditioner's history
 PHYSICAL = [
     "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
@@ -152,22 +159,27 @@ def test_a_restart_with_other_schemes(tmp_path: Path, scheme: str) -> None:
     assert_same_run(tmp_path / "parts", tmp_path / "whole", columns)
 
 
-def test_a_flowing_body_goes_on(tmp_path: Path) -> None:
-    """F_p and the accumulated plastic strain are in the checkpoint, on other ranks too."""
-    data = changed(TEARING, **DUCTILE_TABLES)
-    summary = run(data, tmp_path / "whole")
-    assert summary["broken_edges"] > 0 and last_frame(tmp_path / "whole")["plastic_strain"].max() > 0.01
-    broken = history(tmp_path / "whole")["broken_edges"]
-    stopped_after(data, tmp_path / "parts", int(np.flatnonzero(broken)[0] + 1))
-    shutil.copytree(tmp_path / "parts", tmp_path / "ranks")
-    run(data, tmp_path / "parts", restart=True)
-    second = fracsim("run", write_study(tmp_path / "s.toml", data), "-o", tmp_path / "ranks", "--restart", ranks=2)
-    assert second.returncode == 0, second.stderr
-    for folder in ("parts", "ranks"):
-        assert_same_run(tmp_path / folder, tmp_path / "whole")
-        found, wanted = (last_frame(tmp_path / name)["plastic_strain"] for name in (folder, "whole"))
-        assert np.abs(found - wanted).max() < 1e-6 * wanted.max()
-    plain = {key: value for key, value in data.items() if key != "plasticity"} | {"output": TEARING["output"]}
+@pytest.fixture(scope="module")
+def flowed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A strip that yields and tears, without interruption."""
+    folder = tmp_path_factory.mktemp("flowed") / "out"
+    assert run(DUCTILE, folder)["broken_edges"] > 0 and last_frame(folder)["plastic_strain"].max() > 0.01
+    return folder
+
+
+def assert_same_flow(folder: Path, reference: Path) -> None:
+    """The same run, and the same plastic strain at its end."""
+    assert_same_run(folder, reference)
+    found, wanted = (last_frame(each)["plastic_strain"] for each in (folder, reference))
+    assert np.abs(found - wanted).max() < 1e-6 * wanted.max()
+
+
+def test_a_flowing_body_goes_on(tmp_path: Path, flowed: Path) -> None:
+    """F_p and the accumulated plastic strain are in the checkpoint."""
+    stopped_after(DUCTILE, tmp_path / "parts", int(np.flatnonzero(history(flowed)["broken_edges"])[0] + 1))
+    run(DUCTILE, tmp_path / "parts", restart=True)
+    assert_same_flow(tmp_path / "parts", flowed)
+    plain = {key: value for key, value in DUCTILE.items() if key != "plasticity"} | {"output": TEARING["output"]}
     with pytest.raises(InputError, match=r"the body in .* has flowed; the study needs its \[plasticity\] table"):
         run(plain, tmp_path / "parts", restart=True)
 
@@ -262,12 +274,13 @@ def test_a_restart_of_another_study_is_refused(tmp_path: Path, stopped: Path, ta
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
 
-def test_the_study_compared_is_that_of_the_checkpoint(tmp_path: Path, stopped: Path) -> None:
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_the_study_compared_is_that_of_the_checkpoint(tmp_path: Path, stopped: Path, ranks: int) -> None:
     """Not study.toml beside it, which may be what the user changed and gives as the study."""
     out = shutil.copytree(stopped, tmp_path / "out")
     path = out / "study.toml"
     path.write_text(path.read_text().replace("density = 1000.0", "density = 1500.0"))
-    result = fracsim("run", path, "-o", out, "--restart", ranks=2)
+    result = fracsim("run", path, "-o", out, "--restart", ranks=ranks)
     assert result.returncode == Exit.BAD_INPUT
     assert result.stderr.count("is of another study: material.density was 1000.0, is 1500.0. Only") == 1
     path.write_text(path.read_text().replace("density = 1500.0", "density = 1000.0"))
@@ -424,7 +437,7 @@ import fracsim.run
 build = fracsim.run.build_scene
 def slowly(*arguments):
     open({str(tmp_path)!r} + f"/ready-{{os.getpid()}}", "w").close()
-    time.sleep(1.5)
+    time.sleep({1.5 if ranks else 0.5})
     return build(*arguments)
 fracsim.run.build_scene = slowly
 sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]
@@ -554,15 +567,19 @@ def signalled(folder: Path, name: str, ranks: int) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("ranks", [0, pytest.param(3, marks=pytest.mark.ranks)])
-def test_a_checkpoint_of_two_ranks_goes_on_with_others(tmp_path: Path, whole: Path, ranks: int) -> None:
-    """Two ranks up to the first step that breaks edges, with a checkpoint after every step; then to the end."""
-    strip, out = write_study(tmp_path / "strip.toml", TEARING), tmp_path / "out"
-    broken = history(whole)["broken_edges"]
+def test_a_checkpoint_of_two_ranks_goes_on_with_others(tmp_path: Path, flowed: Path, ranks: int) -> None:
+    """From one rank to two ranks after two steps; up to the first step that breaks edges, with a checkpoint after every
+    step; then to the end on others. The yielding strip: F_p, damage and all else change ranks twice."""
+    strip, out = write_study(tmp_path / "strip.toml", DUCTILE), tmp_path / "out"
+    broken = history(flowed)["broken_edges"]
     steps = int(np.flatnonzero(broken)[0] + 1)
-    part = ["--set", f"time.end={0.005 * steps}"]
-    first = fracsim("run", strip, "-o", out, *part, "--set", "output.checkpoint=1e-9", ranks=2)
+    stopped_after(DUCTILE, out, 2)
+    assert steps > 2
+    part = ["--set", f"time.end={0.005 * steps}", "--set", "output.checkpoint=1e-9"]
+    first = fracsim("run", strip, "-o", out, "--restart", *part, ranks=2)
     assert first.returncode == 0, first.stderr
+    assert first.stdout.count("Results in") == 1 and f"{steps} steps to t = " in first.stdout
     assert history(out)["broken_edges"][-1] == broken[steps - 1]
     second = fracsim("run", strip, "-o", out, "--restart", ranks=ranks)
     assert second.returncode == 0, second.stderr
-    assert_same_run(out, whole)
+    assert_same_flow(out, flowed)

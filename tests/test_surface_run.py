@@ -167,9 +167,9 @@ def test_the_range_of_the_colours() -> None:
 
 def test_an_animation_moves(tmp_path: Path) -> None:
     """A GIF with a picture a frame, the first unlike the last."""
-    run(changed(TEARING, output={"every": 5}), tmp_path / "run")
+    run(changed(TEARING, output={"every": 10}), tmp_path / "run")
     frames = picture(render(tmp_path / "run", tmp_path / "all.gif"))
-    assert len(frames) == len(find_frames(tmp_path / "run")) == 3
+    assert len(frames) == len(find_frames(tmp_path / "run")) == 2
     assert np.any(frames[0] != frames[-1])
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -59,9 +60,10 @@ for changed, line in json.load(open("lines.json")):
 STEPS, DT, G = 20, 0.01, 9.81
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The one file, and a body that falls freely."""
+    tmp_path = tmp_path_factory.mktemp("toy")
     (tmp_path / "theta.py").write_text(THETA)
     falling = changed(STRIP, fracture=None, boundary=[], load={"gravity": [0.0, -G]})
     falling |= {"probe": [{"name": "tip", "point": [1.0, 0.25]}], "output": {"every": 100, "picture": False}}
@@ -75,24 +77,39 @@ def command(folder: Path, *arguments: str, more: str = COMMAND) -> subprocess.Co
     return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
 
 
-def commands(folder: Path, *lines: tuple[list[str], list[str]]) -> list[dict[str, str]]:
-    """What a process answers to command lines, one after another, each with things that the scheme is not."""
-    (folder / "lines.json").write_text(json.dumps(lines))
+RUN, CHECK = ["run", "fall.toml", "-o"], ["check", "fall.toml"]
+# name -> (what the scheme is not, a command line)
+LINES: dict[str, tuple[list[str], list[str]]] = {
+    "half": ([], [*RUN, "0.5"]),
+    "three quarters": ([], [*RUN, "0.75", "--set", "time.theta=0.75"]),
+    "listed": ([], ["list"]),
+    "checked": ([], CHECK),
+    "refused": ([], [*CHECK, "--set", "time.theta=2.0"]),
+    "still": (["inertia"], CHECK),
+    "moving": (["inertia"], [*CHECK, "--set", "initial.velocity=[1, 0]"]),
+    "consistent": (["implicit"], [*CHECK, "--set", "time.mass=consistent"]),
+    "passes": (["implicit"], [*CHECK, "--set", "fracture={strength=1e9, passes=2}"]),
+}
+
+
+@pytest.fixture(scope="module")
+def answers(folder: Path) -> dict[str, dict[str, Any]]:
+    """What one process answers to all of them, one after another."""
+    (folder / "lines.json").write_text(json.dumps(list(LINES.values())))
     done = command(folder, str(TESTS), more="exec(" + repr(COMMANDS) + ")")
     assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return dict(zip(LINES, map(json.loads, done.stdout.splitlines()), strict=True))
 
 
-def test_a_toy_scheme_runs(folder: Path) -> None:
+def test_a_toy_scheme_runs(folder: Path, answers: dict[str, dict[str, Any]]) -> None:
     """Free fall: v_n = g t_n exactly, and u grows by dt g ((1 - theta) t_n + theta t_{n+1}) a step: after N of them
 
     u = g dt^2 (N^2 / 2 + (theta - 1/2) N);
 
     with theta = 3/4 this is neither the exact fall nor that of backward Euler (theta = 1).
     """
-    run = ["run", "fall.toml", "-o"]
-    for result in commands(folder, ([], [*run, "0.5"]), ([], [*run, "0.75", "--set", "time.theta=0.75"])):
-        assert result["returncode"] == 0, result["stderr"]
+    for name in ("half", "three quarters"):
+        assert answers[name]["returncode"] == 0, answers[name]["stderr"]
     for theta in (0.5, 0.75):
         with (folder / str(theta) / "history.csv").open() as file:
             last = list(csv.DictReader(file))[-1]
@@ -103,35 +120,26 @@ def test_a_toy_scheme_runs(folder: Path) -> None:
         assert (written["scheme"], written["theta"], written["rho"]) == ("toy", theta, 0.8)
 
 
-def test_a_toy_scheme_is_checked_and_listed(folder: Path) -> None:
-    check = ["check", "fall.toml"]
-    listed, checked, refused = commands(folder, ([], ["list"]), ([], check), ([], [*check, "--set", "time.theta=2.0"]))
-    assert "  toy                a toy\n" in listed["stdout"]
-    assert "(default)" in next(line for line in listed["stdout"].splitlines() if "generalized-alpha" in line)
-    assert "toy, 20 steps of 0.01 s" in checked["stdout"]
-    assert refused["returncode"] == 2
-    assert "time.theta = 2.0: must be less than or equal to 1" in refused["stderr"]
+def test_a_toy_scheme_is_checked_and_listed(answers: dict[str, dict[str, Any]]) -> None:
+    listed = answers["listed"]["stdout"]
+    assert "  toy                a toy\n" in listed
+    assert "(default)" in next(line for line in listed.splitlines() if "generalized-alpha" in line)
+    assert "toy, 20 steps of 0.01 s" in answers["checked"]["stdout"]
+    assert answers["refused"]["returncode"] == 2
+    assert "time.theta = 2.0: must be less than or equal to 1" in answers["refused"]["stderr"]
 
 
-def test_rules_follow_from_what_a_scheme_is(folder: Path) -> None:
+def test_rules_follow_from_what_a_scheme_is(answers: dict[str, dict[str, Any]]) -> None:
     """Not from its name: without inertia no initial velocity and every body held; explicit: lumped, and no passes."""
-    check = ["check", "fall.toml"]
-    still, moving, consistent, passes = commands(
-        folder,
-        (["inertia"], check),
-        (["inertia"], [*check, "--set", "initial.velocity=[1, 0]"]),
-        (["implicit"], [*check, "--set", "time.mass=consistent"]),
-        (["implicit"], [*check, "--set", "fracture={strength=1e9, passes=2}"]),
-    )
-    assert "nothing holds the body" in still["stderr"]
-    assert "[initial] sets a velocity" in moving["stderr"]
-    assert "explicit steps need mass" in consistent["stderr"]
-    assert "set passes = 1" in passes["stderr"]
+    assert "nothing holds the body" in answers["still"]["stderr"]
+    assert "[initial] sets a velocity" in answers["moving"]["stderr"]
+    assert "explicit steps need mass" in answers["consistent"]["stderr"]
+    assert "set passes = 1" in answers["passes"]["stderr"]
 
 
-def test_two_schemes_cannot_disagree_about_a_key(folder: Path) -> None:
-    (folder / "theta.py").write_text(THETA.replace("theta: float", "rho: float"))
-    result = command(folder, more="import fracsim.study")
+def test_two_schemes_cannot_disagree_about_a_key(tmp_path: Path) -> None:
+    (tmp_path / "theta.py").write_text(THETA.replace("theta: float", "rho: float"))
+    result = command(tmp_path, more="import fracsim.study")
     assert "TypeError: Theta.rho: [time] has this key already, with other limits" in result.stderr
 
 
