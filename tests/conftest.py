@@ -58,8 +58,9 @@ def meshes_built_once() -> Iterator[None]:
 
 # The longest first, so that no worker is left alone with one of them at the end.
 FIRST = (
-    "test_restart", "test_plasticity", "test_studies", "test_surface_run", "test_meshes_builders",
-    "test_fracture", "test_closing", "test_meshes_fill", "test_sweep", "test_own_files", "test_cannot_write",
+    "test_restart", "test_meshes_builders", "test_plasticity", "test_obstacles", "test_ranks", "test_own_files",
+    "test_fracture", "test_closing", "test_free_obstacles", "test_meshes_fill", "test_studies", "test_cannot_write",
+    "test_sweep", "test_itself", "test_apart", "test_surface_run", "test_output", "test_cracked_solver",
 )  # fmt: skip
 
 

@@ -55,11 +55,14 @@ REPEATS = (
     "test_meshes_builders.py::test_cells_are_estimated[figure-0.4",
     "test_meshes_builders.py::test_plane_groups_lie_on_their_planes[figure-0.4",
     "test_meshes_builders.py::test_a_hollow_figure_is_nowhere_thinner_than_its_wall",
-    # plane strain against 3D: neo-hookean, and corotated by its closed form in both
+    # plane strain against 3D: neo-hookean; corotated and stvk by their closed forms in both
     "test_energies.py::test_plane_strain_is_3d_at_unit_thickness_stretch[corotated]",
+    "test_energies.py::test_plane_strain_is_3d_at_unit_thickness_stretch[stvk]",
     "test_patch.py::test_static_patch[corotated-2]",
     "test_patch.py::test_static_patch[stvk-2]",
     # further energies of plasticity: neo-hookean, the default
+    "test_plasticity.py::test_stress_beyond_yield_decays_with_the_flow_rate[corotated]",
+    "test_plasticity.py::test_stress_beyond_yield_decays_with_the_flow_rate[stvk]",
     "test_plasticity.py::test_plastic_volume_is_kept[corotated]",
     "test_plasticity.py::test_plastic_volume_is_kept[stvk]",
     "test_plasticity.py::test_a_step_is_solved_with_the_last_flow_once_more[corotated]",
@@ -71,6 +74,9 @@ REPEATS = (
     "test_fracture.py::test_energy_balance_of_dynamic_fracture[edge-newmark]",
     "test_fracture.py::test_energy_balance_of_dynamic_fracture[chi-newmark]",
     "test_closing.py::test_explicit_steps_stay_stable_with_damage[edge-True]",
+    # bars that meet: neo-hookean, and linear with both approaches
+    "test_closing.py::test_equal_bars_exchange_their_velocities[chi-corotated]",
+    "test_closing.py::test_equal_bars_exchange_their_velocities[chi-stvk]",
     # free obstacles: generalized-alpha of Newmark and backward Euler; a mass between a heavy and a light one
     "test_free_obstacles.py::test_an_isolated_pair_keeps_its_momentum[generalized-alpha]",
     "test_free_obstacles.py::test_a_free_striker_faster_than_its_step_does_not_tunnel[0.1]",

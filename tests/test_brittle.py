@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -415,18 +413,6 @@ def test_several_passes_open_surfaces_one_after_the_other() -> None:
 
 
 # --- what is off, and what is wrong ---------------------------------------------------------------------------------
-
-
-def test_a_study_without_brittle_and_radius_imports_nothing_of_them() -> None:
-    """R = 0 is local: there is no matrix of an average."""
-    code = (
-        "import sys; sys.path.insert(0, 'tests'); from support.scenes import make_scene, march;"
-        "scene, state = make_scene(fracture={'strength': 1.0, 'radius': 0.0}); march(scene, state, 1);"
-        "assert not hasattr(scene.fracture.criterion, 'starts');"
-        "assert not [name for name in sys.modules if name.startswith('fracsim.fracture.brittle')];"
-        "assert 'fracsim.fracture.nonlocal_average' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], timeout=100)
 
 
 @pytest.mark.parametrize(

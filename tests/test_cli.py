@@ -99,8 +99,10 @@ def test_check_tells_of_plasticity() -> None:
 # --- a scene costs only what it uses --------------------------------------------------------------------------------
 
 
-def test_a_scene_without_fracture_or_contact_builds_none_of_it(tmp_path: Path) -> None:
-    """Implicit and explicit."""
+def test_a_scene_builds_nothing_that_its_study_does_not_ask_for(tmp_path: Path) -> None:
+    """Implicit and explicit without fracture and contact; then with fracture, but without brittle surfaces and radius:
+    R = 0 is local, so that there is no matrix of an average."""
+    write_study(tmp_path / "local.toml", STRIP, fracture={"radius": 0.0}, time={"end": 0.005})
     for scheme in (schemes := ("backward-euler", "explicit")):
         write_study(tmp_path / f"{scheme}.toml", BAR, time={"scheme": scheme})
     code = f"""
@@ -119,9 +121,14 @@ parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mecha
 parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
 parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage")
 print([name for name in parts if "fracsim." + name in sys.modules], [name for name in sys.modules if "contact" in name])
+scene = build_scene(MPI.COMM_WORLD, load_study(folder / "local.toml"))
+Run(scene, folder / "local")()
+parts = ("fracture.brittle", "fracture.nonlocal_average")
+parts = tuple("fracsim." + name for name in parts)
+print(hasattr(scene.fracture.criterion, "starts"), [name for name in sys.modules if name.startswith(parts)])
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout.splitlines()[-1] == "[] []"
+    assert [line for line in result.stdout.splitlines() if line.endswith("]")] == ["[] []", "False []"]
 
 
 # --- mesh, list, render ---------------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def test_a_free_grain_of_equal_weights_is_a_polygon() -> None:
     others, counted on a fine lattice; within 3 %: corners of the polygon lie inside cells, which lose them."""
     made, grains, _ = opened(2)
     freed = least(made.opened.starts[:1], grains.seeds, grains.weights)[0][0]
-    x, y = np.meshgrid((np.arange(1000) + 0.5) / 1000, (np.arange(800) + 0.5) / 1000, indexing="ij")
+    x, y = np.meshgrid((np.arange(500) + 0.5) / 500, (np.arange(400) + 0.5) / 500, indexing="ij")
     share = (least(np.column_stack([x.ravel(), y.ravel()]), grains.seeds, grains.weights)[0] == freed).mean()
     piece = made.surface.piece_of_node[np.flatnonzero(grains.of_node == freed)[0]]
     assert made.volumes[piece] == pytest.approx(0.8 * share, rel=0.03)
