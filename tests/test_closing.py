@@ -269,7 +269,8 @@ def edge_strains(X: Values, edges: npt.NDArray[np.integer]) -> tuple[Values, Val
 
 @pytest.mark.parametrize(("approach", "unilateral"), [("edge", False), ("edge", True), ("chi", True)])
 def test_explicit_steps_stay_stable_with_damage(approach: str, unilateral: bool) -> None:
-    """A body with two fifths of its edges broken vibrates for 500 steps without gaining energy; with too long a step it would grow like a power."""
+    """A body with two fifths of its edges broken vibrates for 500 steps without gaining energy, which too long
+    a step would let grow like a power."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.125, "pattern": "unstructured"},
         material=SOFT | {"energy": "linear", "poisson": 0.3},
