@@ -23,11 +23,15 @@ STUDIES = sorted(folder().glob("*.toml"))
 # study -> its cell size for a run of a second or so
 COARSE = {
     "bar-2d": ["mesh.h=0.02"],
+    "bent-bar": ["mesh.h=0.01"],
     "cylinder": ["mesh.h=0.01"],
     "doormat": ["mesh.h=0.025"],
+    "dropped-vase": ["mesh.h=0.015"],
+    "hammered-vase": ["mesh.h=0.015"],
     "jelly-figure": ["mesh.h=0.015"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
+    "platens": ["mesh.h=0.01"],
     "struck-figure": ["mesh.h=0.015"],
     "struck-vase": ["mesh.h=0.012"],
     "wall": ["mesh.h=0.15"],
