@@ -34,12 +34,14 @@ ROUND_OFF = 1e-6  # of a pressure
 
 @dataclass(frozen=True)
 class Law:
-    """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s."""
+    """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s, or below the
+    share `of_speed` of the speed of the body, where that is more."""
 
     distance: float
     stiffness: float
     friction: float
     creep: float
+    of_speed: float = 0.0
 
 
 class Surface:

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from ...mesh.domain import Domain
-from ...mesh.ranks import from_root, on_root
+from ...mesh.ranks import from_root, on_root, total
 from ...mesh.split.places import Places
 from ...mesh.split.skeleton import Skeleton
 from ..coupling import Coupling
@@ -101,15 +101,20 @@ class SelfContact(Term):
         self._level, self._moved, self._rubbing = level, True, None
         if not level.dt:
             return
-        nodal = self._gathered(level.u)
+        nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
         if self._surface is not None and nodal is not None:
             self._surface.make_room(nodal)
             self._start = self._surface.at(nodal)
         if self.law.friction and self._surface is not None and self._start is not None:
-            x, slip = self._start, self.law.creep * level.dt
+            x, slip = self._start, creep * level.dt
             self._rubbing = self._surface.pairs.lag_friction(x, x, slip)
         if level.share < 1:
             self._before = (1 - level.share) * self._handed_down(self._start)
+
+    def _speed(self, v: Values) -> float:
+        """Root mean square of the nodes' speeds, m/s (collective)."""
+        squares, count = total(self.comm, np.array([v @ v, len(v) / self._domain.dim]))
+        return float(np.sqrt(squares / count))
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
