@@ -109,4 +109,4 @@ class Contact(Table):
     friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
     distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
     stiffness: Positive | None = None  # Pa; default 3 % of Young's modulus, obstacles a tenth
-    creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the body's size, 0.05 of its speed
+    creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the size, 0.05 of the speed
