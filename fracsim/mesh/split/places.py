@@ -28,7 +28,7 @@ class Places:
     """Where n points are, at shares of their arms; never changed.
 
     Attributes:
-        share: (n,) s.    rest: (n, d) X_s, m.    copies: (k,) points that have arms.
+        share: (n,) s.    rest: (n, d) X_s, m.
     """
 
     def __init__(
@@ -39,8 +39,13 @@ class Places:
         self._mean, self._middle, self._arms, self._out = mean, middle, arms, out
         self.share = np.ones(len(middle)) if share is None else share
         self.rest: Values = middle + self.share[:, None] * out
-        # a point in the middle of its nodes has arms that cancel each other until the body is deformed
-        self.copies: Ints = np.flatnonzero(np.any(out != 0, axis=1) | (np.asarray(abs(arms).sum(axis=1)).ravel() > 0))
+
+    @cached_property
+    def copies(self) -> Ints:
+        """(k,) points that have arms: also those in the middle of their nodes, whose arms cancel each other until the
+        body is deformed."""
+        armed = np.asarray(abs(self._arms).sum(axis=1)).ravel() > 0
+        return np.flatnonzero(np.any(self._out != 0, axis=1) | armed)
 
     @cached_property
     def weights(self) -> csr_matrix:
