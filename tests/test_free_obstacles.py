@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from mpi4py import MPI
 from pydantic import ValidationError
 
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.free_obstacles import FreeObstacles
-from fracsim.run import Run
-from fracsim.scene import Scene, build_scene
+from fracsim.scene import Scene
 from fracsim.study.check import check_study
+from support.resumed import going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene, make_study, march, positions
 
 Values = npt.NDArray[np.float64]
@@ -269,16 +268,7 @@ def test_a_step_from_an_earlier_state_is_the_same_step() -> None:
 
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     """Stopped in the middle of the blow: the same columns of history.csv, but for what the solver leaves."""
-    going, folder = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), tmp_path / "going"), tmp_path / "stopped"
-    stopped = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), folder)
-    for run in (going, stopped):
-        for _ in range(3):
-            run.step()
-    stopped.checkpoint()
-    again = Run(build_scene(MPI.COMM_SELF, make_study(**STRUCK)), folder, restart=True)
-    for run in (going, again):
-        for _ in range(2):
-            run.step()
+    going, _, again = going_stopped_resumed(STRUCK, tmp_path, 3, 2)
     assert told(again.scene) == pytest.approx(told(going.scene), rel=1e-9, abs=1e-9)
     assert again.state.dissipated == pytest.approx(going.state.dissipated, rel=1e-9)
     assert told(going.scene)["contact_it_y"] != 0

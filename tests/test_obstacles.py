@@ -17,6 +17,7 @@ from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.split.local import Following, LocalSurface
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
+from support.resumed import going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene, make_study, march, positions
 from support.torn import RUNS
 
@@ -273,17 +274,8 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
         "solver": FINE,
         "output": {"picture": False},
     }
-    going, folder = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "going"), tmp_path / "stopped"
-    stopped = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), folder)
-    for run in (going, stopped):
-        for _ in range(6):
-            run.step()
-    stopped.checkpoint()
-    assert going.breaks.figures[0] > 0
-    again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), folder, restart=True)
-    for run in (going, again):
-        for _ in range(2):
-            run.step()
+    going, stopped, again = going_stopped_resumed(tables, tmp_path, 6, 2)
+    assert stopped.breaks.figures[0] > 0
     assert again.breaks.figures == going.breaks.figures
     for name in ("work", "dissipated", "elastic"):
         assert getattr(again.state, name) == pytest.approx(getattr(going.state, name), rel=1e-6)
