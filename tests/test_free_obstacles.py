@@ -42,7 +42,7 @@ def told(scene: Scene) -> dict[str, float]:
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
     """(d,) linear and (1,) or (3,) angular momentum about the origin of body and obstacle."""
-    d, (flight,) = scene.domain.dim, contact_of(scene).flights.values()
+    d, (flight,) = scene.domain.dim, [each.flight for each in contact_of(scene).free.values()]
     mass = scene.balance.mass.lumped.reshape(-1, d)[:, :1]
     x, v = positions(scene) + state.u.reshape(-1, d), state.v.reshape(-1, d)
     rows = [(x, mass * v), (flight.pose.centre[None], flight.momentum[None, :d])]
@@ -153,7 +153,7 @@ def test_angular_momentum_is_kept_to_the_order_of_the_scheme() -> None:
         after = momenta(scene, state)
         np.testing.assert_allclose(after[0], linear, atol=1e-8 * 10)
         lost.append(np.abs(after[1] - angular).max())
-    assert np.linalg.norm(linear - contact_of(scene).flights[0].momentum[:3]) > 5  # most of it has changed hands
+    assert np.linalg.norm(linear - contact_of(scene).free[0].flight.momentum[:3]) > 5  # most of it has changed hands
     assert lost[1] < lost[0] / 3 and lost[1] < 5e-3 * np.linalg.norm(angular)
 
 
@@ -186,7 +186,7 @@ def test_a_weight_dropped_on_a_block_comes_to_rest() -> None:
                    "velocity": [0.0, -1.0]}],
         time={"scheme": "backward-euler", "step": 0.02, "end": 1.0},
     )  # fmt: skip
-    mass, impulse = contact_of(scene).free[0].mass, 0.0
+    mass, impulse = contact_of(scene).free[0].body.mass, 0.0
     assert mass == pytest.approx(400 * 0.12, rel=1e-2)
     for report in each_step(scene, state):
         impulse += told(scene)["contact_it_y"] * report.dt

@@ -49,7 +49,7 @@ def test_a_sphere_on_a_half_space(tmp_path: Path) -> None:
     )  # fmt: skip
     march(scene, state)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    touch = contact._touching()[0]
+    touch = contact.touching()[0]
     pressed, r = -touch.normal[:, 2], np.linalg.norm(contact.x[touch.points][:, :2], axis=1)
     total = 4 * pressed.sum()
     top = np.argmin(np.linalg.norm(positions(scene), axis=1))

@@ -256,9 +256,9 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    X = contact._surface.at.rest
+    X = contact.skin.rest
     inside = (X[:, 0] > 0.05) & (X[:, 0] < 0.95) & (X[:, 1] > 0.05) & (X[:, 1] < 0.45)
-    assert inside.sum() > 10 and contact.area[inside].min() > 0
+    assert inside.sum() > 10 and contact.skin.area[inside].min() > 0
 
 
 def test_an_obstacle_inside_the_body_is_refused() -> None:

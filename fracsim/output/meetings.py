@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from ..mechanics.contact.drawing import least_extent
 from ..mechanics.contact.obstacles import Obstacles
 from ..stepping.state import State
 
@@ -21,7 +22,7 @@ class Meetings:
 
     def __init__(self, contact: Obstacles) -> None:
         """`contact`: the term of the obstacles (collective)."""
-        self._contact, self._edge = contact, contact.edge
+        self._contact, self._edge = contact, contact.skin.edge
         self.gap = dict.fromkeys((each.name for each in contact.obstacles), (math.inf, 0.0))
         self.closed = dict.fromkeys(self.gap, (0.0, 0.0, 0.0))
 
@@ -49,11 +50,15 @@ class Meetings:
     def notes(self, *, done: bool) -> list[str]:
         """A sentence of each obstacle that has one; `done`: the run came to its end (collective)."""
         met = [name for name, (gap, _) in self.gap.items() if gap < self._contact.law.barrier.width]
-        closed, sizes = self._over_ranks(), zip(self.gap, self._contact.sizes(), strict=True)
+        closed, sizes = self._over_ranks(), zip(self.gap, self._sizes(), strict=True)
         missed = [self._missed(name) for name in self.gap if done and name not in met]
         small = [_too_small(name, size, self._edge) for name, size in sizes if size < self._edge]
         fast = [_too_fast(name, self._edge, *closed[name]) for name in met if closed[name][0] > self._edge]
         return [*missed, *small, *fast]
+
+    def _sizes(self) -> list[float]:
+        """The least extent of each obstacle, m; infinite of a plane and of one that the body is in."""
+        return [least_extent(each.shape) for each in self._contact.obstacles]
 
     def _over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`closed` of the rank where it is largest (collective)."""

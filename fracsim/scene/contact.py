@@ -9,8 +9,9 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..forms.schemes import Scheme
 from ..mechanics.contact.barrier import Barrier
+from ..mechanics.contact.law import Law
 from ..mechanics.contact.obstacle import Obstacle
-from ..mechanics.contact.obstacles import Law, Obstacles
+from ..mechanics.contact.obstacles import Obstacles
 from ..mechanics.contact.shapes import SHAPES, Shape
 from ..mechanics.material import MaterialFields
 from ..mechanics.term import Term

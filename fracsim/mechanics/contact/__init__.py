@@ -1,11 +1,13 @@
 """Contact with analytic obstacles, which need no mesh: a signed distance says how far a point is outside.
 
 obstacles         the term of the balance
+touching, touch   what touches in a step; barrier and friction at the points of a surface, by their law
+skin, course      the points that touch; obstacles on their ways
 obstacle          one that is held or driven
 free_obstacles    the term with obstacles that move by themselves; free_obstacle, shifted: one of them, on a hinge
+free_pose         where one of them belongs, with the body where it is
 rigid_step, push  its pose in a step as the least of an incremental potential; what contact does to the pose
 turn              rotation vectors that are not small
-touch             barrier and friction at the points of a surface
 reach             how far points may go, first guesses that have passed through nothing
 
 shapes            the register of shapes, by the name that a user writes
@@ -30,7 +32,8 @@ room, crowd       walls that come to light where there is no room: before obstac
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
 
-All but the terms and `reach` are NumPy and SciPy alone: no DOLFINx, no MPI. Every rank asks about its own points.
+All but the terms, what they alone use (touching, skin, course, free_pose) and `reach` are NumPy and SciPy alone: no
+DOLFINx, no MPI. Every rank asks about its own points.
 
 IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
 distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.

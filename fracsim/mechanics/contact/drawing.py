@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
 from ..drawn import Drawn
 from .axes import frame, unit
+from .obstacle import Obstacle
 from .placed import Placed
 from .plane import Plane
 from .shape import Shape
@@ -37,6 +41,23 @@ class Drawing:
     def __call__(self, placed: Placed) -> Drawn:
         """Where it is now."""
         return Drawn(placed.pose.points_to_space(self._points), self._triangles, self._segments)
+
+
+class Drawings:
+    """Of several obstacles, made once they are asked for."""
+
+    def __init__(self, obstacles: Sequence[Obstacle], lower: Values, upper: Values) -> None:
+        """`lower`, `upper`: corners of the body's box at the start, m."""
+        self._obstacles, self._box = obstacles, (lower, upper)
+
+    @cached_property
+    def _each(self) -> list[Drawing]:
+        return [Drawing(each.placed(0.0), *self._box) for each in self._obstacles]
+
+    def __call__(self, placed: Sequence[Placed]) -> dict[str, Drawn]:
+        """Each by its name, where it is now."""
+        each = zip(self._obstacles, self._each, placed, strict=True)
+        return {obstacle.name: drawing(here) for obstacle, drawing, here in each}
 
 
 def least_extent(shape: Shape) -> float:

@@ -15,6 +15,7 @@ last terms, those of the second-order turn, Newton would not be quadratic for a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,3 +72,8 @@ def second_order_turn(n: Values, y: Values) -> Values:
         return -along
     ny = n[:, :, None] * y[:, None, :]
     return (ny + ny.transpose(0, 2, 1)) / 2 - along * np.eye(3)
+
+
+def least_distance(obstacles: Sequence[Placed], x: Values) -> Values:
+    """(n,) of points x (n, d) to the nearest of several shapes, m."""
+    return np.asarray(np.min([placed.distance(x) for placed in obstacles], axis=0))

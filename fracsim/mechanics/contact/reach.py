@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +13,10 @@ from .barrier import longest_step
 from .motion import Motion
 from .obstacle import Obstacle
 from .placed import Placed
-
-if TYPE_CHECKING:
-    from .obstacles import Obstacles
+from .skin import Skin
 
 Values = npt.NDArray[np.float64]
+type Way = tuple[Placed, Values]  # where an obstacle begins, and the increment (p,) of its pose
 
 ROUNDS = 20  # in which points that follow several nodes are brought back
 
@@ -37,29 +36,29 @@ def safe_shares(placed: Placed, x: Values, moved: Values, q: Values) -> Values:
     return share
 
 
-def within_reach(contact: Obstacles, start: Values, end: Values) -> Values:
+def within_reach(skin: Skin, ways: Sequence[Way], start: Values, end: Values) -> Values:
     """(owned dofs,) of displacements at the start and a guess of the end of a step, the end with every point stopped
     where it would pass into an obstacle; from there on the obstacle takes it along (collective).
 
     Each point on its own: to shorten the step of the whole body would leave a driven obstacle inside it. A point of a
     crack follows several nodes, which it brings back with it.
     """
-    comm, x = contact.comm, contact.places(start)
+    x, follow = skin.places(start), skin.follow
     for _ in range(ROUNDS):
-        back, stopped = _brought_back(contact, x, contact.follow(end - start))
-        if not comm.allreduce(int(stopped.any())):
+        back, stopped = _brought_back(skin.area, ways, x, follow(end - start))
+        if not skin.comm.allreduce(int(stopped.any())):
             return end
-        weight = contact.follow.handed_down(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
-        change = contact.follow.handed_down(back)
+        weight = follow.handed_down(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
+        change = follow.handed_down(back)
         end = end + np.where(np.abs(weight) > 1e-3, change / np.where(np.abs(weight) > 1e-3, weight, 1.0), 0.0)
     return end
 
 
-def _brought_back(contact: Obstacles, x: Values, moved: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
+def _brought_back(area: Values, ways: Sequence[Way], x: Values, moved: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
     """(n, d) what is to be added to the ways of points, and which of them are stopped."""
     back, stopped = np.zeros_like(x), np.zeros(len(x), bool)
-    for placed, q in contact.ways():
-        share = np.where(contact.area > 0, safe_shares(placed, x, moved, q), 1.0)
+    for placed, q in ways:
+        share = np.where(area > 0, safe_shares(placed, x, moved, q), 1.0)
         held = share < 1
         back[held] = ((share - 1)[:, None] * (moved - q[: x.shape[1]]))[held]
         stopped |= held

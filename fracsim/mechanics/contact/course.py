@@ -1,0 +1,69 @@
+"""Where obstacles are in a step, and how far on their way: those that are jammed wait and come on bit by bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from .obstacle import Obstacle
+from .placed import Placed
+from .reach import safe_shares
+
+Values = npt.NDArray[np.float64]
+
+
+class Course:
+    """Obstacles on their ways.
+
+    Attributes:
+        placed, at_start: where each is, and was as the step began.    ways: (p,) increment of its pose in the step.
+        led: numbers of those whose way is known.
+    """
+
+    placed: list[Placed]
+    at_start: list[Placed]
+    ways: list[Values]
+
+    def __init__(self, obstacles: Sequence[Obstacle], led: list[int]) -> None:
+        self._obstacles, self.led = obstacles, led
+        self._gone = 1.0  # share of their way
+
+    def begin(self, start: float, end: float) -> None:
+        """A step between these times, s, or a look at a state at `end`."""
+        self.placed = [each.placed(end) for each in self._obstacles]
+        self.at_start = [each.placed(start) for each in self._obstacles]
+        self.ways = [each.way(start, end) for each in self._obstacles]
+        self._gone = 1.0
+
+    def put_at_start(self, number: int, placed: Placed) -> None:
+        """One whose way is not known yet stays where it began."""
+        self.placed[number] = self.at_start[number] = placed
+
+    def known(self) -> list[tuple[Placed, Values]]:
+        """Where each obstacle whose way is known is at the start of the step, and its way (p,) to the end."""
+        return [(self.at_start[number], self.ways[number]) for number in self.led]
+
+    def back_to_start(self) -> None:
+        """None has gone any of its way."""
+        self._gone = 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all have gone all of their way."""
+        return self._gone == 1
+
+    def go_on(self, x: Values, least: Callable[[Values], float]) -> None:
+        """A share of the rest of the way that is safe with points at x (n, d); `least`: of shares (n,), on all ranks
+        (collective)."""
+        rest, still = 1 - self._gone, np.zeros_like(x)
+        shares = [safe_shares(self._after(*way), x, still, rest * way[1]) for way in self.known()]
+        share = least(np.min(shares, axis=0)) if shares else 1.0
+        self._gone = 1.0 if share == 1 else self._gone + share * rest
+        for number, way in zip(self.led, self.known(), strict=True):
+            self.placed[number] = self._after(*way)
+
+    def _after(self, placed: Placed, way: Values) -> Placed:
+        """Where one that began at `placed` is now."""
+        return Placed(placed.shape, placed.pose.moved(self._gone * way))

@@ -1,0 +1,190 @@
+"""Where a free obstacle is in a step, with the body where it is: what is left of it once its pose is eliminated.
+
+The pose is the least of the incremental potential Phi (rigid_step), found on ways that pass through nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ...mesh.ranks import total
+from .free_obstacle import Flight, FreeObstacle
+from .placed import Placed
+from .push import Push, by_point_and_pose, on_obstacle, push
+from .reach import safe_shares
+from .rigid_step import RigidStep
+from .skin import Skin
+from .touch import Grip, Touch
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Around:
+    """The body around an obstacle.
+
+    Attributes:
+        skin: its points.    x: (n, d) where they are, m.    feel: what the obstacle does to them at a place.
+    """
+
+    skin: Skin
+    x: Values
+    feel: Callable[[Placed], Touch]
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A step of Newton's method that is under way: from points at x (n, d) by `moved`, from z by `dz`."""
+
+    x: Values
+    moved: Values
+    z: Values
+    dz: Values
+
+
+class FreePose:
+    """A free obstacle, and its pose.
+
+    Attributes:
+        flight: how it moves, at the start of a step until it is over.    step: the one that began last.
+        z: (k,) its way in the step.    placed: where it is.
+    """
+
+    step: RigidStep
+    z: Values
+    placed: Placed
+
+    def __init__(self, body: FreeObstacle) -> None:
+        self.body, self.flight = body, body.at_first()
+        self._of: Flight | None = None  # that the step began with
+        self._found: Values | None = None  # z of the last solution of this step
+        self._settled: Push | None = None  # what contact does to it at z
+        self._way: _Way | None = None
+
+    # --- a step ---
+
+    def look(self) -> Placed:
+        """Where it is between two steps."""
+        self.placed = Placed(self.body.shape, self.flight.pose)
+        return self.placed
+
+    def begin(self, step: RigidStep, held: Grip | None) -> Values:
+        """A step begins, for the first time or once more; `held`: what friction holds. (p,) its way in free flight."""
+        if self._of is not self.flight:
+            self._found = None
+        self._of, self.step, self._held, self._way = self.flight, step, held, None
+        self.stay()
+        return step.increment(step.ahead)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the step that began is not over yet."""
+        return self._of is self.flight
+
+    def arrive(self, found: Touch, x: Values, comm: MPI.Comm) -> None:
+        """The step is over: it has the momentum that points in touch at x (n, d) gave it (collective)."""
+        self.flight = self.step.arrived(self.z, total(comm, on_obstacle(found, x, self.placed.pose)))
+        self._found = self.z
+
+    def under(self, held: Grip, placed: Placed) -> Values:
+        """(k, d) way in the step of what is under the points that friction holds, m, with the obstacle at `placed`."""
+        then = self.step.start.pose
+        return placed.pose.points_to_space(then.to_body(held.start)) - held.start
+
+    # --- where it is ---
+
+    def stay(self) -> None:
+        """Where the step began."""
+        self.put(np.zeros(self.body.ways.shape[1]))
+
+    def put(self, z: Values) -> None:
+        """At z (k,)."""
+        self.z, self.placed = z, Placed(self.body.shape, self.step.pose(z))
+
+    def settle(self, around: Around) -> None:
+        """The pose that belongs to the points where they are now (collective)."""
+        self._settled = None
+        for z in self._candidates(around):
+            self.put(z)
+            if around.skin.are_apart(self.placed.distance(around.x)):
+                break
+        else:
+            return  # the body is in the obstacle: Newton's method finds no finite force, and fails
+        z, self._settled = self.step.settle(z, partial(self._push, around), partial(self._free, around))
+        self.put(z)
+
+    def _candidates(self, around: Around) -> Iterator[Values]:
+        """Ways z to start from: where a step of Newton's method takes the obstacle along, where it is, where it was
+        once this step was solved, and where the step began."""
+        here = self.z
+        if (way := self._way) is not None:
+            along = [float(np.vdot(around.x - way.x, way.moved)), float(np.vdot(way.moved, way.moved))]
+            gone = total(around.skin.comm, along)
+            share = float(np.clip(gone[0] / gone[1], 0.0, 1.0)) if gone[1] > 0 else 0.0
+            yield way.z + share * way.dz
+        yield here
+        if self._found is not None:
+            yield self._found
+        yield np.zeros_like(here)
+
+    def _push(self, around: Around, z: Values) -> Push:
+        """What contact does to the obstacle at z, of all ranks (collective)."""
+        self.put(z)
+        mine = push(around.feel(self.placed), around.x, self.placed.pose, self._held, self.step.start.pose)
+        return _summed(mine, around.skin.comm)
+
+    def _free(self, around: Around, z: Values, dz: Values) -> float:
+        """Share of the way from z by dz that closes no gap, with the body where it is (collective)."""
+        self.put(z)
+        return around.skin.safe(safe_shares(self.placed, around.x, 0 * around.x, self.step.onward(z, dz)))
+
+    # --- how it gives way ---
+
+    def by_z(self, found: Touch, x: Values) -> Values:
+        """(k, d, ways) derivative of minus the forces on points in touch by z."""
+        return by_point_and_pose(found, x, self.placed.pose) @ self.step.by_way(self.z)
+
+    def resistance(self, around: Around) -> Values:
+        """(k, k) second derivative of Phi by z, its positive definite part (collective)."""
+        return self.step.system(self.z, self._settled or self._push(around, self.z))[2]
+
+    def taken_along(self, found: Touch, around: Around, moved: Values) -> Values:
+        """(p,) increment of its pose as Newton's method moves it together with the points, by `moved` (n, d), m
+        (collective)."""
+        mixed = self.by_z(found, around.x)
+        pushed = total(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
+        dz = np.asarray(-np.linalg.solve(self.resistance(around), pushed))
+        self._way = _Way(around.x, moved, self.z, dz)
+        return self.step.onward(self.z, dz)
+
+    def forget_way(self) -> None:
+        """Newton's method starts anew."""
+        self._way = None
+
+    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values) -> float:
+        """Share of the ways of points and obstacle, from the start of the step, that closes no gap (collective)."""
+        start = Placed(self.body.shape, self.step.start.pose)
+        return skin.safe(safe_shares(start, x, moved, self.step.increment(z)))
+
+    # --- energies, on this rank ---
+
+    def rubbed(self, found: Touch) -> float:
+        """Work of friction on the body in the step, by the way of what is under it, J."""
+        if (held := self._held) is None:
+            return 0.0
+        rubbed = found.friction[np.searchsorted(found.points, held.points)]
+        return float(np.vdot(rubbed, self.under(held, self.placed)))
+
+
+def _summed(mine: Push, comm: MPI.Comm) -> Push:
+    """Of the points of all ranks (collective)."""
+    parts = [np.atleast_1d(mine.energy), mine.gradient, mine.hessian.reshape(-1), mine.stiffness.reshape(-1)]
+    p = len(mine.gradient)
+    energy, gradient, *both = np.split(total(comm, np.concatenate(parts)), [1, 1 + p, 1 + p + p * p])
+    return Push(float(energy[0]), gradient, *(each.reshape(p, p) for each in both))

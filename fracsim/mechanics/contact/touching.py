@@ -1,0 +1,108 @@
+"""What touches in a step: points of the body (skin), obstacles on their ways (course), and what friction holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ...mesh.domain import Domain
+from ..term import Level
+from .course import Course
+from .friction import Friction
+from .law import Law
+from .obstacle import Obstacle
+from .placed import Placed, least_distance
+from .reach import check_apart
+from .skin import Skin
+from .touch import Grip, Touch, grip, touch
+
+Values = npt.NDArray[np.float64]
+
+
+class Touching:
+    """Obstacles, and the points that they act on at the end of a step.
+
+    Attributes:
+        obstacles: held or driven (or free: free_obstacles).    law: how they act.    skin: what touches them.
+        x: (n, d) where its points are at the end of the step that belongs to u, m.
+    """
+
+    x: Values
+
+    def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
+        """InputError where the body at rest lies in an obstacle (collective)."""
+        self.obstacles, self.law, self.skin = tuple(obstacles), law, Skin(domain, law.barrier.width)
+        self._course = Course(self.obstacles, self._led())
+        self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
+        self.comm = domain.comm
+        self._touches: list[Touch] | None = None
+        self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
+        check_apart(self.comm, self.skin.rest, self.obstacles)
+
+    def _led(self) -> list[int]:
+        """Numbers of those whose way is known: all that are held or driven."""
+        return list(range(len(self.obstacles)))
+
+    def begin(self, level: Level) -> None:
+        """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
+        self._level, self._touches, late = level, None, 1 - level.share
+        end = level.t + late * level.dt
+        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
+            return  # a look at what a step has ended with: grips and ways are still those of the step
+        self._end, self._dt, self._began_with = end, level.dt, level.v
+        self._take_places(end - level.dt, end)
+        self._grips: list[Grip | None] = [None] * len(self.obstacles)
+        if level.dt:
+            self._start_of_step(late)
+
+    def _take_places(self, start: float, end: float) -> None:
+        """Where obstacles are at the ends of a step, s."""
+        self._course.begin(start, end)
+
+    def _start_of_step(self, late: float) -> None:
+        at = self._course.at_start
+        self.skin.make_room(self._level.u, partial(least_distance, at))
+        x = self.skin.places(self._level.u)
+        held = self._starts = [grip(x, self.skin.area, placed, self.law.barrier) for placed in at]
+        self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
+        pushed = [each.force[:, None] * each.normal for each in held]
+        self._pushed = [forces.sum(axis=0) for forces in pushed]
+        self._before: Values = np.zeros(self._owned)
+        if late:
+            forces = np.zeros_like(x)
+            for each, push in zip(held, pushed, strict=True):
+                forces[each.points] += push
+            self._before = np.asarray(late * self.skin.follow.handed_down(forces))
+
+    def _at_end(self) -> Values:
+        """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
+        return self._level.at_end(self._u.x.array[: self._owned])
+
+    def touching(self) -> list[Touch]:
+        """What each obstacle does at the current u (collective)."""
+        if self._touches is None:
+            self.x = self.skin.places(self._at_end())
+            self._touches = [self._feel(number, placed) for number, placed in enumerate(self._course.placed)]
+        return self._touches
+
+    def _feel(self, number: int, placed: Placed) -> Touch:
+        """What an obstacle at `placed` does to the points where they are now."""
+        obstacle, held = self.obstacles[number], self._grips[number]
+        rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
+        return touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, self._under(number, placed))
+
+    def _under(self, number: int, placed: Placed) -> Values:
+        """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
+        return np.asarray(self._course.ways[number][: self._domain.dim])
+
+    def forces(self, *, normal: bool = True) -> Values:
+        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; those of friction alone where
+        not `normal` (collective)."""
+        forces = np.zeros_like(self.skin.rest)
+        for each in self.touching():
+            forces[each.points] += each.friction + (each.normal if normal else 0.0)
+        return self.skin.follow.handed_down(forces)
