@@ -137,15 +137,16 @@ def test_a_press_reads_hookes_law(rotate: bool) -> None:
 
 @pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha"))
 def test_a_step_that_balances_inside_books_what_its_obstacle_did(scheme: str) -> None:
-    """A rubbing platen presses a block: its work is stored in the block but for what the scheme damps away (1 %), and
-    the force that it reads has friction in it, whatever level of the step forces balance at."""
+    """A rubbing platen presses a block: its work is stored in the block but for 2 %, what the blow as they meet and the
+    scheme take, and never less than what is stored; the force that it reads has friction in it, whatever level of the
+    step forces balance at."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT, boundary=[{"on": "bottom", "fix": "xy"}],
         obstacle=[floor(0.53, normal=[0.0, -1.0], velocity=[0.05, -0.2], friction=0.3)], solver=FINE,
         time={"scheme": scheme, "step": 0.02, "end": 0.4},
     )  # fmt: skip
     (*_, report) = march(scene, state)
-    assert state.work == pytest.approx(report.elastic + report.kinetic + state.dissipated, rel=1e-2)
+    assert 0 < state.work - (report.elastic + report.kinetic + state.dissipated) < 2e-2 * state.work
     along, down = scene.probes()[:2]
     assert down > 1e3 and 1 < abs(along) < 0.3 * down
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme
+from fracsim.mechanics.blow import Blow
 from fracsim.mechanics.contact.barrier import Barrier
 from fracsim.mechanics.contact.free_obstacle import FreeObstacle
 from fracsim.mechanics.contact.friction import Friction
@@ -71,7 +72,7 @@ def test_gradient_and_hessian_of_the_incremental_potential(scheme: Scheme, hinge
     held = grip(x, area, Placed(body.shape, start.pose), barrier)
     assert len(held.points) > 5
     c_a, _ = scheme.rates(dt)
-    step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, rng.normal(size=body.count))
+    step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, Blow.of(scheme).factor)
 
     z = np.array([0.02]) if hinged else np.array([0.02, -0.01, 0.015, 0.3, -0.25, 0.3])[: len(body.ways)]
     fixed = x if hinged else step.pose(0.8 * z).points_to_space(x)  # they have moved along: gaps are open
@@ -83,7 +84,7 @@ def test_gradient_and_hessian_of_the_incremental_potential(scheme: Scheme, hinge
         return push(point, fixed, placed.pose, held, start.pose)
 
     def phi(z: Values) -> float:
-        return step.own(z) + step.share**2 * contact(z).energy
+        return step.own(z) + step.factor * step.share**2 * contact(z).energy
 
     assert np.isfinite(phi(z)) and contact(z).energy > 1e-3
     gradient, hessian, stiffness = step.system(z, contact(z))
@@ -107,7 +108,7 @@ def test_a_body_that_tumbles_keeps_its_angular_momentum(scheme: Scheme) -> None:
     flight, dt = body.at_first(), 0.02
     first, energies = flight, []
     for _ in range(200):
-        step = RigidStep(body, flight, scheme, dt, scheme.rates(dt)[0], 1 - scheme.alpha_f, np.zeros(6))
+        step = RigidStep(body, flight, scheme, dt, scheme.rates(dt)[0], 1 - scheme.alpha_f, 1.0)
         none = Push(0.0, np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)))
         z, _ = step.settle(np.zeros(6), lambda _, none=none: none, lambda *_: 1.0)
         flight = step.arrived(z, np.zeros(6))

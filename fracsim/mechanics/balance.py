@@ -21,6 +21,7 @@ from ..forms.schemes import Scheme
 from ..mesh.dolfinx_calls import apply_lifting
 from ..mesh.domain import Domain
 from ..mesh.ranks import total
+from .blow import Blow, given
 from .inertia import Mass
 from .kernels import CellForm, cells_measure
 from .prescribed_motion import PrescribedMotion
@@ -40,6 +41,7 @@ class Balance:
         terms: what adds to the balance, in this order.    stress: the one among them that damage acts on.
         motion: dofs whose motion is prescribed.    mass: the mass matrix.
         scheme: where in a step forces balance, and the rates there.    c_a, c_v: those of the last step.
+        blow: how contact enters a step of that scheme.
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
@@ -62,7 +64,7 @@ class Balance:
         self.domain: Domain = assembler.domain
         self.u, self.owned, self.terms = u, assembler.owned, tuple(terms)
         self.stress = next(term for term in terms if isinstance(term, Stress))
-        self.motion, self.mass, self.scheme = motion, mass, scheme
+        self.motion, self.mass, self.scheme, self.blow = motion, mass, scheme, Blow.of(scheme)
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
         self.low_rank: list[tuple[Values, Values]] = []
@@ -97,7 +99,7 @@ class Balance:
     # --- a step, or a look at a state ---
 
     def arrive(self) -> None:
-        """The step is solved (collective)."""
+        """A solution of the step is found (collective)."""
         for term in self.terms:
             term.arrive()
 
@@ -111,7 +113,7 @@ class Balance:
         own, to = motion.owned, where[: len(motion.owned)]
         if not late and (led := scheme.prescribed(dt, to, u[own], v[own])) is not None:
             u_a[own], u_v[own] = to - led[1] / self.c_a, to - led[0] / self.c_v
-        self._tell(Level(t - late * dt, dt, u, v, self.c_a, self.c_v, u_a, u_v, 1 - late), where)
+        self._tell(Level(t - late * dt, dt, u, v, self.c_a, self.c_v, u_a, u_v, 1 - late, self.blow), where)
 
     def look_at(self, t: float, u: Values, v: Values, a: Values | None = None, *, dt: float | None = None) -> None:
         """Put the body at u with velocity v and acceleration a (none where not given) at time t (collective).
@@ -122,7 +124,8 @@ class Balance:
             self.c_a, self.c_v = self.scheme.rates(dt)
         self.displace(u)
         u_a = u - a / self.c_a if a is not None and self.c_a else u
-        self._tell(Level(t, 0.0, u, v, self.c_a, self.c_v, u_a, u - v / self.c_v), self.motion.at(t))
+        level = Level(t, 0.0, u, v, self.c_a, self.c_v, u_a, u - v / self.c_v, blow=self.blow)
+        self._tell(level, self.motion.at(t))
 
     def _tell(self, level: Level, where: Values) -> None:
         self.level = level
@@ -160,10 +163,33 @@ class Balance:
         rows = b.array_w
         for term in self.terms:
             term.add_force(rows)
+        if (struck := self.struck()) is not None:
+            rows -= self._weighted(struck)
         accelerations = [each for term in self.terms if (each := term.acceleration()) is not None]
         if accelerations:
             rows += self.mass.times(sum(accelerations[1:], accelerations[0]))
         return b
+
+    def struck(self) -> Values | None:
+        """(owned dofs,) forces of contact at the end of the step, N; None where nothing touches (collective)."""
+        forces = [force for term in self.terms if (force := term.struck()) is not None]
+        return sum(forces[1:], forces[0]) if forces else None
+
+    def _weighted(self, struck: Values) -> Values:
+        """As they enter r; what holds a prescribed dof feels them as they are."""
+        if (weight := self.level.weight) == 1:
+            return struck
+        result, own = weight * struck, self.motion.owned
+        result[own] = struck[own]
+        return result
+
+    def carried(self, dt: float, a: Values) -> Values:
+        """(owned dofs,) a at the end of a step without what blows have given, m/s^2: what the next step goes on from
+        (collective)."""
+        if (struck := self.struck()) is None:
+            return a
+        moved = self.mass.solve(self._weighted(struck), self.motion.free) / self.c_a
+        return np.asarray(a - given(self.scheme, dt, moved))
 
     def free_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r at x into b, zero on rows of prescribed dofs, which hold their values in every iterate.

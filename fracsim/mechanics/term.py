@@ -19,6 +19,7 @@ import ufl
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from .blow import NONE, Blow
 from .drawn import Drawn
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Level:
         t: s.        dt: size of the step, s; 0 where a state is only looked at.
         u, v: (owned dofs,) state at the start of the step in m, m/s.
         c_a, c_v: of a = c_a (u - u_a) and v = c_v (u - u_v), 1/s^2 and 1/s.    u_a, u_v: (owned dofs,) m.
-        share: of dt that has passed at t.
+        share: of dt that has passed at t.    blow: how contact enters the step.
     """
 
     t: float
@@ -48,6 +49,12 @@ class Level:
     u_a: Values
     u_v: Values
     share: float = 1.0
+    blow: Blow = NONE
+
+    @property
+    def weight(self) -> float:
+        """Of forces of contact at the end of the step in r."""
+        return self.blow.factor * self.share
 
     def at_end(self, u: Values) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to u at the level, m."""
@@ -90,6 +97,13 @@ class Term:
 
     def add_force(self, rows: Values) -> None:
         """Add nodal forces at the current u to r, (owned dofs,) in N."""
+
+    def struck(self) -> Values | None:
+        """(owned dofs,) forces of contact at the end of the step that belongs to the current u, N (collective).
+
+        r has them with the weight of a blow, and the acceleration that a scheme carries on is without them (blow).
+        """
+        return None
 
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the derivative of `add_force` to the assembled tangent, within the pattern of its cells."""
@@ -180,7 +194,7 @@ class Term:
         return 0.0
 
     def arrive(self) -> None:
-        """The step is solved: be what it ends with, until a past is recalled (collective)."""
+        """A solution of the step is found: be what it ends with, until a past is recalled (collective)."""
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

@@ -77,6 +77,7 @@ class QuasiStaticStepper(ImplicitStepper):
         path = _Path(state.u, state.forces, state.drag, state.out_of_balance)
         broken, released, limit = 0, 0.0, self.breaking.passes or UNLIMITED
         for number in range(limit):
+            self.balance.arrive()
             path.to(self._solved(), *acting(self.balance, lumped=False))
             flowed = self._let_flow()
             result = self._pass(path)

@@ -259,6 +259,8 @@ class BalanceStepper:
         balance.arrive()
         x = balance.u.x.array[: balance.owned].copy()
         u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
+        if scheme.carries_acceleration:
+            a = balance.carried(dt, a)
         if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:
             v[own], a[own] = led
         if scheme.alpha_f:

@@ -32,7 +32,6 @@ from .law import Law
 from .obstacle import Obstacle
 from .obstacles import Obstacles
 from .placed import Placed
-from .push import resultant
 from .rigid_step import RigidStep
 from .touch import Touch
 
@@ -67,18 +66,12 @@ class FreeObstacles(Obstacles):
         for number, each in self.free.items():
             self._course.put_at_start(number, each.look())
 
-    def _start_of_step(self, late: float) -> None:
-        super()._start_of_step(late)
+    def _start_of_step(self) -> None:
+        super()._start_of_step()
         level, self._settled_at = self._level, None
         for number, each in self.free.items():
-            pushed = self._pushed_at_start(number)
-            step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, pushed)
+            step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, level.blow.factor)
             self._course.ways[number] = each.begin(step, self._grips[number])
-
-    def _pushed_at_start(self, number: int) -> Values:
-        """(p,) force and moment of the body on an obstacle at the start of the step, N and N m (collective)."""
-        held, centre = self._starts[number], self._course.at_start[number].pose.centre
-        return total(self.comm, resultant(-held.force[:, None] * held.normal, held.start - centre))
 
     def memory(self) -> object:
         """That of the points, and how obstacles move."""
@@ -103,6 +96,7 @@ class FreeObstacles(Obstacles):
 
     def arrive(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
+        super().arrive()
         found = self.touching()
         for number, each in self.free.items():
             each.arrive(found[number], self.x, self.comm)
@@ -167,25 +161,19 @@ class FreeObstacles(Obstacles):
         """(k, k) Phi_zz^-1 (collective)."""
         return np.asarray(np.linalg.inv(self.free[number].resistance(self._around(number))), np.float64)
 
+    def _pressed(self, number: int) -> float:
+        if number not in self.free:
+            return super()._pressed(number)
+        return self.free[number].pressed(self.touching()[number], self.x)
+
     def driven(self) -> tuple[float, float]:
-        """With the work of gravity on free obstacles, and what friction takes of their way (collective)."""
+        """With the work of gravity on free obstacles (collective)."""
         work, lost = super().driven()
-        for number, each in self.free.items():
-            found = self.touching()[number]
-            rubbed = each.rubbed(found)
-            self._worked[number] = self._pressed(each, found) + rubbed
-            lost += rubbed
-            if self.comm.rank == 0:
+        if self.comm.rank == 0:
+            for number, each in self.free.items():
                 ends = self._course.at_start[number].pose, each.placed.pose
                 work += each.body.weight(ends[0])[0] - each.body.weight(ends[1])[0]
         return work, lost
-
-    def _pressed(self, each: FreePose, found: Touch) -> float:
-        """Work of normal forces on the body in the step, by the way of the obstacle, this rank's share, J."""
-        force = resultant(found.normal, self.x[found.points] - each.placed.pose.centre)
-        if self.comm.rank == 0:
-            force = force - each.step.pushed
-        return float(force @ each.step.increment(each.z)) / 2
 
     def kinetic(self) -> float:
         """Energy of motion of the free obstacles, on rank 0, J."""

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from ...mesh.ranks import total
 from .free_obstacle import Flight, FreeObstacle
 from .placed import Placed
-from .push import Push, by_point_and_pose, on_obstacle, push
+from .push import Push, by_point_and_pose, on_obstacle, push, resultant
 from .reach import safe_shares
 from .rigid_step import RigidStep
 from .skin import Skin
@@ -147,8 +147,8 @@ class FreePose:
     # --- how it gives way ---
 
     def by_z(self, found: Touch, x: Values) -> Values:
-        """(k, d, ways) derivative of minus the forces on points in touch by z."""
-        return by_point_and_pose(found, x, self.placed.pose) @ self.step.by_way(self.z)
+        """(k, d, ways) derivative of minus the forces on points in touch by z, as it enters the tangent."""
+        return self.step.factor * by_point_and_pose(found, x, self.placed.pose) @ self.step.by_way(self.z)
 
     def resistance(self, around: Around) -> Values:
         """(k, k) second derivative of Phi by z, its positive definite part (collective)."""
@@ -172,14 +172,10 @@ class FreePose:
         start = Placed(self.body.shape, self.step.start.pose)
         return skin.safe(safe_shares(start, x, moved, self.step.increment(z)))
 
-    # --- energies, on this rank ---
-
-    def rubbed(self, found: Touch) -> float:
-        """Work of friction on the body in the step, by the way of what is under it, J."""
-        if (held := self._held) is None:
-            return 0.0
-        rubbed = found.friction[np.searchsorted(found.points, held.points)]
-        return float(np.vdot(rubbed, self.under(held, self.placed)))
+    def pressed(self, found: Touch, x: Values) -> float:
+        """Work of normal forces on the body in the step, by the way of the obstacle, this rank's share, J."""
+        force = resultant(found.normal, x[found.points] - self.placed.pose.centre)
+        return float(force @ self.step.increment(self.z))
 
 
 def _summed(mine: Push, comm: MPI.Comm) -> Push:

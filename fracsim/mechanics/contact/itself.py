@@ -40,7 +40,6 @@ class SelfContact(Term):
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
-        self._before: Values = np.zeros(self._owned)
         self._surface: Surface | None = None
         self._rebuild()
 
@@ -108,8 +107,6 @@ class SelfContact(Term):
         if self.law.friction and self._surface is not None and self._start is not None:
             x, slip = self._start, creep * level.dt
             self._rubbing = self._surface.pairs.lag_friction(x, x, slip)
-        if level.share < 1:
-            self._before = (1 - level.share) * self._handed_down(self._start)
 
     def _speed(self, v: Values) -> float:
         """Root mean square of the nodes' speeds, m/s (collective)."""
@@ -146,14 +143,13 @@ class SelfContact(Term):
 
         return np.asarray(self._domain.gather_nodes.scatter(on_root(self.comm, found))).reshape(-1)
 
-    def add_force(self, rows: Values) -> None:
-        """r -= forces (collective)."""
-        rows -= self.scale()
+    def struck(self) -> Values:
+        """(owned dofs,) forces at the end of the step, N (collective)."""
+        return self._handed_down(self._places())
 
     def scale(self) -> Values:
-        """(owned dofs,) forces at the level, N (collective)."""
-        share, forces = self._level.share, self._handed_down(self._places())
-        return forces if share == 1 else np.asarray(share * forces + self._before)
+        """(owned dofs,) the same as they enter r, N (collective)."""
+        return np.asarray(self._level.weight * self.struck())
 
     def coupling(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces, where anything is in touch (collective)."""
@@ -162,7 +158,8 @@ class SelfContact(Term):
         def found() -> csr_matrix:
             assert self._surface is not None and x is not None
             H = self._surface.pairs.hessian(x)
-            return H if self._rubbing is None else (H + self._rubbing.hessian(x)).tocsr()
+            whole = H if self._rubbing is None else (H + self._rubbing.hessian(x)).tocsr()
+            return csr_matrix(self._level.blow.factor * whole)
 
         H = on_root(self.comm, found)
         if not self.comm.bcast(H is not None and H.nnz):
@@ -181,14 +178,11 @@ class SelfContact(Term):
         return -self._handed_down(self._places(), normal=False) if self.law.friction else None
 
     def potential(self) -> float:
-        """share^2 times barrier and friction at the end of the step, less what the start's forces do, this rank's
-        share, J (collective)."""
-        share, x, energy = self._level.share, self._places(), self.stored()
+        """Barrier and friction at the end of the step as they enter that of r, on rank 0, J (collective)."""
+        x, energy = self._places(), self.stored()
         if self._rubbing is not None and x is not None:
             energy += self._rubbing.energy(x)
-        if share == 1:
-            return energy
-        return share**2 * energy - float(self._before @ self._u.x.array[: self._owned])
+        return self._level.weight * self._level.share * energy
 
     # --- how far Newton's method may go ---
 

@@ -2,9 +2,8 @@
 
     E(u) = sum over obstacles of  int b(gap(x)) dA  +  sum over points in touch of  mu lambda f0(|s|)
 
-over the split surface x(u) (skin), each point with its share of the reference surface. Forces balance where the body
-will be at the end of a step, u_n + (u - u_n) / share, whatever level the scheme solves at; of a level inside the step
-they count with its share, and those of the step's start with the rest.
+over the split surface x(u) (skin), each point with its share of the reference surface. Forces are those where the body
+will be at the end of a step, u_n + (u - u_n) / share, whatever level the scheme solves at (blow).
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Obstacles(Touching, Term):
         """InputError where the body at rest lies in an obstacle (collective)."""
         super().__init__(domain, u, obstacles, law)
         self._coupling, self._drawings = Coupling(domain), Drawings(obstacles, domain.lower, domain.upper)
-        self._worked = [0.0] * len(self.obstacles)  # J, of each in the last step
+        self._worked, self._lost = [0.0] * len(self.obstacles), 0.0  # J, of each, and by friction, in the last step
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
@@ -54,14 +53,13 @@ class Obstacles(Touching, Term):
 
     # --- what it adds to the balance ---
 
-    def add_force(self, rows: Values) -> None:
-        """r -= forces (collective)."""
-        rows -= self.scale()
+    def struck(self) -> Values:
+        """(owned dofs,) forces at the end of the step, N (collective)."""
+        return self.forces()
 
     def scale(self) -> Values:
-        """(owned dofs,) forces at the level, N (collective)."""
-        share = self._level.share
-        return self.forces() if share == 1 else share * self.forces() + self._before
+        """(owned dofs,) the same as they enter r, N (collective)."""
+        return np.asarray(self._level.weight * self.forces())
 
     def coupling(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces, where anything is in touch (collective)."""
@@ -70,7 +68,7 @@ class Obstacles(Touching, Term):
         if not count:
             return None
         points = np.concatenate([each.points for each in touches])
-        blocks = np.concatenate([each.stiffness for each in touches])
+        blocks = self._level.blow.factor * np.concatenate([each.stiffness for each in touches])
         return self._coupling(self.skin.stiffness(points, blocks), self.skin.columns)
 
     def stored(self) -> float:
@@ -78,28 +76,27 @@ class Obstacles(Touching, Term):
         return sum(each.energy for each in self.touching())
 
     def potential(self) -> float:
-        """share^2 times barriers and friction at the end of the step, less what the start's forces do, this rank's
-        share, J (collective)."""
-        share, u = self._level.share, self._u.x.array[: self._owned]
+        """Barriers and friction at the end of the step as they enter that of r, this rank's share, J (collective)."""
         energy = sum(each.energy + each.friction_energy for each in self.touching())
-        return energy if share == 1 else share**2 * energy - float(self._before @ u)
+        return self._level.weight * self._level.share * energy
 
-    def drag(self) -> Values | None:
-        """(owned dofs,) minus the forces of friction, N (collective)."""
-        return -self.forces(normal=False) if any(each.friction for each in self.obstacles) else None
+    def arrive(self) -> None:
+        """What contact has done in the step is booked (collective)."""
+        self._lost = 0.0
+        for number in range(len(self.obstacles)):
+            moved, under = self.rubbed(number)
+            self._worked[number] = self._pressed(number) + under
+            self._lost += under - moved
+
+    def _pressed(self, number: int) -> float:
+        """Work of normal forces on the body in the step, by the way of the obstacle, this rank's share, J."""
+        end, shift = self._level.blow.end, self._course.ways[number][: self._domain.dim]
+        pushed = end * self.touching()[number].normal.sum(axis=0) + (1 - end) * self._pushed[number]
+        return float(pushed @ shift)
 
     def driven(self) -> tuple[float, float]:
-        """Work of the obstacles' own motion in the step on this rank, and what of it friction takes, J (collective).
-
-        Friction's `drag` counts the way of the body; the slip is that way less the obstacle's.
-        """
-        lost, led = 0.0, self._course.led
-        for number in led:
-            shift, found = self._course.ways[number][: self._domain.dim], self.touching()[number]
-            pushed, rubbed = found.normal.sum(axis=0), float(found.friction.sum(axis=0) @ shift)
-            self._worked[number] = float((pushed + self._pushed[number]) @ shift) / 2 + rubbed
-            lost += rubbed
-        return sum(self._worked[number] for number in led), lost
+        """Work of the obstacles' own motion in the step on this rank, and what friction takes, J."""
+        return sum(self._worked[number] for number in self._course.led), self._lost
 
     # --- how far Newton's method may go ---
 

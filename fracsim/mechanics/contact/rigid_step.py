@@ -1,10 +1,11 @@
 """A step of a free obstacle: its pose as the minimum of an incremental potential, for a body that is where it is.
 
-z (k,) is its way in the step, pose(z) = start moved by q = ways @ z, V(z) the energy of contact and weight. The scheme
-of the study steps the momentum M dz/dt as it steps that of every node, with M (inertia in axes of space) held where the
-obstacle will be half-way; its unknown is s z, s the level of the step where forces balance (term.Level), and
+z (k,) is its way in the step, pose(z) = start moved by q = ways @ z, E(z) and V(z) the energies of contact and weight.
+The scheme of the study steps the momentum M dz/dt as it steps that of every node, with M (inertia in axes of space)
+held where the obstacle will be half-way; its unknown is s z, s the level of the step where forces balance (term.Level),
+contact enters as a blow of factor k (blow), and
 
-    Phi(z) = c_a / 2 (s z - z_a) . M (s z - z_a) + s^2 V(z) - s b . z,    b: (1 - s) times the forces of the start.
+    Phi(z) = c_a / 2 (s z - z_a) . M (s z - z_a) + s^2 (k E(z) + V(z)) - s b . z,    b: (1 - s) times the weight.
 
 So the linear momentum that body and obstacle exchange is the same to the last digit, in 2D the angular one too, and
 without a moment the angular momentum of a body that tumbles stays as it is. In 3D a moment would act through J(w)^T
@@ -20,6 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ...forms.schemes import Scheme
+from ..blow import given
 from .free_obstacle import Flight, FreeObstacle
 from .pose import Pose, Values
 from .push import Push
@@ -37,7 +39,7 @@ class RigidStep:
 
     Attributes:
         body, start: what moves, and how at the start.    scheme, dt: of the step, s.    c_a, share: of the level.
-        pushed: (p,) force and moment of the body on it at the start, N and N m.
+        factor: k.
     """
 
     body: FreeObstacle
@@ -46,7 +48,7 @@ class RigidStep:
     dt: float
     c_a: float
     share: float
-    pushed: Values
+    factor: float
 
     # --- what holds during the step ---
 
@@ -73,8 +75,7 @@ class RigidStep:
     def before(self) -> Values:
         """(k,) b."""
         late = 1 - self.share
-        weight = self.body.weight(self.start.pose)[1] if late else 0.0
-        return np.asarray(late * self.body.ways.T @ (self.pushed - weight))
+        return np.asarray(-late * self.body.ways.T @ self.body.weight(self.start.pose)[1])
 
     @cached_property
     def ahead(self) -> Values:
@@ -120,12 +121,13 @@ class RigidStep:
         """(k,) gradient of Phi / s, (k, k) Hessian of Phi / s^2, and its part that is positive definite."""
         d, T = self.start.pose.dim, self.by_way(z)
         _, by_pose, twice = self.body.weight(self.pose(z))
-        forces = contact.gradient + by_pose
+        forces = self.factor * contact.gradient + by_pose
         gradient = self.c_a * self.M @ (self.share * z - self.z_a) + self.share * T.T @ forces - self.before
-        stiffness = self.c_a * self.M + T.T @ contact.stiffness @ T
+        stiffness = self.c_a * self.M + self.factor * T.T @ contact.stiffness @ T
         bent = np.zeros_like(twice)
         bent[d:, d:] = bend(self.increment(z)[d:], forces[d:])
-        hessian = self.c_a * self.M + T.T @ (contact.hessian + twice) @ T + self.body.ways.T @ bent @ self.body.ways
+        curved = T.T @ (self.factor * contact.hessian + twice) @ T
+        hessian = self.c_a * self.M + curved + self.body.ways.T @ bent @ self.body.ways
         return gradient, hessian, stiffness
 
     def scale(self, z: Values) -> float:
@@ -141,18 +143,18 @@ class RigidStep:
 
         `contact`: z -> Push, of all ranks.    `free`: share of the way from z by dz on which no gap closes.
         """
-        now = contact(z)
-        height = self.own(z) + self.share**2 * now.energy
+        now, weight = contact(z), self.factor * self.share**2
+        height = self.own(z) + weight * now.energy
         for _ in range(ITERATIONS):
             gradient, hessian, stiffness = self.system(z, now)
             dz: Values = np.asarray(-_solved(hessian, stiffness, gradient) / self.share)
-            decrement, at_play = -self.share * float(gradient @ dz), self.scale(z) + self.share**2 * now.energy
+            decrement, at_play = -self.share * float(gradient @ dz), self.scale(z) + weight * now.energy
             if not decrement > SMALL * at_play:
                 break
             step, slack = free(z, dz), ROUND_OFF * (at_play + abs(height))
             while step > SHORTEST:
                 there = contact(z + step * dz)
-                level = self.own(z + step * dz) + self.share**2 * there.energy
+                level = self.own(z + step * dz) + weight * there.energy
                 if level <= height - 1e-4 * step * decrement + slack:
                     break
                 step /= 2
@@ -164,10 +166,12 @@ class RigidStep:
     def arrived(self, z: Values, force: Values) -> Flight:
         """How it moves at the end, which is at z, with force and moment (p,) of the body on it there, N and N m."""
         pose = self.pose(z)
-        acting = self.body.ways.T @ (force - self.body.weight(pose)[1])
-        reached = self.z_a + _over(self.M, self.share * acting + self.before) / self.c_a
+        weight = self.body.ways.T @ -self.body.weight(pose)[1]
+        struck = self.share * self.factor * _over(self.M, self.body.ways.T @ force) / self.c_a
+        reached = self.z_a + _over(self.M, self.share * weight + self.before) / self.c_a + struck
         _, rate, change = self.scheme.finish(self.dt, reached, np.zeros(len(z)), *self._motion)
-        return Flight(pose, self.M @ rate, self.M @ change, self._turned(pose, z))
+        carried = change - given(self.scheme, self.dt, struck)
+        return Flight(pose, self.M @ rate, self.M @ carried, self._turned(pose, z))
 
     def _turned(self, pose: Pose, z: Values) -> Values:
         if pose.dim == 2:

@@ -49,34 +49,27 @@ class Touching:
 
     def begin(self, level: Level) -> None:
         """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
-        self._level, self._touches, late = level, None, 1 - level.share
-        end = level.t + late * level.dt
+        self._level, self._touches = level, None
+        end = level.t + (1 - level.share) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: grips and ways are still those of the step
         self._end, self._dt, self._began_with = end, level.dt, level.v
         self._take_places(end - level.dt, end)
         self._grips: list[Grip | None] = [None] * len(self.obstacles)
         if level.dt:
-            self._start_of_step(late)
+            self._start_of_step()
 
     def _take_places(self, start: float, end: float) -> None:
         """Where obstacles are at the ends of a step, s."""
         self._course.begin(start, end)
 
-    def _start_of_step(self, late: float) -> None:
+    def _start_of_step(self) -> None:
         at = self._course.at_start
         self.skin.make_room(self._level.u, partial(least_distance, at))
         x = self.skin.places(self._level.u)
-        held = self._starts = [grip(x, self.skin.area, placed, self.law.barrier) for placed in at]
+        held = [grip(x, self.skin.area, placed, self.law.barrier) for placed in at]
         self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
-        pushed = [each.force[:, None] * each.normal for each in held]
-        self._pushed = [forces.sum(axis=0) for forces in pushed]
-        self._before: Values = np.zeros(self._owned)
-        if late:
-            forces = np.zeros_like(x)
-            for each, push in zip(held, pushed, strict=True):
-                forces[each.points] += push
-            self._before = np.asarray(late * self.skin.follow.handed_down(forces))
+        self._pushed = [each.force @ each.normal for each in held]
 
     def _at_end(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
@@ -99,10 +92,19 @@ class Touching:
         """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
         return np.asarray(self._course.ways[number][: self._domain.dim])
 
-    def forces(self, *, normal: bool = True) -> Values:
-        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; those of friction alone where
-        not `normal` (collective)."""
+    def forces(self) -> Values:
+        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
         forces = np.zeros_like(self.skin.rest)
         for each in self.touching():
-            forces[each.points] += each.friction + (each.normal if normal else 0.0)
+            forces[each.points] += each.normal + each.friction
         return self.skin.follow.handed_down(forces)
+
+    def rubbed(self, number: int) -> tuple[float, float]:
+        """Work of friction on the body in the step, and what of it an obstacle does by its own way, this rank's share,
+        J (collective); the rest is lost."""
+        found, held = self.touching()[number], self._grips[number]
+        if held is None or not len(held.points):
+            return 0.0, 0.0
+        force = found.friction[np.searchsorted(found.points, held.points)]
+        under = self._under(number, self._course.placed[number])
+        return float(np.vdot(force, self.x[held.points] - held.start)), float((force * under).sum())
