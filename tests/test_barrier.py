@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fracsim.errors import InputError
+from fracsim.mechanics.contact.along import Along
 from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
 from fracsim.mechanics.contact.friction import Friction, tangential
 from fracsim.mechanics.contact.motion import Motion
@@ -37,6 +38,28 @@ def test_slope_and_curvature_are_derivatives(share: float) -> None:
     by = [differences(lambda x, f=f: f(x[:, 0]), g, h)[0, 0] for f in (BARRIER.energy, BARRIER.slope)]
     assert BARRIER.slope(g[0])[0] == pytest.approx(by[0], rel=1e-6, abs=1e-6 * scale)
     assert BARRIER.curvature(g[0])[0] == pytest.approx(by[1], rel=1e-6, abs=1e-6 * scale / share / BARRIER.width)
+
+
+@given(start=st.floats(1e-4, 2.0), end=st.floats(1e-4, 2.0).filter(lambda share: abs(share - 1) > 2e-3))
+def test_along_the_way_it_gives_no_energy(start: float, end: float) -> None:
+    """-p (g - g_n), what its force does on a way from g_n to g, is no more than b(g_n) - b(g), and on short ways all of
+    it but for a fifth of what the force at the end would lose. p and p' are derivatives of its potential."""
+    d = BARRIER.width
+    start_gap, g, h = np.array([start * d]), np.array([[end * d]]), 1e-4 * end * d
+    along = Along(BARRIER, start_gap)
+    done = -along.slope(g[0]) * (g[0] - start_gap)
+    released = BARRIER.energy(start_gap) - BARRIER.energy(g[0])
+    round_off = 1e-12 * (BARRIER.energy(start_gap) + BARRIER.energy(g[0]))
+    assert done <= released + round_off
+    assert done >= -BARRIER.slope(g[0]) * (g[0] - start_gap) - round_off
+    if abs(start - end) < 0.01 * end:
+        least = released - 0.21 * (released + BARRIER.slope(g[0]) * (g[0] - start_gap))
+        assert done >= least - round_off
+    scale = BARRIER.stiffness * max(1.0, 1 / end)
+    by = [differences(lambda x, f=f: f(x[:, 0]), g, h)[0, 0] for f in (along.energy, along.slope)]
+    if abs((2 * start + end) / 3 - 1) > 2e-3:
+        assert along.slope(g[0])[0] == pytest.approx(by[0], rel=1e-6, abs=1e-6 * scale)
+        assert along.curvature(g[0])[0] == pytest.approx(by[1], rel=1e-6, abs=1e-6 * scale / end / d)
 
 
 def test_barrier_is_c2_where_it_begins() -> None:

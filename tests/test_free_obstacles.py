@@ -113,8 +113,7 @@ def test_a_pendulum_swings_in_its_period(dim: int) -> None:
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_an_isolated_pair_keeps_its_momentum(scheme: str) -> None:
     """A spinning, rubbing box thrown on a block that nothing holds: m v of both together stays to the solver's
-    tolerance while it is turned round; friction and the scheme take energy, and a blow within a few steps
-    adds 5 % at most, with backward Euler nothing."""
+    tolerance while it is turned round; friction and the scheme take energy, and none gives any."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.3], "h": 0.1}, material=SOFT, solver=FINE,
         obstacle=[{"name": "it", "shape": "box", "size": [0.3, 0.1], "at": [0.7, 0.36], "velocity": [1.0, -2.0],
@@ -122,11 +121,10 @@ def test_an_isolated_pair_keeps_its_momentum(scheme: str) -> None:
         time={"scheme": scheme, "step": 2e-3, "end": 0.04},
     )  # fmt: skip
     before, _ = momenta(scene, state)
-    most = 1 + 1e-9 if scheme == "backward-euler" else 1.05
     given = 0.0
     for report in each_step(scene, state):
         np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-8 * 10)
-        assert report.kinetic + report.elastic + state.dissipated < 12.69 * most
+        assert report.kinetic + report.elastic + state.dissipated < 12.69 * (1 + 1e-9)
         given += told(scene)["work_it"]
     row = told(scene)
     assert row["velocity_it_y"] > -0.1 and state.dissipated > 0.5

@@ -31,12 +31,15 @@ def two_blocks(path: Path, dim: int, gap: float) -> str:
     return str(path / "two.vtu")
 
 
-@pytest.mark.parametrize("dim", (2, 3))
-def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
-    """Thrown at each other: momentum is kept to the solver's tolerance, they touch, and nothing cuts anything."""
+@pytest.mark.parametrize(
+    ("dim", "scheme"), [(2, "backward-euler"), (3, "backward-euler"), (2, "newmark"), (2, "generalized-alpha")]
+)
+def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str) -> None:
+    """Thrown at each other: momentum is kept to the solver's tolerance, they touch, nothing cuts anything, and no
+    scheme gains energy."""
     scene, state = make_scene(
         mesh={"file": two_blocks(tmp_path, dim, 0.05)}, material=SOFT, contact={}, solver=FINE,
-        time={"scheme": "backward-euler", "step": 0.01, "end": 0.18},
+        time={"scheme": scheme, "step": 0.01, "end": 0.18},
     )  # fmt: skip
     X = positions(scene)
     v = np.zeros_like(X)
@@ -46,7 +49,8 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
     m = scene.balance.mass.lumped.reshape(-1, dim)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     before, touched = (m * v).sum(axis=0), 0
-    for _ in each_step(scene, state):
+    for report in each_step(scene, state):
+        assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
         x = contact._places()
         assert len(contact._surface.pairs.overlaps(x)) == 0
         touched += contact.stored() > 0
@@ -54,7 +58,6 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
     right = X[:, 0] > 1.01
     assert touched > 3 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.3 * before[0]
-    assert scene.balance.kinetic_energy(state.v) + state.elastic < 0.5 * before[0] * 1.001
 
 
 def test_a_cracked_column_carries_its_upper_half() -> None:

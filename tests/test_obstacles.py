@@ -71,13 +71,14 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int)
 # --- impulse, rest, pressure ----------------------------------------------------------------------------------------
 
 
-def test_the_impulse_of_contact_is_what_balances_momentum() -> None:
-    """Backward Euler: M (v - v_n) = dt f for every step, so that m v = sum of dt f - m g t through a whole bounce; and
-    the floor is never passed, though the body is as soft as jelly and falls 0.2 m."""
+@pytest.mark.parametrize("scheme", ("backward-euler", "newmark", "generalized-alpha"))
+def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
+    """M (v - v_n) = dt f for every step, so that m v = sum of dt f - m g t through a whole bounce; the floor is never
+    passed, though the body is as soft as jelly and falls 0.2 m, and no energy comes from nothing."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT, load={"gravity": [0.0, -G]},
         obstacle=[floor(-0.2, friction=0.3)], solver=FINE,
-        time={"scheme": "backward-euler", "step": 0.01, "end": 0.6},
+        time={"scheme": scheme, "step": 0.01, "end": 0.6},
     )  # fmt: skip
     impulse, touched, before = np.zeros(2), 0, 0.0
     for report in each_step(scene, state):
@@ -85,7 +86,9 @@ def test_the_impulse_of_contact_is_what_balances_momentum() -> None:
         impulse += force * report.dt
         touched += force[1] > 0
         assert places(scene, state)[:, 1].min() > -0.2
-        assert abs(force[0]) <= 0.3 * before * (1 + 1e-9)  # lagged: of the normal force at the start of the step
+        if scheme == "backward-euler":  # others read the mean of a step
+            assert abs(force[0]) <= 0.3 * before * (1 + 1e-9)  # lagged: of the normal force at the start of the step
+        assert report.kinetic + report.elastic + state.dissipated < state.work + 1e-6 * 200
         before = force[1]
     momentum = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
     np.testing.assert_allclose(momentum, impulse - np.array([0.0, 100 * G * state.t]), atol=1e-4)

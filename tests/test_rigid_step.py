@@ -69,7 +69,8 @@ def test_gradient_and_hessian_of_the_incremental_potential(scheme: Scheme, hinge
     radius = 0.3 + rng.uniform(0.03, 0.2, 40)
     x = body.centre + way / np.linalg.norm(way, axis=1)[:, None] * radius[:, None]
     area, start = np.full(40, 0.02), body.at_first()
-    held = grip(x, area, Placed(body.shape, start.pose), barrier)
+    at_start = Placed(body.shape, start.pose)
+    held = grip(x, at_start.distance(x), area, at_start, barrier)
     assert len(held.points) > 5
     c_a, _ = scheme.rates(dt)
     step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, Blow.of(scheme).factor)

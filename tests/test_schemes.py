@@ -74,6 +74,21 @@ def test_dissipative_newmark_is_stable(dt: float) -> None:
     assert E[200:].max() < E[:200].max()
 
 
+@pytest.mark.parametrize("gamma", (0.5, 0.6, 0.8, 1.0))
+def test_newmark_is_refused_from_where_long_steps_grow(gamma: float) -> None:
+    """At a hundred times the period: at beta = gamma / 2 taken, and no growth; just below refused, with reason."""
+    for beta, stable in ((gamma / 2, True), (gamma / 2 - 0.02, False)):
+        scheme = Newmark(beta, gamma)
+        E = energy(run(scheme, W, 100.0, 60, START))
+        if stable:
+            scheme.check()
+            assert E[30:].max() < 1.01 * E[:30].max()
+        else:
+            with pytest.raises(ValueError, match="beta >= gamma / 2"):
+                scheme.check()
+            assert E[-1] > 1e2 * E[0]
+
+
 def test_newmark_is_the_trapezoidal_rule() -> None:
     """u' and v' integrated by trapezia: u1 = u0 + dt/2 (v0 + v1), v1 = v0 + dt/2 (a0 + a1)."""
     dt = 0.3

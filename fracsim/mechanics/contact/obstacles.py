@@ -77,8 +77,7 @@ class Obstacles(Touching, Term):
 
     def potential(self) -> float:
         """Barriers and friction at the end of the step as they enter that of r, this rank's share, J (collective)."""
-        energy = sum(each.energy + each.friction_energy for each in self.touching())
-        return self._level.weight * self._level.share * energy
+        return self._level.weight * self._level.share * sum(each.potential for each in self.touching())
 
     def arrive(self) -> None:
         """What contact has done in the step is booked (collective)."""
@@ -159,7 +158,7 @@ class Obstacles(Touching, Term):
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """New walls are part of the surface, drawn in where they would lie in an obstacle (collective)."""
         self.skin.edges_broke(pattern, self._at_end(), partial(least_distance, self._course.placed))
-        self._grips, self._touches = [None] * len(self.obstacles), None
+        self._forget_start()
 
     def memory(self) -> object:
         """That of what touches."""

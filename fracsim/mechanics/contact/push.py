@@ -49,7 +49,7 @@ def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) ->
         hessian = hessian + _summed(J, found.stick)
         d = pose.dim
         hessian[d:, d:] += second_order_turn(found.friction, arm).sum(axis=0)
-    return Push(found.energy + found.friction_energy, total, hessian, stiffness)
+    return Push(found.potential, total, hessian, stiffness)
 
 
 def on_obstacle(found: Touch, x: Values, pose: Pose) -> Values:

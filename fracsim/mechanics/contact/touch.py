@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from .along import Along
 from .barrier import Barrier
 from .friction import Friction
 from .placed import Placed
@@ -37,7 +38,8 @@ class Touch:
 
     Attributes:
         points: (k,) of the surface, with a gap below the barrier's width or gripped by friction.
-        energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.    friction_energy: J.
+        energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.
+        potential: J, of which both are minus the derivatives.
         make_parts: gives `exact` and `stick`, once they are asked for.
     """
 
@@ -45,7 +47,7 @@ class Touch:
     energy: float
     normal: Values
     friction: Values
-    friction_energy: float
+    potential: float
     make_parts: Callable[[], tuple[Values, Values]]
 
     @cached_property
@@ -68,44 +70,51 @@ class Touch:
         return positive(self.exact) + self.stick
 
 
-def grip(x: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
-    """Normal forces at places x (n, d) of the start of a step."""
-    gap = placed.distance(x)
+def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
+    """Normal forces at places x (n, d) of the start of a step, with gaps (n,), m."""
     near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
     return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near])
 
 
 def touch(
-    x: Values, area: Values, placed: Placed, barrier: Barrier, held: Grip | None, friction: Friction | None, way: Values
+    x: Values,
+    area: Values,
+    placed: Placed,
+    barrier: Barrier,
+    held: Grip | None,
+    friction: Friction | None,
+    way: Values,
+    start: Values | None = None,
 ) -> Touch:
     """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, or (k, d) of its places under
-    the points that are held, m.
+    the points that are held, m; `start`: (n,) gaps then, m, where the barrier acts along the way (along).
 
     The barrier's energy is the integral of b(gap) over the surface, each point with its area.
     """
     gap = placed.distance(x)
-    near = (gap < barrier.width) & (area > 0)
+    near = ((gap if start is None else np.minimum(gap, start)) < barrier.width) & (area > 0)
     if friction is not None and held is not None:
         near[held.points] = True
     points = np.flatnonzero(near)
     gap, share, at = gap[points], area[points], x[points]
-    normal, slope = placed.normal(at), barrier.slope(gap)
-    rubbed, stored = np.zeros_like(at), 0.0
+    acting = barrier if start is None else Along(barrier, start[points])
+    normal, slope = placed.normal(at), acting.slope(gap)
+    rubbed, rubbing = np.zeros_like(at), 0.0
     if friction is not None and held is not None and len(held.points):
         moved = x[held.points] - held.start - way
         rubbed[np.searchsorted(points, held.points)] = -friction.gradient(held.force, held.normal, moved)
-        stored = float(friction.energy(held.force, held.normal, moved).sum())
+        rubbing = float(friction.energy(held.force, held.normal, moved).sum())
 
     def parts() -> tuple[Values, Values]:
-        bent = barrier.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        bent = acting.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         exact = share[:, None, None] * (bent + slope[:, None, None] * placed.curvature(at))
         stick = np.zeros_like(exact)
         if friction is not None and held is not None and len(held.points):
             stick[np.searchsorted(points, held.points)] = friction.hessian(held.force, held.normal, moved)
         return exact, stick
 
-    energy = float(share @ barrier.energy(gap))
-    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, stored, parts)
+    energy, potential = (float(share @ each.energy(gap)) for each in (barrier, acting))
+    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, potential + rubbing, parts)
 
 
 def positive(blocks: Values) -> Values:

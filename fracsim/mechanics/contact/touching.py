@@ -32,6 +32,8 @@ class Touching:
     """
 
     x: Values
+    _grips: list[Grip | None]  # what friction holds of each
+    _gaps: list[Values | None]  # (n,) at the start of the step, where barriers act along the way, m
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
@@ -55,7 +57,7 @@ class Touching:
             return  # a look at what a step has ended with: grips and ways are still those of the step
         self._end, self._dt, self._began_with = end, level.dt, level.v
         self._take_places(end - level.dt, end)
-        self._grips: list[Grip | None] = [None] * len(self.obstacles)
+        self._forget_start()
         if level.dt:
             self._start_of_step()
 
@@ -67,9 +69,17 @@ class Touching:
         at = self._course.at_start
         self.skin.make_room(self._level.u, partial(least_distance, at))
         x = self.skin.places(self._level.u)
-        held = [grip(x, self.skin.area, placed, self.law.barrier) for placed in at]
+        gaps = [placed.distance(x) for placed in at]
+        held = [grip(x, gap, self.skin.area, placed, self.law.barrier) for gap, placed in zip(gaps, at, strict=True)]
         self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
+        if self._level.blow.along:
+            self._gaps = list(gaps)
         self._pushed = [each.force @ each.normal for each in held]
+
+    def _forget_start(self) -> None:
+        """The points are others than those that the step began with."""
+        none = [None] * len(self.obstacles)
+        self._grips, self._gaps, self._touches = [*none], [*none], None
 
     def _at_end(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
@@ -86,7 +96,8 @@ class Touching:
         """What an obstacle at `placed` does to the points where they are now."""
         obstacle, held = self.obstacles[number], self._grips[number]
         rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
-        return touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, self._under(number, placed))
+        under, start = self._under(number, placed), self._gaps[number]
+        return touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, under, start)
 
     def _under(self, number: int, placed: Placed) -> Values:
         """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""

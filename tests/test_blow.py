@@ -1,0 +1,90 @@
+"""Bodies that bounce: what the schemes do with forces of contact, against a particle by hand and the height it fell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
+from fracsim.mechanics.blow import Blow, given
+from support.scenes import each_step, make_scene, march
+
+Values = npt.NDArray[np.float64]
+SCHEMES: list[Scheme] = [BackwardEuler(), Newmark(), Newmark(0.4, 0.8), GeneralizedAlpha(), GeneralizedAlpha(0.0)]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES, ids=lambda each: type(each).__name__)
+def test_a_particle_that_is_struck(scheme: Scheme) -> None:
+    """m = 2 kg at v = 3, a = 5 is struck by f = 7 N over a step of 0.1 s: beside what a does, v changes by dt f / m and
+    u by theta dt^2 f / m (theta = 1, or beta / gamma), and what is carried on is as if nothing had struck it."""
+    dt, m, f = 0.1, 2.0, 7.0
+    c_a, _ = scheme.rates(dt)
+    start = np.zeros(1), np.full(1, 3.0), np.full(1, 5.0)
+    x, _ = scheme.references(dt, *start)
+    moved = np.full(1, Blow.of(scheme).factor * (1 - scheme.alpha_f) * f / m / c_a)
+    (u, v, a), (u_f, v_f, a_f) = scheme.finish(dt, x, *start), scheme.finish(dt, x + moved, *start)
+    newmark = getattr(scheme, "newmark", scheme)
+    theta = 1.0 if isinstance(scheme, BackwardEuler) else newmark.beta / newmark.gamma
+    assert [v_f - v, u_f - u] == pytest.approx([dt * f / m, theta * dt**2 * f / m], rel=1e-9)
+    assert a_f - given(scheme, dt, moved) == pytest.approx(a, rel=1e-9)
+
+
+def test_without_inertia_there_are_no_blows() -> None:
+    assert Blow.of(QuasiStatic()) == Blow()
+
+
+def bounce(scheme: str, step: float, **more: Any) -> float:
+    """Share of its height that a stiff block returns to which is thrown on the floor at 1 m/s as if from 0.05 m, by the
+    place and the velocity of its centre as it leaves. The barrier is wide: it takes 50 ms to turn it round."""
+    G, gap = 10.0, 0.031
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 1.0}, load={"gravity": [0.0, -G]},
+        material={"energy": "linear", "young": 1e7, "poisson": 0.0, "density": 100.0},
+        initial={"velocity": [0.0, -1.0]}, contact={"distance": 0.03, "stiffness": 3e3, "itself": False},
+        obstacle=[{"name": "floor", "shape": "plane", "at": [0.0, -gap], "normal": [0.0, 1.0]}],
+        solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9}, time={"scheme": scheme, "step": step, "end": 0.4}, **more,
+    )  # fmt: skip
+    mass = scene.balance.mass.lumped.reshape(-1, 2)[:, :1]
+    energy, touched = 0.5 * 100, False
+    for report in each_step(scene, state):
+        now = report.kinetic + report.elastic - state.work
+        assert now < energy + 1e-6
+        energy = now
+        force = scene.probes()[1]
+        if touched and force == 0:
+            break
+        touched |= force != 0
+    y, v = ((mass * field.reshape(-1, 2))[:, 1].sum() / 100 for field in (state.u, state.v))
+    return float((v**2 / (2 * G) + y) / 0.05)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "fine", "ratio"),
+    [("backward-euler", 0.6, 0.65), ("newmark", 0.95, 0.55), ("generalized-alpha", 0.95, 0.55)],
+)
+def test_a_bounce_returns_the_height_less_the_loss_of_the_scheme(scheme: str, fine: float, ratio: float) -> None:
+    """In 7, 25 and 50 steps from touch to leave: never higher, energy falls in every step, and the loss falls with the
+    step, to 4 % with second order; backward Euler loses a third."""
+    heights = [bounce(scheme, step) for step in (8e-3, 2e-3, 1e-3)]
+    assert heights == sorted(heights) and fine < heights[-1] < 1
+    assert (1 - heights[2]) / (1 - heights[1]) < ratio
+
+
+@pytest.mark.parametrize("scheme", ("backward-euler", "newmark", "generalized-alpha"))
+def test_what_holds_a_side_reads_the_force_that_presses_it(scheme: str) -> None:
+    """A platen comes near a side that is held: the body behind it stays as it is, and the reaction is the force that
+    the platen reads, not twice as much for the weight of a blow."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.5}, boundary=[{"on": "top", "fix": "xy"}],
+        contact={"distance": 0.03, "itself": False}, probe=[{"name": "held", "on": "top"}],
+        obstacle=[{"name": "platen", "shape": "plane", "at": [0.0, 0.525], "normal": [0.0, -1.0],
+                   "velocity": [0.0, -0.2]}],
+        time={"scheme": scheme, "step": 0.01, "end": 0.05},
+    )  # fmt: skip
+    march(scene, state)
+    row = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    assert row["contact_platen_y"] > 0.1 and not state.u.any()
+    assert row["reaction_held_y"] == pytest.approx(row["contact_platen_y"], rel=1e-9)
