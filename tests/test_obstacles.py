@@ -78,7 +78,7 @@ def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT, load={"gravity": [0.0, -G]},
         obstacle=[floor(-0.2, friction=0.3)], solver=FINE,
-        time={"scheme": scheme, "step": 0.01, "end": 0.6},
+        time={"scheme": scheme, "step": 0.01, "end": 0.5},
     )  # fmt: skip
     impulse, touched, before = np.zeros(2), 0, 0.0
     for report in each_step(scene, state):
@@ -92,7 +92,7 @@ def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
         before = force[1]
     momentum = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
     np.testing.assert_allclose(momentum, impulse - np.array([0.0, 100 * G * state.t]), atol=1e-4)
-    assert touched > 20 and np.ptp(impulse) > 500
+    assert touched > 15 and np.ptp(impulse) > 500
 
 
 def test_a_body_at_rest_is_carried() -> None:

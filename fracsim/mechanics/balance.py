@@ -6,7 +6,8 @@ K(u) = d r / d u
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 
 import numpy as np
@@ -67,6 +68,7 @@ class Balance:
         self.motion, self.mass, self.scheme, self.blow = motion, mass, scheme, Blow.of(scheme)
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
+        self._touches = True  # whether the tangent has contact in it
         self.low_rank: list[tuple[Values, Values]] = []
         self.vector = assembler.vector()
         self._kept = assembler.vector()
@@ -238,11 +240,18 @@ class Balance:
             self.mass.add_to(K, factor)
         for term in self.terms:
             term.add_stiffness(K)
-            if (coupling := term.coupling()) is not None:
+            if self._touches and (coupling := term.coupling()) is not None:
                 self._couple(K, coupling)
-        self.low_rank = [part for term in self.terms for part in term.low_rank()]
+        self.low_rank = [part for term in self.terms for part in term.low_rank()] if self._touches else []
         for U, _ in self.low_rank:
             U[self.motion.owned] = 0.0
+
+    @contextmanager
+    def untouched(self) -> Iterator[None]:
+        """The tangent of a body that touches nothing."""
+        self._touches = False
+        yield
+        self._touches = True
 
     def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat) -> None:
         """K += a matrix of another pattern, but for prescribed dofs (collective)."""

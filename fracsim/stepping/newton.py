@@ -236,7 +236,8 @@ class Solver:
     # --- linear solves by themselves ---
 
     def linear_response(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m.
+        """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m, where
+        nothing else touches the body.
 
         Near incompressibility tangents may be indefinite: factors where iterations fail. 0 where nothing helps, which
         is counted.
@@ -245,7 +246,7 @@ class Solver:
         with_factors = [False, True] if self._may_factorise() else [False]
         for factors in with_factors[1:] if self._with_factors else with_factors:
             self.balance.vector.array_w[:] = force
-            with self._factors() if factors else nullcontext():
+            with self.balance.untouched(), self._factors() if factors else nullcontext():
                 solved = self._solve_linear()
             if solved:
                 return np.asarray(self._correction.array_r.copy())

@@ -4,7 +4,8 @@ M a of before would push for a part of it once more, with energy that is counted
 changes by c_a (c_a M + K)^-1 f of the forces f that the breaks released, K of the body before them: M^-1 f for motion
 that steps resolve, with an error of second order, and as good as nothing for what is over long before the step's end.
 M^-1 f itself, or K after the breaks, sets slivers and cells that hang by an edge ringing: energy that was kept to 1 %
-doubled.
+doubled. Contact is not in K: blows (mechanics.blow) are no part of the acceleration that is carried, and what it loses
+by breaks inside a body has no resultant.
 """
 
 from __future__ import annotations

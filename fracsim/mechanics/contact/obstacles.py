@@ -45,7 +45,9 @@ class Obstacles(Touching, Term):
         """InputError where the body at rest lies in an obstacle (collective)."""
         super().__init__(domain, u, obstacles, law)
         self._coupling, self._drawings = Coupling(domain), Drawings(obstacles, domain.lower, domain.upper)
-        self._worked, self._lost = [0.0] * len(self.obstacles), 0.0  # J, of each, and by friction, in the last step
+        # of the last step: work of each obstacle, J, what friction took, J, and forces on each, N
+        self._worked, self._lost = [0.0] * len(self.obstacles), 0.0
+        self._read = [np.zeros(domain.dim)] * len(self.obstacles)
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
@@ -81,7 +83,8 @@ class Obstacles(Touching, Term):
 
     def arrive(self) -> None:
         """What contact has done in the step is booked (collective)."""
-        self._lost = 0.0
+        self._lost, found = 0.0, self.touching()
+        self._read = [-(each.normal + each.friction).sum(axis=0) for each in found]
         for number in range(len(self.obstacles)):
             moved, under = self.rubbed(number)
             self._worked[number] = self._pressed(number) + under
@@ -184,7 +187,7 @@ class Obstacles(Touching, Term):
     # --- columns of history.csv, and what the end of a run tells ---
 
     def readings(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) forces of the body on each obstacle, this rank's share, N (collective)."""
+        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the step that has ended, this rank's share, N."""
         return {
             f"contact_{each.name}_{axis}": partial(self._on_obstacle, number, place)
             for number, each in enumerate(self.obstacles)
@@ -192,8 +195,7 @@ class Obstacles(Touching, Term):
         }
 
     def _on_obstacle(self, number: int, axis: int) -> Values:
-        found = self.touching()[number]
-        return -(found.normal + found.friction)[:, axis].sum(keepdims=True)
+        return self._read[number][axis : axis + 1]
 
     def least(self) -> dict[str, Callable[[], float]]:
         """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none."""
