@@ -187,7 +187,7 @@ class Obstacles(Touching, Term):
     # --- columns of history.csv, and what the end of a run tells ---
 
     def readings(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the step that has ended, this rank's share, N."""
+        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, this rank's share, N."""
         return {
             f"contact_{each.name}_{axis}": partial(self._on_obstacle, number, place)
             for number, each in enumerate(self.obstacles)
