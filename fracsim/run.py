@@ -32,6 +32,7 @@ from .study.file import study_text
 
 if TYPE_CHECKING:
     from .output.meetings import Meetings
+    from .output.overlapping import Overlapping
     from .output.passing import Passing
 
 FRAMES = 50  # of a run whose study says neither every nor interval
@@ -115,25 +116,31 @@ class Run:
         stress = self.scene.balance.stress
         self.inverted = InvertedCells(stress, self.scene.fracture)
         self.gained = EnergyGain(at_rest=self.scene.study.at_rest, floor=worth_telling(stress))
-        self.meetings, self.passing = self._contact_watched()
-        others = [each for each in (self.meetings, self.passing) if each is not None]
+        self.meetings, self.overlapping, self.passing = self._contact_watched()
+        others = [each for each in (self.meetings, self.overlapping, self.passing) if each is not None]
         self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter, others)
         if notes is not None:
             self.monitors.restore(notes.monitors)
 
-    def _contact_watched(self) -> tuple[Meetings | None, Passing | None]:
-        """What watches obstacles, and pieces that nothing keeps apart: each only where it can tell anything."""
-        study, meetings, passing = self.scene.study, None, None
+    def _contact_watched(self) -> tuple[Meetings | None, Overlapping | None, Passing | None]:
+        """What watches obstacles, those that move freely, and pieces that nothing keeps apart: each only where it can
+        tell anything."""
+        study, meetings, overlapping, passing = self.scene.study, None, None, None
         if study.obstacle:
             from .mechanics.contact.obstacles import Obstacles
             from .output.meetings import Meetings
 
-            meetings = Meetings(next(term for term in self.scene.balance.terms if isinstance(term, Obstacles)))
+            contact = next(term for term in self.scene.balance.terms if isinstance(term, Obstacles))
+            meetings = Meetings(contact)
+            if len(study.obstacle) > 1 and any(each.free for each in study.obstacle):
+                from .output.overlapping import Overlapping
+
+                overlapping = Overlapping(contact)
         if wants_surface(study) and (study.contact is None or not study.contact.itself):
             from .output.passing import Passing
 
             passing = Passing()
-        return meetings, passing
+        return meetings, overlapping, passing
 
     # --- one step, one frame, one checkpoint ---
 
@@ -160,6 +167,8 @@ class Run:
         began = time.perf_counter()
         self.inverted.look(self.state.t)
         self.frames.write(self.state)
+        if self.overlapping is not None:
+            self.overlapping.look(self.state.t)
         self._clock.wrote(self.state)
         self._meter.output += time.perf_counter() - began
 
@@ -228,6 +237,8 @@ class Run:
         notes = self.monitors.notes(self.scene.study.material.energy, self.scene.study.time.scheme)
         if self.meetings is not None:
             notes += self.meetings.notes(done=outcome == "done")
+        if self.overlapping is not None:
+            notes += self.overlapping.notes()
         if self.passing is not None:
             notes += self.passing.notes(implicit=self.scene.study.time.kind.implicit)
         say(self.comm, notes)

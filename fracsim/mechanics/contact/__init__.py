@@ -8,6 +8,7 @@ free_obstacles    the term with obstacles that move by themselves; free_obstacle
 free_pose         where one of them belongs, with the body where it is
 rigid_step, push  its pose in a step as the least of an incremental potential; what contact does to the pose
 turn              rotation vectors that are not small
+overlap           free obstacles that lie in others
 reach             how far points may go, first guesses that have passed through nothing
 
 shapes            the register of shapes, by the name that a user writes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class FreeObstacle(Obstacle):
     centre: Values
     gravity: Values
     rate: Values
+    free: ClassVar[bool] = True
 
     @cached_property
     def count(self) -> int:

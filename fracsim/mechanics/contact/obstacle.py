@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,6 +29,7 @@ class Obstacle:
     at: Values
     moved: TimeFunction | None = None
     friction: float = 0.0
+    free: ClassVar[bool] = False  # whether it has a mass, and moves by itself
 
     def placed(self, t: float) -> Placed:
         """Where it is at time t, s."""

@@ -36,7 +36,7 @@ class Touching:
     _gaps: list[Values | None]  # (n,) at the start of the step, where barriers act along the way, m
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
-        """InputError where the body at rest lies in an obstacle (collective)."""
+        """InputError where the body at rest lies in an obstacle, or a free obstacle in another one (collective)."""
         self.obstacles, self.law, self.skin = tuple(obstacles), law, Skin(domain, law.barrier.width)
         self._course = Course(self.obstacles, self._led())
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
@@ -44,6 +44,10 @@ class Touching:
         self._touches: list[Touch] | None = None
         self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
         check_apart(self.comm, self.skin.rest, self.obstacles)
+        if any(each.free for each in self.obstacles):
+            from .overlap import check_free_apart
+
+            check_free_apart(self.obstacles)
 
     def _led(self) -> list[int]:
         """Numbers of those whose way is known: all that are held or driven."""
