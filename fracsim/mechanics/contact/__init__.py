@@ -5,6 +5,7 @@ touching, touch   what touches in a step; barrier and friction at the points of 
 skin, course      the points that touch; obstacles on their ways
 obstacle          one that is held or driven
 free_obstacles    the term with obstacles that move by themselves; free_obstacle, shifted: one of them, on a hinge
+stops, stop       other obstacles that a free one meets; skeleton: the points that do
 free_pose         where one of them belongs, with the body where it is
 rigid_step, push  its pose in a step as the least of an incremental potential; what contact does to the pose
 turn              rotation vectors that are not small

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from .obstacle import Obstacle
 from .placed import Placed
-from .reach import safe_shares
+from .reach import Way, safe_shares
 
 Values = npt.NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Course:
         """One whose way is not known yet stays where it began."""
         self.placed[number] = self.at_start[number] = placed
 
-    def known(self) -> list[tuple[Placed, Values]]:
+    def known(self) -> list[Way]:
         """Where each obstacle whose way is known is at the start of the step, and its way (p,) to the end."""
         return [(self.at_start[number], self.ways[number]) for number in self.led]
 
@@ -54,12 +54,17 @@ class Course:
         """Whether all have gone all of their way."""
         return self._gone == 1
 
-    def go_on(self, x: Values, least: Callable[[Values], float]) -> None:
-        """A share of the rest of the way that is safe with points at x (n, d); `least`: of shares (n,), on all ranks
-        (collective)."""
+    def rest(self) -> dict[int, Way]:
+        """Where each whose way is known is now, and what is left of its way (p,), by numbers."""
+        ways = zip(self.led, self.known(), strict=True)
+        return {number: (self._after(*way), (1 - self._gone) * way[1]) for number, way in ways}
+
+    def go_on(self, x: Values, least: Callable[[Values], float], most: float = 1.0) -> None:
+        """A share of the rest of the way, `most` at most, that is safe with points at x (n, d); `least`: of shares
+        (n,), on all ranks (collective)."""
         rest, still = 1 - self._gone, np.zeros_like(x)
-        shares = [safe_shares(self._after(*way), x, still, rest * way[1]) for way in self.known()]
-        share = least(np.min(shares, axis=0)) if shares else 1.0
+        shares = [safe_shares(placed, x, still, way) for placed, way in self.rest().values()]
+        share = min(least(np.min(shares, axis=0)) if shares else 1.0, most)
         self._gone = 1.0 if share == 1 else self._gone + share * rest
         for number, way in zip(self.led, self.known(), strict=True):
             self.placed[number] = self._after(*way)

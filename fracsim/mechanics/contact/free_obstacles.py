@@ -8,7 +8,8 @@ method within the term. The body sees what is left, a function of x alone:
 So the system of equations keeps its size, and its solution is the same as if poses were among its unknowns. The last
 part couples all points in touch with one another; it is of rank k, the freedoms of an obstacle, and is applied, not
 stored. (Without it a disk of a third of the body's mass takes 17,892 iterations in place of 127, or finds no solution.)
-Every rank finds the same poses from sums over all ranks. Free obstacles meet the body alone, not one another.
+Every rank finds the same poses from sums over all ranks. Free obstacles meet those that are held or driven (stops), but
+not one another.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from .obstacle import Obstacle
 from .obstacles import Obstacles
 from .placed import Placed
 from .rigid_step import RigidStep
+from .stops import Stops
 from .touch import Touch
 
 Values = npt.NDArray[np.float64]
@@ -51,7 +53,12 @@ class FreeObstacles(Obstacles):
         self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law, scheme: Scheme
     ) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
-        self.free = {number: FreePose(each) for number, each in enumerate(obstacles) if isinstance(each, FreeObstacle)}
+        others = {number: each for number, each in enumerate(obstacles) if not each.free}
+        self.free = {
+            number: FreePose(each, Stops(each, others, law.barrier))
+            for number, each in enumerate(obstacles)
+            if isinstance(each, FreeObstacle)
+        }
         self._scheme = scheme
         self._settled_at: Values | None = None  # places of the points that poses belong to
         super().__init__(domain, u, obstacles, law)
@@ -72,6 +79,7 @@ class FreeObstacles(Obstacles):
         for number, each in self.free.items():
             step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, level.blow.factor)
             self._course.ways[number] = each.begin(step, self._grips[number])
+            each.stops.begin(each.flight.pose, self._course.at_start, along=level.blow.along)
 
     def memory(self) -> object:
         """That of the points, and how obstacles move."""
@@ -99,7 +107,7 @@ class FreeObstacles(Obstacles):
         super().arrive()
         found = self.touching()
         for number, each in self.free.items():
-            each.arrive(found[number], self.x, self.comm)
+            each.arrive(found[number], self._around(number))
 
     # --- where free obstacles are ---
 
@@ -119,7 +127,7 @@ class FreeObstacles(Obstacles):
         return bool(self._level.dt) and all(each.is_under_way for each in self.free.values())
 
     def _around(self, number: int) -> Around:
-        return Around(self.skin, self.x, partial(self._feel, number))
+        return Around(self.skin, self.x, partial(self._feel, number), self._course.placed)
 
     def _place(self) -> None:
         """All see free obstacles where they are."""
@@ -136,9 +144,19 @@ class FreeObstacles(Obstacles):
 
     def potential(self) -> float:
         """That of all obstacles, with the inertia and the weight of the free ones on rank 0, J (collective)."""
-        energy = super().potential()
-        if self.comm.rank == 0 and self._level.dt:
-            energy += sum(each.step.own(each.z) for each in self.free.values())
+        energy, level = super().potential(), self._level
+        if self.comm.rank == 0 and level.dt:
+            for each in self.free.values():
+                _, stopped = each.stops.energies(each.placed.pose, self._course.placed)
+                energy += each.step.own(each.z) + level.weight * level.share * stopped
+        return energy
+
+    def stored(self) -> float:
+        """That of all obstacles, with the barriers between them on rank 0, J (collective)."""
+        energy = super().stored()
+        if self.comm.rank == 0:
+            placed = self._course.placed
+            energy += sum(each.stops.energies(each.placed.pose, placed)[0] for each in self.free.values())
         return energy
 
     def low_rank(self) -> list[tuple[Values, Values]]:
@@ -167,12 +185,13 @@ class FreeObstacles(Obstacles):
         return self.free[number].pressed(self.touching()[number], self.x)
 
     def driven(self) -> tuple[float, float]:
-        """With the work of gravity on free obstacles (collective)."""
+        """With the work of gravity, and of other obstacles' motion, on free ones (collective)."""
         work, lost = super().driven()
         if self.comm.rank == 0:
             for number, each in self.free.items():
                 ends = self._course.at_start[number].pose, each.placed.pose
                 work += each.body.weight(ends[0])[0] - each.body.weight(ends[1])[0]
+                work += each.stops.work(ends[1], self._course.placed, self._course.ways)
         return work, lost
 
     def kinetic(self) -> float:
@@ -203,14 +222,39 @@ class FreeObstacles(Obstacles):
         moved = self.skin.places(level.at_end(u)) - x
         share, taken = 1.0, {}
         for number, each in self.free.items():
-            onward, still = each.step.ahead, 0 * each.step.ahead
-            ahead, stays = (each.safe_share(self.skin, x, moved, z) for z in (onward, still))
-            taken[number] = onward if ahead == 1 or stays < 1 else still
-            share = min(share, ahead if stays < 1 else 1.0)
+            taken[number], free = self._first_guess(each, x, moved)
+            share = min(share, free)
         for number, z in taken.items():
             self.free[number].put(share * z)
         self._place()
         return u if share == 1 else np.asarray(level.u + share * (u - level.u))
+
+    def _first_guess(self, each: FreePose, x: Values, moved: Values) -> tuple[Values, float]:
+        """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
+        that way that closes no gap, with points that go from x (n, d) by `moved` (collective)."""
+        others = dict(zip(self._course.led, self._course.known(), strict=True))
+        along = [each.led_by(way) for _, way in others.values() if way.any()]
+        ways = [each.step.ahead, 0 * each.step.ahead, *along]
+        first = 0.0
+        for z in ways:
+            share = each.safe_share(self.skin, x, moved, z, others)
+            if share == 1:
+                return z, 1.0
+            first = min(first, share) if first else share
+        return ways[0], first
+
+    def clear(self, u: Values) -> bool:
+        """Whether every gap is open with the body at u, those between obstacles as well (collective)."""
+        placed = self._course.placed
+        apart = all(each.stops.are_open(each.placed.pose, placed) for each in self.free.values())
+        return super().clear(u) and apart
+
+    def _go_on(self, x: Values) -> None:
+        """As far as free obstacles let others."""
+        rest, still = self._course.rest(), np.zeros_like(self._course.ways[0])
+        shares = [each.stops.safe_share(each.placed.pose, still, rest) for each in self.free.values()]
+        self._course.go_on(x, self.skin.safe, min(shares))
+        self._touches = self._settled_at = None
 
     def hold_back(self) -> None:
         """All stay where the step began (collective)."""

@@ -17,9 +17,10 @@ from ...mesh.ranks import total
 from .free_obstacle import Flight, FreeObstacle
 from .placed import Placed
 from .push import Push, by_point_and_pose, on_obstacle, push, resultant
-from .reach import safe_shares
+from .reach import Way, safe_shares
 from .rigid_step import RigidStep
 from .skin import Skin
+from .stops import Stops
 from .touch import Grip, Touch
 
 Values = npt.NDArray[np.float64]
@@ -31,11 +32,13 @@ class Around:
 
     Attributes:
         skin: its points.    x: (n, d) where they are, m.    feel: what the obstacle does to them at a place.
+        placed: where all obstacles are, by their numbers.
     """
 
     skin: Skin
     x: Values
     feel: Callable[[Placed], Touch]
+    placed: list[Placed]
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,9 @@ class FreePose:
     z: Values
     placed: Placed
 
-    def __init__(self, body: FreeObstacle) -> None:
-        self.body, self.flight = body, body.at_first()
+    def __init__(self, body: FreeObstacle, stops: Stops) -> None:
+        """`stops`: what it meets beside the body."""
+        self.body, self.flight, self.stops = body, body.at_first(), stops
         self._of: Flight | None = None  # that the step began with
         self._found: Values | None = None  # z of the last solution of this step
         self._settled: Push | None = None  # what contact does to it at z
@@ -87,9 +91,11 @@ class FreePose:
         """Whether the step that began is not over yet."""
         return self._of is self.flight
 
-    def arrive(self, found: Touch, x: Values, comm: MPI.Comm) -> None:
-        """The step is over: it has the momentum that points in touch at x (n, d) gave it (collective)."""
-        self.flight = self.step.arrived(self.z, total(comm, on_obstacle(found, x, self.placed.pose)))
+    def arrive(self, found: Touch, around: Around) -> None:
+        """The step is over: it has the momentum that points in touch, and stops, gave it (collective)."""
+        pose = self.placed.pose
+        pushed = total(around.skin.comm, on_obstacle(found, around.x, pose)) + self.stops.force(pose, around.placed)
+        self.flight = self.step.arrived(self.z, pushed)
         self._found = self.z
 
     def under(self, held: Grip, placed: Placed) -> Values:
@@ -112,10 +118,11 @@ class FreePose:
         self._settled = None
         for z in self._candidates(around):
             self.put(z)
-            if around.skin.are_apart(self.placed.distance(around.x)):
+            open_to_body = around.skin.are_apart(self.placed.distance(around.x))
+            if open_to_body and self.stops.are_open(self.placed.pose, around.placed):
                 break
         else:
-            return  # the body is in the obstacle: Newton's method finds no finite force, and fails
+            return  # the body or a stop is in the obstacle: Newton's method finds no finite force, and fails
         z, self._settled = self.step.settle(z, partial(self._push, around), partial(self._free, around))
         self.put(z)
 
@@ -137,12 +144,15 @@ class FreePose:
         """What contact does to the obstacle at z, of all ranks (collective)."""
         self.put(z)
         mine = push(around.feel(self.placed), around.x, self.placed.pose, self._held, self.step.start.pose)
-        return _summed(mine, around.skin.comm)
+        return _summed(mine, around.skin.comm) + self.stops.push(self.placed.pose, around.placed)
 
     def _free(self, around: Around, z: Values, dz: Values) -> float:
         """Share of the way from z by dz that closes no gap, with the body where it is (collective)."""
         self.put(z)
-        return around.skin.safe(safe_shares(self.placed, around.x, 0 * around.x, self.step.onward(z, dz)))
+        q, still = self.step.onward(z, dz), 0 * around.x
+        others = {number: (placed, np.zeros_like(q)) for number, placed in enumerate(around.placed)}
+        share = self.stops.safe_share(self.placed.pose, q, others)
+        return min(share, around.skin.safe(safe_shares(self.placed, around.x, still, q)))
 
     # --- how it gives way ---
 
@@ -167,10 +177,17 @@ class FreePose:
         """Newton's method starts anew."""
         self._way = None
 
-    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values) -> float:
-        """Share of the ways of points and obstacle, from the start of the step, that closes no gap (collective)."""
-        start = Placed(self.body.shape, self.step.start.pose)
-        return skin.safe(safe_shares(start, x, moved, self.step.increment(z)))
+    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values, others: dict[int, Way]) -> float:
+        """Share of the ways of points, obstacle and others, from the start of the step, that closes no gap
+        (collective)."""
+        start, q = Placed(self.body.shape, self.step.start.pose), self.step.increment(z)
+        share = self.stops.safe_share(start.pose, q, others)
+        return min(share, skin.safe(safe_shares(start, x, moved, q)))
+
+    def led_by(self, way: Values) -> Values:
+        """(k,) z that takes it along with an obstacle on its way (p,), as far as it may go there."""
+        d = self.step.start.pose.dim
+        return np.asarray(np.linalg.lstsq(self.body.ways[:d], way[:d], rcond=None)[0])
 
     def pressed(self, found: Touch, x: Values) -> float:
         """Work of normal forces on the body in the step, by the way of the obstacle, this rank's share, J."""

@@ -1,4 +1,4 @@
-"""How deep obstacles lie in one another: what moves freely passes through all but the body."""
+"""How deep obstacles lie in one another: two that move freely do not feel each other."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ def pairs(obstacles: Sequence[Obstacle]) -> list[tuple[int, int]]:
     return [(a, b) for a, b in either if obstacles[a].free]
 
 
-def overlaps(placed: Sequence[Placed], among: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, float]]:
-    """Those of the pairs that overlap, and how deep, m."""
+def overlaps(
+    placed: Sequence[Placed], among: Sequence[tuple[int, int]], least: float = LEAST
+) -> Iterator[tuple[int, int, float]]:
+    """Those of the pairs that overlap by more than `least` of the size of the first, and how deep, m."""
     for a, b in among:
         size = float(np.ptp(placed[a].shape.outline()[0], axis=0).max())
-        if (deep := depth(placed[a], placed[b])) > LEAST * size:
+        if (deep := depth(placed[a], placed[b])) > least * size:
             yield a, b, deep
 
 
@@ -48,9 +50,9 @@ def depth(body: Placed, other: Placed) -> float:
 
 
 def check_free_apart(obstacles: Sequence[Obstacle]) -> None:
-    """InputError where a free obstacle overlaps another one at the start."""
-    for a, b, deep in overlaps([each.placed(0.0) for each in obstacles], pairs(obstacles)):
+    """InputError where a free obstacle overlaps or touches another one at the start."""
+    for a, b, deep in overlaps([each.placed(0.0) for each in obstacles], pairs(obstacles), -LEAST):
         raise InputError(
             f"obstacle.{a}: {obstacles[a].name} moves freely and overlaps {obstacles[b].name} at the start, by "
-            f"{deep:.4g} m; move it away or make it smaller"
+            f"{max(0.0, deep):.4g} m; move it away or make it smaller"
         )

@@ -30,6 +30,13 @@ class Push:
     hessian: Values
     stiffness: Values
 
+    def __add__(self, other: Push) -> Push:
+        """Both together."""
+        return Push(
+            self.energy + other.energy, self.gradient + other.gradient, self.hessian + other.hessian,
+            self.stiffness + other.stiffness,
+        )  # fmt: skip
+
 
 def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) -> Push:
     """Of points in touch at x (n, d), m; friction holds the places of the obstacle that were under them at its pose at
@@ -50,6 +57,16 @@ def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) ->
         d = pose.dim
         hessian[d:, d:] += second_order_turn(found.friction, arm).sum(axis=0)
     return Push(found.potential, total, hessian, stiffness)
+
+
+def carried(found: Touch, x: Values, pose: Pose) -> Push:
+    """Of points in touch at x (n, d), m, that the body carries itself: they go by -J q."""
+    arm = x[found.points] - pose.centre
+    J, gradient = _by_pose(arm), -found.normal
+    stiffness, hessian = (_summed(J, blocks) for blocks in (found.stiffness, found.exact))
+    d = pose.dim
+    hessian[d:, d:] += second_order_turn(gradient, arm).sum(axis=0)
+    return Push(found.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
 
 
 def on_obstacle(found: Touch, x: Values, pose: Pose) -> Values:

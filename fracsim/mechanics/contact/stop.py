@@ -1,0 +1,113 @@
+"""A free obstacle before one that is held or driven: points of the skeleton of each, and the distance to the other.
+
+    E = sum over points of both of  A b(gap),    gap: distance to the other shape less the radius of the skeleton
+
+A the share of a point in the surface of its shape, b the barrier of the contact with the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from .barrier import Barrier, longest_step
+from .obstacle import Obstacle
+from .placed import Placed
+from .pose import Pose, turned
+from .reach import safe_shares
+from .shape import Shape
+from .skeleton import Grown, Skeleton, skeleton
+from .touch import Touch, touch
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """Of a free obstacle, the first, and another one.
+
+    Attributes:
+        bones: their skeletons.    areas: (n,) shares of their points, m^2.    seen: what the points of each see of the
+            other, grown by their radius.
+    """
+
+    bones: tuple[Skeleton, Skeleton]
+    areas: tuple[Values, Values]
+    seen: tuple[Shape, Shape]
+
+    @classmethod
+    def of(cls, body: Obstacle, other: Obstacle) -> Stop:
+        """Between two obstacles."""
+        mine, its = skeleton(body.shape), skeleton(other.shape)
+        areas = np.full(len(mine.points), mine.share), np.full(len(its.points), its.share)
+        seen = Grown(other.shape, mine.radius), Grown(body.shape, its.radius)
+        return cls((mine, its), areas, cast("tuple[Shape, Shape]", seen))  # what `touch` asks of a shape they have
+
+    def sides(self, body: Pose, other: Pose) -> Iterator[tuple[Values, Placed]]:
+        """(n, d) points of each in space, m, and what they see of the other one."""
+        yield body.points_to_space(self.bones[0].points), Placed(self.seen[0], other)
+        yield other.points_to_space(self.bones[1].points), Placed(self.seen[1], body)
+
+    def gaps(self, body: Pose, other: Pose) -> list[Values]:
+        """(n,) of the points of each, m."""
+        return [placed.distance(x) for x, placed in self.sides(body, other)]
+
+    def touches(
+        self, body: Pose, other: Pose, barrier: Barrier, start: list[Values] | None
+    ) -> list[tuple[Touch, Values]]:
+        """What acts on the points of each, and where these are; `start`: gaps as the step began (along)."""
+        begun: Sequence[Values | None] = start or (None, None)
+        still = np.zeros(body.dim)
+        return [
+            (touch(x, area, placed, barrier, None, None, still, gap), x)
+            for (x, placed), area, gap in zip(self.sides(body, other), self.areas, begun, strict=True)
+        ]
+
+    def safe_share(self, body: Pose, q: Values, other: Pose, shift: Values) -> float:
+        """Share of the ways q (p,) of the body and `shift` (d,) of the other one that leaves a tenth of each gap."""
+        (x, there), (y, here) = self.sides(body, other)
+        way = _Way(there, x - body.centre, body.centre, q, shift)
+        back = safe_shares(here, y, np.tile(shift, (len(y), 1)), q)
+        return min(way.safe_share(), float(back.min(initial=1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Points go with a body, arms (n, d) about its centre, by q (p,), and an obstacle before them by `shift` (d,)."""
+
+    obstacle: Placed
+    arm: Values
+    centre: Values
+    q: Values
+    shift: Values
+
+    def safe_share(self) -> float:
+        """Of the way, that leaves a tenth of each gap; 0 where one is closed."""
+        if not len(self.arm):
+            return 1.0
+        if not (self.gap(np.zeros(len(self.arm))) > 0).all():
+            return 0.0
+        return float(longest_step(self.gap, self.speed, len(self.arm)).min())
+
+    def gap(self, share: Values) -> Values:
+        """(n,) after shares (n,) of the way, m."""
+        return self.obstacle.distance(self._at(share))
+
+    def speed(self, share: Values) -> Values:
+        """(n,) bounds of how fast gaps close, m per whole way (motion.Motion)."""
+        straight, turn = self._straight(), self.q[len(self.shift) :]
+        closing: Values = np.full(len(self.arm), float(np.linalg.norm(straight)))
+        if self.obstacle.shape.convex:
+            closing = np.maximum(-self.obstacle.normal(self._at(share)) @ straight, 0.0)
+        return np.asarray(closing + np.linalg.norm(turn) * np.linalg.norm(self.arm, axis=1))
+
+    def _straight(self) -> Values:
+        return self.q[: len(self.shift)] - self.shift
+
+    def _at(self, share: Values) -> Values:
+        turn = share[:, None] * self.q[len(self.shift) :]
+        return np.asarray(self.centre + share[:, None] * self._straight() + turned(self.arm, turn))
