@@ -22,6 +22,7 @@ drawing           what is drawn of an obstacle at its pose
 outlines, axes    triangles and segments to draw a shape with; frames about an axis
 pose, placed      where a rigid obstacle is, and derivatives of the distance to it with respect to its pose
 motion            points and obstacle on their way: gaps, and bounds of how fast they close
+bent              the gap to a round obstacle over a step in which a point slides around it
 barrier, along    energy that keeps gaps open (IPC), and how far points may move without passing through; its force
                   as a mean over a step
 friction          Coulomb friction as a lagged, smoothed potential (IPC)

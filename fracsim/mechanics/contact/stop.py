@@ -7,7 +7,7 @@ A the share of a point in the surface of its shape, b the barrier of the contact
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .barrier import Barrier, longest_step
+from .bent import Start
 from .obstacle import Obstacle
 from .placed import Placed
 from .pose import Pose, turned
@@ -60,7 +61,7 @@ class Stop:
         self, body: Pose, other: Pose, barrier: Barrier, start: list[Values] | None
     ) -> list[tuple[Touch, Values]]:
         """What acts on the points of each, and where these are; `start`: gaps as the step began (along)."""
-        begun: Sequence[Values | None] = start or (None, None)
+        begun = [None, None] if start is None else [Start.straight(gap, body.dim) for gap in start]
         still = np.zeros(body.dim)
         return [
             (touch(x, area, placed, barrier, None, None, still, gap), x)

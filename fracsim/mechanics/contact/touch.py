@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from .along import Along
 from .barrier import Barrier
+from .bent import Start
 from .friction import Friction
 from .placed import Placed
 
@@ -84,21 +85,24 @@ def touch(
     held: Grip | None,
     friction: Friction | None,
     way: Values,
-    start: Values | None = None,
+    start: Start | None = None,
 ) -> Touch:
     """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, or (k, d) of its places under
-    the points that are held, m; `start`: (n,) gaps then, m, where the barrier acts along the way (along).
+    the points that are held, m; `start`: all as they were then, where the barrier acts along the way (along, bent).
 
     The barrier's energy is the integral of b(gap) over the surface, each point with its area.
     """
     gap = placed.distance(x)
-    near = ((gap if start is None else np.minimum(gap, start)) < barrier.width) & (area > 0)
+    near = ((gap if start is None else np.minimum(gap, start.gap)) < barrier.width) & (area > 0)
     if friction is not None and held is not None:
         near[held.points] = True
     points = np.flatnonzero(near)
     gap, share, at = gap[points], area[points], x[points]
-    acting = barrier if start is None else Along(barrier, start[points])
-    normal, slope = placed.normal(at), acting.slope(gap)
+    normal = placed.normal(at)
+    acting = barrier if start is None else Along(barrier, start.gap[points])
+    bent = None if start is None else start.bent(points, gap, normal, at)
+    along, value = (normal, gap) if bent is None else (bent.gradient, bent.value)
+    slope = acting.slope(value)
     rubbed, rubbing = np.zeros_like(at), 0.0
     if friction is not None and held is not None and len(held.points):
         moved = x[held.points] - held.start - way
@@ -106,15 +110,18 @@ def touch(
         rubbing = float(friction.energy(held.force, held.normal, moved).sum())
 
     def parts() -> tuple[Values, Values]:
-        bent = acting.curvature(gap)[:, None, None] * normal[:, :, None] * normal[:, None, :]
-        exact = share[:, None, None] * (bent + slope[:, None, None] * placed.curvature(at))
+        stiff = acting.curvature(value)[:, None, None] * along[:, :, None] * along[:, None, :]
+        curved = placed.curvature(at)
+        if bent is not None:
+            curved = bent.of_curvature[:, None, None] * curved + bent.rest
+        exact = share[:, None, None] * (stiff + slope[:, None, None] * curved)
         stick = np.zeros_like(exact)
         if friction is not None and held is not None and len(held.points):
             stick[np.searchsorted(points, held.points)] = friction.hessian(held.force, held.normal, moved)
         return exact, stick
 
-    energy, potential = (float(share @ each.energy(gap)) for each in (barrier, acting))
-    return Touch(points, energy, -(share * slope)[:, None] * normal, rubbed, potential + rubbing, parts)
+    energy, potential = float(share @ barrier.energy(gap)), float(share @ acting.energy(value))
+    return Touch(points, energy, -(share * slope)[:, None] * along, rubbed, potential + rubbing, parts)
 
 
 def positive(blocks: Values) -> Values:

@@ -11,6 +11,7 @@ from dolfinx import fem
 
 from ...mesh.domain import Domain
 from ..term import Level
+from .bent import Start
 from .course import Course
 from .friction import Friction
 from .law import Law
@@ -33,7 +34,7 @@ class Touching:
 
     x: Values
     _grips: list[Grip | None]  # what friction holds of each
-    _gaps: list[Values | None]  # (n,) at the start of the step, where barriers act along the way, m
+    _begun: list[Start | None]  # the points before each at the start of the step, where barriers act along the way
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle, or a free obstacle in another one (collective)."""
@@ -77,13 +78,15 @@ class Touching:
         held = [grip(x, gap, self.skin.area, placed, self.law.barrier) for gap, placed in zip(gaps, at, strict=True)]
         self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
         if self._level.blow.along:
-            self._gaps = list(gaps)
+            self._begun = [
+                Start(gap, each.points, each.normal, each.start) for gap, each in zip(gaps, held, strict=True)
+            ]
         self._pushed = [each.force @ each.normal for each in held]
 
     def _forget_start(self) -> None:
         """The points are others than those that the step began with."""
         none = [None] * len(self.obstacles)
-        self._grips, self._gaps, self._touches = [*none], [*none], None
+        self._grips, self._begun, self._touches = [*none], [*none], None
 
     def _at_end(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
@@ -100,7 +103,9 @@ class Touching:
         """What an obstacle at `placed` does to the points where they are now."""
         obstacle, held = self.obstacles[number], self._grips[number]
         rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
-        under, start = self._under(number, placed), self._gaps[number]
+        under, start = self._under(number, placed), self._begun[number]
+        if start is not None:
+            start = start.seen(self._course.at_start[number].pose, placed.pose)
         return touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, under, start)
 
     def _under(self, number: int, placed: Placed) -> Values:
