@@ -61,7 +61,7 @@ class Stop:
         self, body: Pose, other: Pose, barrier: Barrier, start: list[Values] | None
     ) -> list[tuple[Touch, Values]]:
         """What acts on the points of each, and where these are; `start`: gaps as the step began (along)."""
-        begun = [None, None] if start is None else [Start.straight(gap, body.dim) for gap in start]
+        begun: list[Start | None] = [None, None] if start is None else [Start.straight(gap, body.dim) for gap in start]
         still = np.zeros(body.dim)
         return [
             (touch(x, area, placed, barrier, None, None, still, gap), x)
