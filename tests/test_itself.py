@@ -62,9 +62,9 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str) -> None:
 
 def test_a_cracked_column_carries_its_upper_half() -> None:
     """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
-    reads nothing."""
+    reads nothing. So it is with contact between pieces alone."""
     carried = []
-    for contact in ({"contact": {}}, {}):
+    for contact in ({"contact": {}}, {}, {"contact": {"itself": "pieces"}}):
         scene, state = make_scene(
             mesh={"builder": "box", "size": [0.5, 1.0], "h": 0.25}, material=SOFT | {"energy": "corotated"},
             fracture={"strength": 1e9}, boundary=[
@@ -85,6 +85,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     # 0.05 m less the gap of the crack over a column of 1 m: E A strain, about
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
+    assert abs(carried[2] - carried[0]) < 1e-6 * carried[0]
 
 
 def test_bodies_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:

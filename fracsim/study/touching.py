@@ -105,7 +105,8 @@ class Obstacle(Table):
 class Contact(Table):
     """[contact]: of the body and its pieces with themselves; and how obstacles act."""
 
-    itself: Flag = True  # false: obstacles alone
+    # false: obstacles alone; "pieces": not the cracks inside a piece, nor crumbs that have lost their last whole cell
+    itself: Flag | Literal["pieces"] = True
     friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
     distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
     stiffness: Positive | None = None  # Pa; default 3 % of Young's modulus, obstacles a tenth

@@ -17,9 +17,11 @@ from scipy.sparse import csr_matrix, kron
 from ...errors import InputError
 from ...mesh.split.build import Split, split
 from ...mesh.split.identity import found_again, identity
-from ...mesh.split.places import whole
+from ...mesh.split.places import Places, whole
 from ...mesh.split.skeleton import Skeleton
+from ...mesh.split.solid import split_of_pieces
 from ...meshes.words import format_point
+from .near import longest
 from .pairs import Pairs
 from .recede import receded
 
@@ -30,18 +32,23 @@ GAP = 2.0  # between the sides of a new crack, in distances of the barrier (rece
 IN, LEAST = 0.7, 0.2  # what is left of an arm each time that it is shortened, and in all
 NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
 ROUND_OFF = 1e-6  # of a pressure
+# of the barrier's distance: steps below it are taken with the exact tangent. Without its negative eigenvalues Newton's
+# method gains a digit in two iterations to the end
+NEAR_END = 0.1
 
 
 @dataclass(frozen=True)
 class Law:
     """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s, or below the
-    share `of_speed` of the speed of the body, where that is more."""
+    share `of_speed` of the speed of the body, where that is more. `pieces`: without walls inside a piece, and without
+    crumbs (split.solid)."""
 
     distance: float
     stiffness: float
     friction: float
     creep: float
     of_speed: float = 0.0
+    pieces: bool = False
 
 
 class Surface:
@@ -55,7 +62,7 @@ class Surface:
         self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
     ) -> None:
         """`u`: (nodes, d) where the body is, m; `before`: the surface until now."""
-        self.made = split(skeleton, pattern)
+        self.made = split_of_pieces(skeleton, pattern) if law.pieces else split(skeleton, pattern)
         self._rest = receded(self.made, GAP * law.distance)
         self.at = whole(self.made, skeleton, pattern, self._rest)
         self._how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
@@ -64,6 +71,7 @@ class Surface:
         self._walls = np.flatnonzero(copies[self.made.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
         self.pairs = self._all_pairs()
+        self._wide: tuple[Places, csr_matrix] | None = None  # (n d, nodes d) weights of components, and of which places
         self._out: Ints = np.empty(0, np.int64)
         if before is None:
             _check_apart(self.pairs, self.made)
@@ -162,6 +170,10 @@ class Surface:
         if len(self._crowded(u, load, self.pairs)):
             self.at = self.at.drawn_in(before)
 
+    def is_near(self, x: Values, other: Values | None) -> bool:
+        """Whether x (n, d) is so near to the place of the last tangent that Newton's method is at its end."""
+        return other is not None and longest(x - other) < NEAR_END * self._how["distance"]
+
     # --- from nodes to points and back ---
 
     def handed_down(self, forces: Values) -> Values:
@@ -170,7 +182,9 @@ class Surface:
 
     def stiffness(self, H: csr_matrix) -> csr_matrix:
         """(nodes d, nodes d) of (n d, n d), N/m."""
-        W = kron(self.at.weights, np.eye(self.at.rest.shape[1]), format="csr")
+        if self._wide is None or self._wide[0] is not self.at:
+            self._wide = self.at, kron(self.at.weights, np.eye(self.at.rest.shape[1]), format="csr")
+        W = self._wide[1]
         return (W.T @ H @ W).tocsr()
 
 

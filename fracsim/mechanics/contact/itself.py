@@ -56,6 +56,7 @@ class SelfContact(Term):
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
         self._start: Values | None = None
+        self._tangent_at: Values | None = None
         self._rubbing: Friction | None = None
         self._moved = True
 
@@ -66,6 +67,8 @@ class SelfContact(Term):
     def apart(self, at: Places, u: Values, t: float) -> Places:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
         assert self._surface is not None
+        if self.law.pieces:  # other points: walls inside pieces and crumbs are drawn where they are
+            return at
         own = self._surface.at
         return own.drawn_in(np.minimum(own.share, at.share))
 
@@ -157,8 +160,9 @@ class SelfContact(Term):
 
         def found() -> csr_matrix:
             assert self._surface is not None and x is not None
-            H = self._surface.pairs.hessian(x)
-            whole = H if self._rubbing is None else (H + self._rubbing.hessian(x)).tocsr()
+            exact, self._tangent_at = self._surface.is_near(x, self._tangent_at), x
+            H = self._surface.pairs.hessian(x, exact=exact)
+            whole = H if self._rubbing is None else (H + self._rubbing.hessian(x, exact=exact)).tocsr()
             return csr_matrix(self._level.blow.factor * whole)
 
         H = on_root(self.comm, found)
