@@ -182,7 +182,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
         yield f"            touched by the points of {anatomy.surface()}, {_MORE}; {_PRICE_OF_OBSTACLES}"
     if study.contact is not None and study.contact.itself:
-        yield f"contact     of the body with itself, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
+        of = "of pieces alone with one another" if study.contact.itself == "pieces" else "of the body with itself"
+        yield f"contact     {of}, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
         yield f"            its surface has {anatomy.surface()}, {_MORE}"
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
