@@ -119,26 +119,34 @@ class Surface:
         load[:nodes] = pressure[:nodes]
         return share, load
 
-    def _crowded(self, u: Values, most: Values, pairs: Pairs) -> Ints:
-        """Walls that are pressed harder than `most` (n,) Pa at a corner, or cut something."""
-        x, elements = self.at(u), self.made.elements[self._walls]
-        flags = (pairs.pressure(x) > most * (1 + ROUND_OFF))[elements].any(axis=1)
-        cut = np.zeros(len(self.made.elements), bool)
-        cut[pairs.overlaps(x)] = True
-        return self._walls[flags | cut[self._walls]]
+    def _crowded(self, u: Values, most: Values) -> Ints:
+        """Walls that are pressed harder than `most` (n,) Pa at a corner, or else those that cut something."""
+        pressed = self._pressed(u, most)
+        return pressed if len(pressed) else self._cutting(u)
+
+    def _pressed(self, u: Values, most: Values) -> Ints:
+        over = self.pairs.pressure(self.at(u)) > most * (1 + ROUND_OFF)
+        return self._walls[over[self.made.elements[self._walls]].any(axis=1)]
+
+    def _cutting(self, u: Values) -> Ints:
+        return np.intersect1d(self._walls, self.pairs.overlaps(self.at(u)))
+
+    def _shorten(self, walls: Ints) -> bool:
+        """Whether the arms of any of these walls can be shortened, which they are."""
+        share, tight = self.at.share.copy(), np.unique(self.made.elements[walls])
+        share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
+        changed = not np.array_equal(share, self.at.share)
+        if changed:
+            self.at = self.at.drawn_in(share)
+        return changed
 
     def _settle(self, u: Values, load: Values) -> None:
         """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
         so. Pairs are those of all elements."""
         start = self.at.share
-        while len(crowded := self._crowded(u, load, self.pairs)):
-            share, tight = self.at.share.copy(), np.unique(self.made.elements[crowded])
-            share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
-            if np.array_equal(share, self.at.share):
-                break
-            self.at = self.at.drawn_in(share)
-        if len(crowded):
-            crowded = self._crowded(u, np.maximum(load, NEAR * self._how["stiffness"]), self.pairs)
+        while self._shorten(self._pressed(u, load)) or self._shorten(cut := self._cutting(u)):
+            pass
+        crowded = np.union1d(self._pressed(u, np.maximum(load, NEAR * self._how["stiffness"])), cut)
         self._leave_out(crowded)
         if len(crowded):  # what is out is to come back as it was, not smaller each time
             gone = np.ones(len(start), bool)
@@ -161,13 +169,13 @@ class Surface:
         before = self.at.share
         self.at = self.at.drawn_in(np.minimum(before / IN, 1.0))
         for _ in range(2):  # what stays in may be in the way of its neighbours
-            crowded = self._crowded(u, load, self.pairs)
+            crowded = self._crowded(u, load)
             if not len(crowded):
                 return
             share, tight = self.at.share.copy(), np.unique(self.made.elements[crowded])
             share[tight] = before[tight]
             self.at = self.at.drawn_in(share)
-        if len(self._crowded(u, load, self.pairs)):
+        if len(self._crowded(u, load)):
             self.at = self.at.drawn_in(before)
 
     def is_near(self, x: Values, other: Values | None) -> bool:
