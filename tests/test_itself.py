@@ -60,6 +60,26 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str) -> None:
     assert touched > 3 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.3 * before[0]
 
 
+def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
+    """Steps in which the gap would be crossed twice over: what is held gives no way, and is not passed; the impulse on
+    the free block is that of what holds the other."""
+    anvil = {"box": [[-1.0, -1.0], [1.01, 2.0]]}
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={}, solver=FINE,
+        boundary=[{"on": anvil, "fix": "xy"}], probe=[{"name": "anvil", "on": anvil}],
+        initial={"velocity": [-1.0, 0.0]}, time={"scheme": "backward-euler", "step": 0.1, "end": 0.6},
+    )  # fmt: skip
+    m, before, impulse = scene.balance.mass.lumped[::2], state.v[::2].copy(), 0.0
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    for report in each_step(scene, state):
+        assert len(contact._surface.pairs.overlaps(contact._places())) == 0
+        assert (positions(scene) + state.u.reshape(-1, 2))[:, 0].max() > 1.8
+        impulse += report.dt * scene.probes()[0]
+    right = positions(scene)[:, 0] > 1.01
+    assert impulse == pytest.approx(m @ (state.v[::2] - before), rel=1e-6)
+    assert (m * (state.v[::2] - before))[right].sum() > 0.5 * 100.0
+
+
 def test_a_cracked_column_carries_its_upper_half() -> None:
     """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
     reads nothing. So it is with contact between pieces alone."""

@@ -286,7 +286,11 @@ class Balance:
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that Newton's method may start from: the step's start where there is no
-        better one, with terms held back until it has gone on (collective)."""
+        better one, with terms held back until it has gone on (collective).
+
+        Prescribed dofs are at their values first: what is held has to be found in the way of what moves.
+        """
+        u[self.motion.owned] = self.motion.values
         for term in self.terms:
             u = term.reachable(u)
         if all([term.clear(u) for term in self.terms]):

@@ -310,7 +310,8 @@ class Solver:
         if not np.isfinite(norm):
             return int(reason.DIVERGED_FNORM_NAN)
         if its == 0:
-            self._first = norm
+            # a first guess that contact has cut is off by more than any force of the step, however stiff the body
+            self._first = 0.0 if self.balance.limits_steps else norm
         scale, floor = self.balance.force_scale()
         if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
             return int(reason.CONVERGED_FNORM_RELATIVE)
