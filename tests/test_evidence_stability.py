@@ -12,6 +12,7 @@ from fracsim.errors import InputError
 from fracsim.run import run_study
 from fracsim.studies.evidence import (
     closed_forms,
+    contacts,
     dependence,
     extremes,
     failed,
@@ -62,7 +63,7 @@ def test_studies_are_valid(trial: Trial) -> None:
 
 
 def test_measures_exist() -> None:
-    modules = {"survival": survival, "dependence": dependence}
+    modules = {"survival": survival, "dependence": dependence, "contacts": contacts}
     for trial in TRIALS:
         if trial.measure:
             module, _, name = trial.measure.partition(":")
@@ -158,6 +159,37 @@ def test_a_wrong_force_is_an_error(tmp_path: Path) -> None:
     assert error == pytest.approx(0.01, rel=1e-4)
 
 
+def test_a_stiff_fall_has_the_impulse_of_its_momentum(tmp_path: Path) -> None:
+    """At 1e11 Pa the first guess, cut at the floor, is off by more than all forces of the step (with a tolerance that
+    looks at it the impulse was 4 % off). A force that is 1 % off, and a floor that was passed, are found."""
+    study = contacts.fallen(1e-3, young=1e11, speed=1.0, steps=5)
+    run = tmp_path / "run"
+    run_study(MPI.COMM_WORLD, validate(study, "x"), run)
+    figures = contacts.fell(run)
+    assert figures["error"] < 1e-3 and figures["passed"] == 0 and figures["newton_max"] > 3
+    force = results.history(run)["contact_floor_z"]
+    assert contacts._impulse_error(run, -1.01 * force) == pytest.approx(0.01, rel=0.1)
+    stated = (run / "study.toml").read_text()
+    (run / "study.toml").write_text(stated.replace("-0.0011", "0.1"))
+    assert contacts.fell(run)["passed"] > 0
+
+
+def test_nodes_of_one_body_inside_another(tmp_path: Path) -> None:
+    """Two cubes of 8 nodes, one moved into the other by a quarter: of one the 4 nodes of a face lie inside."""
+    import h5py
+
+    from fracsim.meshes.builders.box import Box
+
+    one = Box(size=(1.0, 1.0, 1.0), h=1.0).build()
+    points = np.concatenate([one.points, 0.5 * one.points + [0.25, 0.25, 1.0]])
+    for shift, inside in ((0.1, 0), (-0.25, 4)):
+        with h5py.File(tmp_path / "fields.h5", "w") as file:
+            file["points"], file["cells"] = points, np.concatenate([one.cells, one.cells + 8])
+            file["frames/000001/displacement"] = np.outer(np.arange(16) >= 8, [0.0, 0.0, shift])
+            file["frames/000001"].attrs["time"] = 1.0
+        assert contacts.inside_one_another(tmp_path) == inside
+
+
 def test_nothing_is_measured_of_a_refusal(tmp_path: Path) -> None:
     assert survival.survived(tmp_path) == {} and survival.pulled(tmp_path / "run") == {}
 
@@ -237,6 +269,7 @@ def record(case: str, name: str, ranks: int, **changes: Any) -> dict[str, Any]:
         ({"figures": {"finite": False}}, "WRONG: not finite"),
         ({"figures": {}}, "WRONG: not finite"),
         ({"figures": {"finite": True, "growth": 0.2}}, "WRONG: energy grew"),
+        ({"figures": {"finite": True, "passed": 3, "error": 0.0}}, "WRONG: 3 points passed through"),
         ({"figures": {"finite": True, "error": 0.5}}, "WRONG: far from the closed form"),
         ({"figures": {"finite": True, "error": float("nan")}}, "WRONG: far from the closed form"),
         ({"message": "fracsim: note: 3 cells are turned inside out"}, "warned: 3 cells are turned inside out"),
@@ -268,6 +301,17 @@ def test_runs_that_nobody_vouches_for_may_end_unlike_and_are_named() -> None:
     assert section.tables[0].rows[0][3] is False
     (section,) = stability.sections([record("dt", "a", 1), record("dt", "a", 2, **lost)])
     assert section.claims[3].holds is False and "against it: dt/a" in section.claims[3].measured
+
+
+def test_iterations_with_contact_stand_beside_those_without() -> None:
+    counts = {"newton_mean": 4.0, "newton_max": 9, "krylov_mean": 80.0, "krylov_max": 200}
+    name, alone = next(iter(stability.ALONE.items()))
+    assert {name, alone} <= {t.settings["of"] for t in stability.trials() if t.case == "contact"}
+    less = {"newton_mean": 1.0, "newton_max": 2, "krylov_mean": 5.0, "krylov_max": 6}
+    records = [record("contact", name, 1, figures={"finite": True} | counts),
+               record("contact", alone, 1, figures={"finite": True} | less)]  # fmt: skip
+    (row,) = stability.sections(records)[1].tables[0].rows
+    assert row == (name, 4.0, 9, 80.0, 200, 20.0, 1.0, 2, 5.0, 6, 5.0)
 
 
 def test_section_of_the_failed_approaches() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
+from . import contacts
 from . import extremes as x
 from .section import Cell, Claim, Section, Table
 from .trial import Setting, Trial
@@ -23,7 +24,7 @@ def trials() -> list[Trial]:
     """Every case on 1 and on 2 ranks, once always and five times in full: a crack must not hang on the last digits."""
     cases = chain(
         _steps(), _stiffness(), _poisson(), _densities(), _stretches(), _inverted(), _slivers(), _shells(),
-        _strengths(), _many(), _one_cell(), _lengths(), _long_steps(), _edge(), _failed(),
+        _strengths(), _many(), _one_cell(), _lengths(), _long_steps(), _edge(), _contacts(), _failed(),
     )  # fmt: skip
     return [_on_ranks(trial, *each) for trial in cases for each in (ONCE if trial.case == "failed" else REPEATED)]
 
@@ -37,7 +38,14 @@ def _on_ranks(trial: Trial, ranks: int, time: int) -> Trial:
 def _trial(case: str, name: str, study: x.Data, measure: str = "survived", limit: float = 60.0) -> Trial:
     setting: dict[str, Setting] = {"of": name}
     return Trial(
-        GROUP, case, name, study=study, settings=setting, measure=f"survival:{measure}", always=True, limit=limit
+        GROUP,
+        case,
+        name,
+        study=study,
+        settings=setting,
+        always=True,
+        limit=limit,
+        measure=measure if ":" in measure else f"survival:{measure}",
     )
 
 
@@ -179,6 +187,38 @@ def _edge() -> list[Trial]:
     return found
 
 
+def _contacts() -> list[Trial]:
+    """Falls on a floor, blows of light and heavy balls, a press, and bodies that touch one another."""
+    fell, struck = "contacts:fell", "contacts:was_struck"
+    found = [_trial("contact", f"dt-{step:.0e}-s", contacts.fallen(step), fell) for step in (*STEPS[:-1], 5e-2)]
+    others = ("newmark", "generalized-alpha")
+    found += [_trial("contact", f"dt-1e-02-s-{name}", contacts.fallen(1e-2, scheme=name), fell) for name in others]
+    for young in (1e3, 1e5, 1e7, 1e9, 1e11):
+        soft = contacts.fallen(5e-3, young=young, speed=0.3, gravity=0.0)
+        found.append(_trial("contact", f"young-{young:.0e}-Pa", soft, fell))
+    for ratio in (1e-4, 1.0, 1e4):
+        found.append(_trial("contact", f"mass-ratio-{ratio:.0e}", contacts.struck(ratio), struck))
+    broken = x.breaking(contacts.struck(1e4), 3e5)
+    found.append(_trial("contact", "mass-ratio-1e+04-torn", broken, struck))
+    found.append(_trial("contact", "shell-1-to-1000-pressed", contacts.pressed(1e-3), "contacts:was_pressed"))
+    itself = (name for name in contacts.MESHES if name.startswith("itself"))
+    found += [_script("contact", name, "written", name, measure="contacts:fell_on_itself") for name in itself]
+    found.append(_script("contact", "shell-in-a-stack", "written", "stacked-4mm", measure="contacts:was_stacked"))
+    return found + _without_contact()
+
+
+# row of a body in contact -> row of the same one without
+ALONE = {"young-1e+07-Pa": "young-1e+07-Pa-alone", "shell-in-a-stack": "stack-in-one-piece"}
+
+
+def _without_contact() -> list[Trial]:
+    fall = contacts.without_contact(contacts.fallen(5e-3, speed=0.3, gravity=0.0))
+    return [
+        _trial("contact", "young-1e+07-Pa-alone", fall),
+        _trial("contact", "stack-in-one-piece", contacts.in_one_piece()),
+    ]
+
+
 def _failed() -> list[Trial]:
     """M22s section 6, as an experiment of its own (failed.py)."""
     from .failed import APPROACHES
@@ -200,6 +240,8 @@ def verdict(record: Record) -> str:
         return "WRONG: not finite"
     if message.startswith("note: ") and any(word in message for word in ("turned inside out", "from nowhere")):
         return f"warned: {message.removeprefix('note: ')}"
+    if figures.get("passed"):
+        return f"WRONG: {figures['passed']} points passed through"
     if figures.get("growth", 0.0) > GROWN:
         return "WRONG: energy grew"
     if "error" not in figures:
@@ -218,11 +260,13 @@ def sections(records: list[Record]) -> list[Section]:
         "the error is that of a force, a momentum or a weight known in closed form (homogeneous stretch, dead load on "
         "a free body); the smallest J is that of the cells that still carry. `stable` means finite, and no energy "
         "from nowhere, where no closed form is known; `warned` means that the run says that its "
-        "result is not to be trusted and why. Each row was run on 1 and on 2 ranks, those on 1 two at a time."
+        "result is not to be trusted and why. In contact no point of a frame may lie in an obstacle or in another body "
+        "(in a ball not deeper than chords of facets may), or the row is wrong. Each row was run on 1 and on 2 ranks, "
+        "those on 1 two at a time."
     )
     found = [record for record in records if record["case"] == "failed"]
     first = Section("Stability", text, claims=_claims(table), tables=(_table(table),))
-    return [first, *([section(found)] if found else [])]
+    return [first, *([contact] if (contact := _iterations(table)) else []), *([section(found)] if found else [])]
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
@@ -278,12 +322,39 @@ def _alike(one: Record, *others: Record) -> bool:
     )
 
 
+def _iterations(records: list[Record]) -> Section | None:
+    """Newton's and CG's iterations with contact beside those without."""
+    figures = {_place(each): each["figures"] for each in records if each["case"] == "contact" and each["ranks"] == 1}
+    rows = [_counts(name, figures[name], {}) for name in figures if name not in (*ALONE, *ALONE.values())]
+    rows += [
+        _counts(name, figures[name], figures[alone]) for name, alone in ALONE.items() if {name, alone} <= {*figures}
+    ]
+    if not rows:
+        return None
+    both = ("Newton a step", "most", "CG a step", "most ", "CG a Newton iteration")
+    columns = ("scene", *both, *(f"without contact: {name.strip()}" for name in both))
+    text = (
+        "Iterations a step of 200 to 2,000 tetrahedra, on one rank. A barrier makes tangents stiff where bodies touch, "
+        "and their pattern changes with what does. Without contact: the same bar in flight, and the stack as one block."
+    )
+    return Section(
+        "Contact: iterations", text, tables=(Table("contact-iterations", "Iterations", columns, tuple(rows)),)
+    )
+
+
+def _counts(name: str, *both: Record) -> tuple[Cell, ...]:
+    found = [[each.get(key) for key in COUNTS] for each in both]
+    each_time = [counts[2] / counts[0] if counts[0] else None for counts in found]
+    return name, *found[0], each_time[0], *found[1], each_time[1]
+
+
+COUNTS = ("newton_mean", "newton_max", "krylov_mean", "krylov_max")
 COLUMNS = (
-    "case", "of", "verdict", "2 ranks alike", "error", "energy growth", "Newton, mean", "Newton, most", "smallest J",
-    "steps halved", "broken edges", "in one step", "pieces", "s",
+    "case", "of", "verdict", "2 ranks alike", "error", "energy growth", "Newton, mean", "Newton, most", "CG, mean",
+    "smallest J", "steps halved", "broken edges", "in one step", "pieces", "s",
 )  # fmt: skip
 DAMAGE = ("broken", "broken_in_a_step", "pieces")
-FIGURES = ("error", "growth", "newton_mean", "newton_max", "smallest_J")
+FIGURES = ("error", "growth", "newton_mean", "newton_max", "krylov_mean", "smallest_J")
 
 
 def _table(records: list[Record]) -> Table:

@@ -28,9 +28,11 @@ def survived(run: Path) -> Figures:
     if len(rows["time"]):
         figures |= {
             "steps": len(rows["time"]),
-            "growth": energy_growth(rows, moving_at_start="initial" in results.study(run)),
+            "growth": energy_growth(rows, moving_at_start=moves_at_start(results.study(run))),
             "newton_max": int(rows["newton_its"].max()),
             "newton_mean": float(rows["newton_its"].mean()),
+            "krylov_max": int(rows["krylov_its"].max()),
+            "krylov_mean": float(rows["krylov_its"].mean()),
             "broken": int(rows["broken_edges"][-1]),
             "broken_in_a_step": int(np.diff(rows["broken_edges"], prepend=0).max()),
             "pieces": int(rows["pieces"][-1]),
@@ -77,6 +79,12 @@ def drifting(run: Path) -> Figures:
 
 
 # --- reading an output folder ---------------------------------------------------------------------------------------
+
+
+def moves_at_start(study: dict[str, Any]) -> bool:
+    """Whether body or free obstacles bring energy of motion."""
+    free = (each for each in study.get("obstacle", []) if "mass" in each or "density" in each)
+    return "initial" in study or any("velocity" in each or "spin" in each for each in free)
 
 
 def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:

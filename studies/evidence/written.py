@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from . import extremes
+from . import contacts, extremes
 
 FILE: dict[str, Any] = {"file": "mesh.msh"}
 
@@ -48,6 +48,7 @@ MESHES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
     "tetrahedron": tetrahedron,
     "two-densities": two_densities,
     "two-densities-hanging": two_densities_hanging,
+    **contacts.MESHES,
 }
 
 
