@@ -45,6 +45,7 @@ class Balance:
         blow: how contact enters a step of that scheme.
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
+        moves: how often u has been put elsewhere.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
 
@@ -70,6 +71,7 @@ class Balance:
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
         self._touches = True  # whether the tangent has contact in it
         self.low_rank: list[tuple[Values, Values]] = []
+        self.moves = 0
         self.vector = assembler.vector()
         self._kept = assembler.vector()
         self.reactions: Values = np.zeros(self.owned)
@@ -136,14 +138,24 @@ class Balance:
             term.begin(level)
 
     def displace(self, u: Values) -> None:
-        """Put the owned values of a displacement into u, ghosts included (collective)."""
+        """Put the owned values of a displacement into u, ghosts included (collective).
+
+        Newton's method comes to each iterate twice. Terms that look for what touches look once.
+        """
+        if self.limits_steps and self._is_at(u):
+            return
+        self.moves += 1
         self.u.x.array[: self.owned] = u
         self.u.x.scatter_forward()
         for term in self.terms:
             term.displaced()
 
+    def _is_at(self, u: Values) -> bool:
+        """Whether u is there already, on all ranks (collective)."""
+        return bool(self.domain.comm.allreduce(np.array_equal(self.u.x.array[: self.owned], u), op=MPI.LAND))
+
     def displace_to(self, x: PETSc.Vec, *, prescribed: bool = True) -> None:
-        """Bring an iterate into u; `prescribed`: with prescribed dofs at their values."""
+        """Bring an iterate into u; `prescribed`: with prescribed dofs at their values (collective)."""
         u = x.array_r.copy()
         if prescribed:
             u[self.motion.owned] = self.motion.values

@@ -16,6 +16,12 @@ OUTCOMES: dict[int, str] = {
 SPEAKER = "fracsim: "  # before every message of the program's own
 
 
+def all_words(log: Path) -> str:
+    """All lines that are the program's own, in one that begins as they do; "" where there are none."""
+    own = [line for line in log.read_text(errors="replace").splitlines() if line.startswith(SPEAKER)]
+    return SPEAKER + "; ".join(line.removeprefix(SPEAKER) for line in own) if own else ""
+
+
 def last_words(log: Path) -> str:
     """The last line that is the program's own, else the last of all: what it said of its failure; "" where nothing."""
     said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]

@@ -84,6 +84,7 @@ class Solver:
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
         self._first, self._height, self._sets_out = 0.0, np.inf, True
+        self._known, self._known_at = (0.0, 0.0), -1  # potential, and after how many moves of the body
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -213,6 +214,7 @@ class Solver:
         something is still held back."""
         newton = krylov = 0
         for _ in range(LEGS):
+            self._known_at = -1
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not self.balance.go_on():
@@ -226,8 +228,10 @@ class Solver:
         differ by round-off alone: such a step counts as one downwards, so that it is taken whole.
         """
         self.balance.displace_to(x)
-        potential, size = self.balance.potential()
-        if self._sets_out:  # PETSc's line search first asks where it starts
+        if self._known_at != self.balance.moves:
+            self._known, self._known_at = self.balance.potential(), self.balance.moves
+        potential, size = self._known
+        if self._sets_out:  # PETSc's line search first asks where it starts: mostly where the one before has ended
             self._height, self._sets_out = potential, False
             return potential
         slack = ROUND_OFF * size
