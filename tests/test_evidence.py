@@ -17,7 +17,7 @@ from fracsim.mesh.simplices import local_edges, node_groups
 from fracsim.meshes.builders.box import lattice
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.studies.evidence import __main__ as program
-from fracsim.studies.evidence import growth, ladder
+from fracsim.studies.evidence import faces, growth, ladder
 from fracsim.studies.evidence.section import Point, Section, fitted_order, pareto_front, recommended, timed
 from fracsim.studies.evidence.trial import Trial
 from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
@@ -182,6 +182,25 @@ def test_sections_show_what_failed() -> None:
         rows = [row for section in sections for table in section.tables for row in table.rows]
         assert len(rows) == len(records) and all(str(row[-1]).startswith("failed (1)") for row in rows)
         assert all(claim.holds is not True for section in sections for claim in section.claims)
+
+
+def test_faces_lie_on_each_other_or_cross_in_edges() -> None:
+    """By the height of the lower cube and what of the upper is nearest: a face of it, or an edge of 2 nodes or more."""
+    for kind, top, nearest in (("flat", 0.5, 9), ("edge", 0.5**0.5, 3)):
+        x = faces.bodies(kind, 1, 0.1).points
+        lower, upper = x[:8, 2], x[8:, 2]
+        assert lower.max() == pytest.approx(top) and upper.min() == pytest.approx(top + 0.1)
+        assert (upper < upper.min() + 1e-9).sum() == nearest
+
+
+def test_flat_on_flat_is_held_against_edge_on_edge() -> None:
+    def record(kind: str, step: float) -> dict[str, Any]:
+        figures = {"triangles": 1, "touching": 1, "newton": 2.0, "step": step} | dict.fromkeys(faces.OF_PAIRS, 1e-3)
+        return {"name": kind, "figures": figures, "outcome": "done", "message": ""}
+
+    for step, holds in ((1.2, True), (1.5, False)):
+        section = faces.section([record("flat", step), record("edge", 1.0)])
+        assert section.claims[0].holds is holds and len(section.tables[0].rows) == 2
 
 
 def test_modules_of_other_features_are_noticed() -> None:

@@ -272,6 +272,10 @@ def record(case: str, name: str, ranks: int, **changes: Any) -> dict[str, Any]:
         ({"figures": {"finite": True, "passed": 3, "error": 0.0}}, "WRONG: 3 points passed through"),
         ({"figures": {"finite": True, "error": 0.5}}, "WRONG: far from the closed form"),
         ({"figures": {"finite": True, "error": float("nan")}}, "WRONG: far from the closed form"),
+        (
+            {"message": "fracsim: note: gained 1 J from nowhere; note: met fast"},
+            "warned: gained 1 J from nowhere; note: met fast",
+        ),
         ({"message": "fracsim: note: 3 cells are turned inside out"}, "warned: 3 cells are turned inside out"),
     ],
 )

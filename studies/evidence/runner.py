@@ -20,7 +20,7 @@ import tomli_w
 
 import fracsim as root
 from fracsim import forms, meshes
-from fracsim.report.exit_status import OUTCOMES, last_words
+from fracsim.report.exit_status import OUTCOMES, all_words, last_words
 
 from .trial import Trial
 
@@ -130,7 +130,7 @@ def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
     return {
         "outcome": outcome,
         "wall": time.perf_counter() - began,
-        "message": last_words(folder / "log.txt"),
+        "message": (all_words if outcome == "done" else last_words)(folder / "log.txt"),
         "summary": json.loads(summary.read_text()) if summary.exists() else None,
     }
 
