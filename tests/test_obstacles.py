@@ -95,6 +95,26 @@ def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
     assert touched > 15 and np.ptp(impulse) > 500
 
 
+def test_an_obstacle_that_touches_nothing_changes_nothing() -> None:
+    """The body stretches under a load as it does without, and its energy is not summed for the line search: that is
+    done once it is near."""
+    ends, asked = [], []
+    for obstacle in ([], [floor(-5.0)], [floor(-1e-3)]):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT, load={"gravity": [0.0, -G]},
+            boundary=[{"on": "top", "fix": "xy"}], solver=FINE,
+            time={"scheme": "backward-euler", "step": 0.02, "end": 0.2},
+            **({"obstacle": obstacle} if obstacle else {}),
+        )  # fmt: skip
+        potential, calls = scene.balance.potential, []
+        scene.balance.potential = lambda p=potential, c=calls: (c.append(1), p())[1]
+        march(scene, state)
+        ends.append(state.u.copy())
+        asked.append(len(calls))
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
+    assert asked[:2] == [0, 0] and asked[2] > 0 and np.abs(ends[2] - ends[0]).max() > 1e-3
+
+
 def test_a_body_at_rest_is_carried() -> None:
     """Laid on the floor, damped to rest: the load cell reads m g."""
     scene, state = make_scene(

@@ -291,6 +291,11 @@ class Balance:
         """Whether a term has a say in how long a step of Newton's method is."""
         return any(type(term).longest_step is not Term.longest_step for term in self.terms)
 
+    def acts(self) -> bool:
+        """Whether a term that limits steps has a potential at the current u (collective)."""
+        limiting = (term for term in self.terms if type(term).longest_step is not Term.longest_step)
+        return bool(total(self.domain.comm, sum(abs(term.potential() or 0.0) for term in limiting))[0] > 0)
+
     def longest_step(self, change: Values) -> float:
         """Largest share of a change of u (owned dofs,) that all terms allow (collective)."""
         share = min(term.longest_step(change) for term in self.terms)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,9 @@ from ..mesh.domain import Domain
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
 from .stepper import SolveResult
+
+if TYPE_CHECKING:
+    from .descent import Descent
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -40,9 +44,6 @@ FACTORISED = 100_000
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
 LEGS = 20  # solves of a step in which obstacles that are jammed come on
-
-# Potentials that differ by less than this share of their terms are the same.
-ROUND_OFF = 1e4 * float(np.finfo(float).eps)
 
 # A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
 # preconditioner is made anew anyhow, every dead cell goes.
@@ -73,18 +74,22 @@ class Solver:
         self._x, self._correction = balance.vector.duplicate(), balance.vector.duplicate()
         self._configure(given)
         snes.setConvergenceTest(self._converged)
+        self._descent: Descent | None = None
         if balance.limits_steps:
             snes.setLineSearchPreCheck(self._limit)
             if balance.conservative:
-                snes.setObjective(lambda _, x: self._potential(x))
+                from .descent import Descent
+
+                self._descent = descent = Descent(balance, snes)
+                snes.setObjective(lambda _, x: descent(x))
+                snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
         self._rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
-        self._first, self._height, self._sets_out = 0.0, np.inf, True
-        self._known, self._known_at = (0.0, 0.0), -1  # potential, and after how many moves of the body
+        self._first = 0.0
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -214,28 +219,13 @@ class Solver:
         something is still held back."""
         newton = krylov = 0
         for _ in range(LEGS):
-            self._known_at = -1
+            if self._descent is not None:
+                self._descent.begin()
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not self.balance.go_on():
                 return newton, krylov, False
         return newton, krylov, True
-
-    def _potential(self, x: PETSc.Vec) -> float:
-        """The incremental potential at x, J: what the line search goes down with contact.
-
-        On the norm of r, which a barrier makes steep, it cuts good steps to nothing. Near the solution potentials
-        differ by round-off alone: such a step counts as one downwards, so that it is taken whole.
-        """
-        self.balance.displace_to(x)
-        if self._known_at != self.balance.moves:
-            self._known, self._known_at = self.balance.potential(), self.balance.moves
-        potential, size = self._known
-        if self._sets_out:  # PETSc's line search first asks where it starts: mostly where the one before has ended
-            self._height, self._sets_out = potential, False
-            return potential
-        slack = ROUND_OFF * size
-        return self._height - slack if abs(potential - self._height) <= slack else potential
 
     # --- linear solves by themselves ---
 
@@ -291,7 +281,8 @@ class Solver:
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
-        self._sets_out = True
+        if self._descent is not None:
+            self._descent.set_out()
         share = self.balance.longest_step(-y.array_r)
         if share < 1:
             y.scale(share)
@@ -326,6 +317,8 @@ class Solver:
         self._options.remove()
         for kept in (self.snes, self._x, self._correction):
             kept.destroy()
+        if self._descent is not None:
+            self._descent.destroy()
         if self._near_null is not None:
             self._near_null.destroy()
 
