@@ -18,6 +18,7 @@ from .builders.loaf import Loaf
 from .builders.notched_bar import NotchedBar
 from .builders.notched_plate import NotchedPlate
 from .builders.plate_hole import PlateHole
+from .builders.stones import Stones
 from .builders.vase import Vase
 from .data import MeshData, MeshError
 from .parameters import Builder
@@ -31,6 +32,7 @@ BUILDERS: dict[str, type[Builder]] = {
     "notched-bar": NotchedBar,
     "notched-plate": NotchedPlate,
     "plate-hole": PlateHole,
+    "stones": Stones,
     "vase": Vase,
 }
 

@@ -42,6 +42,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("notched-plate", {"thickness": 0.004, "h": 0.003, "h_tip": 0.001}),
     ("plate-hole", {}),
     ("plate-hole", {"length": 0.04, "thickness": 0.01, "h_hole": 0.002}),
+    ("stones", {"count": 12, "aside": (3, 2)}),
     ("vase", {"h": 0.01}),
     ("vase", {"wall": 0.0, "h": 0.012}),
     ("vase", {"wall": 0.004, "h": 0.008, "height": 0.3}),
@@ -82,7 +83,8 @@ def volume(mesh: MeshData) -> float:
 def test_cells_are_positive_and_the_check_has_nothing_to_say(built: tuple[Any, MeshData]) -> None:
     builder, mesh = built
     assert signed_measures(mesh.points, mesh.cells).min() > 0
-    assert check_mesh(mesh).notes == ()
+    notes = check_mesh(mesh).notes
+    assert len(notes) == 1 and "12 bodies that share no node" in notes[0] if builder.name == "stones" else not notes
     quality = mesh_quality(mesh)
     # gmsh may not move the surface of a figure, so that it cannot mend every cell below it: a few in ten thousand
     assert quality["radius_ratio_min"] > (0.05 if builder.name == "figure" else 0.15)
@@ -416,6 +418,18 @@ def test_importing_builders_loads_neither_gmsh_nor_meshio() -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_stones_are_icosahedra_that_do_not_touch() -> None:
+    """Unscattered: 5 (3 + sqrt 5) / 12 a^3 each, the side a = 4 r / sqrt(10 + 2 sqrt 5). Scattered: the balls that
+    they lie in are apart."""
+    r, side = 0.2, 4 * 0.2 / (10 + 2 * 5**0.5) ** 0.5
+    mesh = BUILDERS["stones"](count=5, radius=r, spread=0.0).build()
+    assert volume(mesh) == pytest.approx(5 * 5 * (3 + 5**0.5) / 12 * side**3, rel=1e-12)
+    stones = BUILDERS["stones"](count=30, aside=(2, 3), radius=r, spread=0.5).build().points.reshape(30, 13, 3)
+    reach = np.linalg.norm(stones[:, 1:] - stones[:, :1], axis=2).max(axis=1)
+    apart = np.linalg.norm(stones[:, None, 0] - stones[:, 0], axis=2) - reach[:, None] - reach
+    assert reach.max() <= 1.5 * r and apart[~np.eye(30, dtype=bool)].min() > 0
+
+
 def test_gmsh_is_ended_after_an_error() -> None:
     import gmsh
 
@@ -457,6 +471,9 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("figure", {"wall": 0.05}, "wall = 0.05 must be no more than .* of the thinnest"),
     ("figure", {"wall": 0.004}, "h = 0.01 must be no more than 0.006 m, 1.5 times the wall"),
     ("figure", {"h": 0.05}, "h = 0.05 must be less than .* of the thinnest part"),
+    ("stones", {"count": 0}, "stones: count = 0 must be from 1"),
+    ("stones", {"aside": (0, 2)}, "aside = .* must be two numbers of 1 or more"),
+    ("stones", {"spread": 0.7}, "spread = 0.7 must be at most 0.5"),
     ("loaf", {"dome": 2.0}, "dome = 2.0 must lie between 0 and 1"),
 ]
 

@@ -24,16 +24,20 @@ STUDIES = sorted(folder().glob("*.toml"))
 COARSE = {
     "bar-2d": ["mesh.h=0.02"],
     "bent-bar": ["mesh.h=0.01"],
+    "bowl": ["mesh.count=8"],
     "cylinder": ["mesh.h=0.01"],
     "doormat": ["mesh.h=0.025"],
     "dropped-vase": ["mesh.h=0.015"],
+    "hammered-figure": ["mesh.h=0.015"],
     "hammered-vase": ["mesh.h=0.015"],
     "jelly-figure": ["mesh.h=0.015"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "platens": ["mesh.h=0.01"],
+    "punched-slab": ["mesh.h=0.01"],
     "struck-figure": ["mesh.h=0.015"],
     "struck-vase": ["mesh.h=0.012"],
+    "table-loaf": ["mesh.h=0.02"],
     "wall": ["mesh.h=0.15"],
 }
 QUIET = ["output.picture=false"]

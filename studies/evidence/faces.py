@@ -64,7 +64,7 @@ def pressed(kind: str, n: int) -> dict[str, Any]:
 
 
 def measured(kind: str, n: int) -> dict[str, Any]:
-    """Processor time of a step in contact, and of what is asked of pairs where the steps have ended, s: medians."""
+    """Processor time of a step in touch, and of what is asked of pairs where the steps have ended, s: medians."""
     from mpi4py import MPI
 
     from ...meshes.write import write_mesh
@@ -76,17 +76,23 @@ def measured(kind: str, n: int) -> dict[str, Any]:
         write_mesh(bodies(kind, n, 0.033 / n), Path(folder, "mesh.msh"))
         study = pressed(kind, n) | {"mesh": {"file": str(Path(folder, "mesh.msh"))}}
         run = Run(build_scene(MPI.COMM_WORLD, validate(study, kind)), Path(folder, "run"))
-        (contact,) = [term for term in run.scene.balance.terms if term.name == "contact"]
-        seconds, newton = [], []
-        while len(seconds) < STEPS:
-            began = time.process_time()
-            run.step()
-            if contact.stored() > 0:
-                seconds.append(time.process_time() - began)
-                newton.append(run.scene.stepper.solver.snes.its)
+        contact: Any = next(term for term in run.scene.balance.terms if term.name == "contact")
+        steps = _in_touch(run, contact)
         figures = of_pairs(contact._surface, contact._places())
+    seconds, newton = zip(*steps, strict=True)
     own = {"triangles": 12 * (n**2 + (n + 1) ** 2), "newton": float(np.mean(newton)), "step": median(seconds)}
     return own | figures
+
+
+def _in_touch(run: Any, contact: Any) -> list[tuple[float, int]]:
+    """Processor time, s, and Newton iterations of each of the first STEPS steps that end in touch."""
+    found: list[tuple[float, int]] = []
+    while len(found) < STEPS:
+        began = time.process_time()
+        run.step()
+        if contact.stored() > 0:
+            found.append((time.process_time() - began, run.scene.stepper.solver.snes.its))
+    return found
 
 
 def of_pairs(surface: Any, x: Any) -> dict[str, Any]:
