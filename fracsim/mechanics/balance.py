@@ -324,7 +324,7 @@ class Balance:
         """The incremental potential, whose derivative is r, at the current u, and the size of what it is the sum of,
         J (collective).
 
-        psi is a difference of terms as large as the moduli: 4 eps Y V of it is round-off, with ROUND_OFF of the solver.
+        psi is a difference of terms as large as the moduli: 4 eps Y V of it is round-off, with ROUND_OFF of descent.
         """
         parts = total(self.domain.comm, np.array([term.potential() or 0.0 for term in self.terms]))
         return float(parts.sum()), float(np.abs(parts).sum()) + 4e-4 * self._stored_at_strain_one
