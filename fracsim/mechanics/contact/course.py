@@ -9,9 +9,10 @@ import numpy.typing as npt
 
 from .obstacle import Obstacle
 from .placed import Placed
-from .reach import Way, safe_shares
+from .reach import safe_shares
 
 Values = npt.NDArray[np.float64]
+type Going = tuple[Placed, Values]  # where an obstacle begins, and the increment (p,) of its pose
 
 
 class Course:
@@ -41,7 +42,7 @@ class Course:
         """One whose way is not known yet stays where it began."""
         self.placed[number] = self.at_start[number] = placed
 
-    def known(self) -> list[Way]:
+    def known(self) -> list[tuple[Placed, Values]]:
         """Where each obstacle whose way is known is at the start of the step, and its way (p,) to the end."""
         return [(self.at_start[number], self.ways[number]) for number in self.led]
 
@@ -54,16 +55,19 @@ class Course:
         """Whether all have gone all of their way."""
         return self._gone == 1
 
-    def rest(self) -> dict[int, Way]:
-        """Where each whose way is known is now, and what is left of its way (p,), by numbers."""
-        ways = zip(self.led, self.known(), strict=True)
-        return {number: (self._after(*way), (1 - self._gone) * way[1]) for number, way in ways}
+    def whole(self) -> dict[int, Going]:
+        """Where each whose way is known was as the step began, and its way (p,), by numbers."""
+        return {number: (self.at_start[number], self.ways[number]) for number in self.led}
+
+    def rest(self) -> dict[int, Going]:
+        """Where it is now, and what is left of its way."""
+        return {number: (self._after(*way), (1 - self._gone) * way[1]) for number, way in self.whole().items()}
 
     def go_on(self, x: Values, least: Callable[[Values], float], most: float = 1.0) -> None:
         """A share of the rest of the way, `most` at most, that is safe with points at x (n, d); `least`: of shares
         (n,), on all ranks (collective)."""
         rest, still = 1 - self._gone, np.zeros_like(x)
-        shares = [safe_shares(placed, x, still, way) for placed, way in self.rest().values()]
+        shares = [safe_shares(self._after(*way), x, still, rest * way[1]) for way in self.known()]
         share = min(least(np.min(shares, axis=0)) if shares else 1.0, most)
         self._gone = 1.0 if share == 1 else self._gone + share * rest
         for number, way in zip(self.led, self.known(), strict=True):

@@ -232,7 +232,7 @@ class FreeObstacles(Obstacles):
     def _first_guess(self, each: FreePose, x: Values, moved: Values) -> tuple[Values, float]:
         """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
         that way that closes no gap, with points that go from x (n, d) by `moved` (collective)."""
-        others = dict(zip(self._course.led, self._course.known(), strict=True))
+        others = self._course.whole()
         along = [each.led_by(way) for _, way in others.values() if way.any()]
         ways = [each.step.ahead, 0 * each.step.ahead, *along]
         first = 0.0

@@ -14,10 +14,11 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ...mesh.ranks import total
+from .course import Going
 from .free_obstacle import Flight, FreeObstacle
 from .placed import Placed
 from .push import Push, by_point_and_pose, on_obstacle, push, resultant
-from .reach import Way, safe_shares
+from .reach import safe_shares
 from .rigid_step import RigidStep
 from .skin import Skin
 from .stops import Stops
@@ -177,7 +178,7 @@ class FreePose:
         """Newton's method starts anew."""
         self._way = None
 
-    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values, others: dict[int, Way]) -> float:
+    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values, others: dict[int, Going]) -> float:
         """Share of the ways of points, obstacle and others, from the start of the step, that closes no gap
         (collective)."""
         start, q = Placed(self.body.shape, self.step.start.pose), self.step.increment(z)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .barrier import Barrier
+from .course import Going
 from .obstacle import Obstacle
 from .placed import Placed
 from .pose import Pose
@@ -37,7 +38,7 @@ class Stops:
         found = [stop.gaps(pose, placed[number].pose) for number, stop in self._each.items()]
         return all(gap.min(initial=np.inf) > 0 for both in found for gap in both)
 
-    def safe_share(self, pose: Pose, q: Values, ways: dict[int, tuple[Placed, Values]]) -> float:
+    def safe_share(self, pose: Pose, q: Values, ways: dict[int, Going]) -> float:
         """Share of its way q (p,) that closes no gap, where others are and go by their numbers."""
         d = pose.dim
         shares = [stop.safe_share(pose, q, ways[n][0].pose, ways[n][1][:d]) for n, stop in self._each.items()]
