@@ -29,6 +29,7 @@ from .obstacle import Obstacle
 from .placed import Placed, least_distance
 from .reach import safe_shares, within_reach
 from .skin import clear_of
+from .touch import Touch
 from .touching import Touching
 
 Values = npt.NDArray[np.float64]
@@ -47,7 +48,7 @@ class Obstacles(Touching, Term):
         self._coupling, self._drawings = Coupling(domain), Drawings(obstacles, domain.lower, domain.upper)
         # of the last step: work of each obstacle, J, what friction took, J, and forces on each, N
         self._worked, self._lost = [0.0] * len(self.obstacles), 0.0
-        self._read = [np.zeros(domain.dim)] * len(self.obstacles)
+        self._read: list[Values] | None = None  # None: not yet
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
@@ -84,7 +85,7 @@ class Obstacles(Touching, Term):
     def arrive(self) -> None:
         """What contact has done in the step is booked (collective)."""
         self._lost, found = 0.0, self.touching()
-        self._read = [-(each.normal + each.friction).sum(axis=0) for each in found]
+        self._read = [_on_obstacle(each) for each in found]
         for number in range(len(self.obstacles)):
             moved, under = self.rubbed(number)
             self._worked[number] = self._pressed(number) + under
@@ -195,7 +196,8 @@ class Obstacles(Touching, Term):
         }
 
     def _on_obstacle(self, number: int, axis: int) -> Values:
-        return self._read[number][axis : axis + 1]
+        read = _on_obstacle(self.touching()[number]) if self._read is None else self._read[number]
+        return read[axis : axis + 1]
 
     def least(self) -> dict[str, Callable[[], float]]:
         """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none."""
@@ -218,3 +220,8 @@ class Obstacles(Touching, Term):
             closer = np.einsum("ni,ni->n", way[: self._domain.dim] - moved[pushed], placed.normal(self.x[pushed]))
             result.append(float(closer.max(initial=0.0)))
         return result
+
+
+def _on_obstacle(found: Touch) -> Values:
+    """(d,) force of the body on an obstacle, this rank's share, N."""
+    return np.asarray(-(found.normal + found.friction).sum(axis=0))
