@@ -138,6 +138,11 @@ class Term:
         """(owned dofs,) forces that r is the balance of, for its convergence test, N."""
         return None
 
+    def frequency(self) -> float:
+        """By how much it adds to the square of the highest frequency of the body at most, on all ranks, 1/s^2: what
+        explicit steps are cut to."""
+        return 0.0
+
     def longest_step(self, change: Values) -> float:
         """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0

@@ -78,8 +78,10 @@ def _dead_loads(parts: Parts) -> Term | None:
 def _obstacles(parts: Parts) -> Term | None:
     if not parts.study.obstacle:
         return None
-    from .contact import obstacles_of
+    from .contact import explicit_obstacles_of, obstacles_of
 
+    if not parts.scheme.implicit:
+        return explicit_obstacles_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
     return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
 

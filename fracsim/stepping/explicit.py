@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 
 SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on the current shape
+KINK = 3.0  # of the squares of frequencies that terms add: with omega dt above 1 a spring that takes hold gains energy
 REFRESH = 20  # steps between two looks at the shape of the cells
 
 
@@ -43,7 +44,9 @@ class ExplicitStepper(BalanceStepper):
         if self._frequencies is None or state.step % REFRESH == 0:
             self._frequencies = cell_frequencies(stress)
         squares = damaged_frequencies(stress, self._frequencies, self._of_edges())
-        highest = float(np.sqrt(self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)))
+        fastest = self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)
+        added = sum(term.frequency() for term in self.balance.terms)
+        highest = float(np.sqrt(max(fastest + added, KINK * added)))
         stable = SAFETY * stable_step(highest, self._a, self._b)
         left = self.sizes.end - state.t
         # equal steps to the end rather than a sliver: rounding up never exceeds the bound
@@ -75,10 +78,8 @@ class ExplicitStepper(BalanceStepper):
         u = state.u + dt * half
         u[own] = balance.motion.at(state.t + dt)[: len(own)]
         half[own] = (u[own] - state.u[own]) / dt
-        if "flow" in state.memory:
-            self.flow.recall(state.memory["flow"])
-        balance.look_at(state.t + dt, u, half, dt=dt)
-        self.flow.begin(dt)
+        self._begin(state, dt)  # rates of the step: (u - u_n) / dt is the velocity half-way
+        balance.displace(u)
         unbalanced = balance.forces()
         # mass damping at the velocity of the end, not of half-way: second order
         a: Values = np.asarray(-unbalanced / (balance.mass.lumped * (1 + self._a * dt / 2)), np.float64)
@@ -89,6 +90,7 @@ class ExplicitStepper(BalanceStepper):
         return SolveResult(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
+        self.balance.arrive()
         return self._arrival
 
     def _released(self, end: State, solved: Values, result: PassResult) -> State:

@@ -143,12 +143,16 @@ class Study(Table):
         return self
 
     @model_validator(mode="after")
-    def _contact_is_implicit(self) -> Study:
-        wanted = "[[obstacle]]" if self.obstacle else "[contact]" if self.contact is not None else ""
-        if wanted and not self.time.kind.implicit:
-            raise ValueError(
-                f'{wanted} needs an implicit scheme, not time.scheme = "{self.time.scheme}"; choose "backward-euler"'
-            )
+    def _contact_fits_the_scheme(self) -> Study:
+        scheme = f'time.scheme = "{self.time.scheme}"'
+        if self.contact is not None and not self.time.kind.implicit:
+            if self.contact.itself:
+                raise ValueError(
+                    f"[contact] of the body with itself needs an implicit scheme, not {scheme}; choose "
+                    '"backward-euler", or contact.itself = false for obstacles alone'
+                )
+            if self.contact.creep is not None:
+                raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
         if self.contact is not None and not self.contact.itself and not self.obstacle:
             raise ValueError("[contact] has itself = false and there is no [[obstacle]]: nothing can touch; remove it")
         return self

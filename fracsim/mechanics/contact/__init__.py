@@ -8,9 +8,15 @@ free_obstacles    the term with obstacles that move by themselves; free_obstacle
 stops, stop       other obstacles that a free one meets; skeleton: the points that do
 free_pose         where one of them belongs, with the body where it is
 rigid_step, push  its pose in a step as the least of an incremental potential; what contact does to the pose
+flights           what terms with free obstacles have in common
 turn              rotation vectors that are not small
 overlap           free obstacles that lie in others
 reach             how far points may go, first guesses that have passed through nothing
+
+explicit_obstacles  the term in explicit steps: penalty, and springs that hold and slip
+penalty, springs  what pushes and what rubs there
+explicit_free, drift  with obstacles that move by themselves, by velocity Verlet
+carried           how stiff a surface may be before it is faster than the body
 
 shapes            the register of shapes, by the name that a user writes
 shape             what a shape is: distance, normal, curvature, outline, inertia

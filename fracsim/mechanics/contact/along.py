@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import Barrier
+from .law import Repulsion
 
 Values = npt.NDArray[np.float64]
 
@@ -34,7 +34,7 @@ EARLIER = 0.75 * 0.8  # 3 c / 4: weight of the force after a third of the way
 class Along:
     """A barrier over steps that begin with gaps `start` (n,), m: a function of the gaps g (n,) at their ends."""
 
-    barrier: Barrier
+    barrier: Repulsion
     start: Values
 
     def energy(self, g: Values) -> Values:

@@ -14,7 +14,7 @@ not one another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import cast
 
@@ -26,12 +26,11 @@ from mpi4py import MPI
 from ...forms.schemes import Scheme
 from ...mesh.domain import Domain
 from ...mesh.ranks import total
-from ...meshes.words import AXES
+from .flights import Flights
 from .free_obstacle import Flight, FreeObstacle
 from .free_pose import Around, FreePose
 from .law import Law
 from .obstacle import Obstacle
-from .obstacles import Obstacles
 from .placed import Placed
 from .rigid_step import RigidStep
 from .stops import Stops
@@ -40,7 +39,7 @@ from .touch import Touch
 Values = npt.NDArray[np.float64]
 
 
-class FreeObstacles(Obstacles):
+class FreeObstacles(Flights):
     """Obstacles, at least one of them free.
 
     Attributes:
@@ -48,6 +47,7 @@ class FreeObstacles(Obstacles):
     """
 
     condenses = True
+    free: dict[int, FreePose]
 
     def __init__(
         self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law, scheme: Scheme
@@ -62,9 +62,6 @@ class FreeObstacles(Obstacles):
         self._scheme = scheme
         self._settled_at: Values | None = None  # places of the points that poses belong to
         super().__init__(domain, u, obstacles, law)
-
-    def _led(self) -> list[int]:
-        return [number for number in super()._led() if number not in self.free]
 
     # --- a step ---
 
@@ -83,24 +80,13 @@ class FreeObstacles(Obstacles):
 
     def memory(self) -> object:
         """That of the points, and how obstacles move."""
-        return super().memory(), {number: each.flight for number, each in self.free.items()}
+        return super().memory(), self.flights()
 
     def recall(self, memory: object) -> None:
         """Be again what `memory` gave (not collective)."""
         points, flights = cast("tuple[object, dict[int, Flight]]", memory)
         super().recall(points)
-        for number, each in self.free.items():
-            each.flight = flights[number]
-
-    def saved(self) -> dict[str, Values]:
-        """With rows of how obstacles move (collective)."""
-        return super().saved() | {"flights": np.array([each.flight.flat() for each in self.free.values()])}
-
-    def restore(self, saved: dict[str, Values]) -> None:
-        """Be again what `saved` gave."""
-        super().restore(saved)
-        for k, each in enumerate(self.free.values()):
-            each.flight = each.flight.like(saved["flights"][k])
+        self.fly(flights)
 
     def arrive(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
@@ -194,12 +180,6 @@ class FreeObstacles(Obstacles):
                 work += each.stops.work(ends[1], self._course.placed, self._course.ways)
         return work, lost
 
-    def kinetic(self) -> float:
-        """Energy of motion of the free obstacles, on rank 0, J."""
-        if self.comm.rank:
-            return 0.0
-        return float(sum(each.body.told(each.flight)[-1] for each in self.free.values()))
-
     # --- how far Newton's method may go ---
 
     def _taken_along(self, moved: Values) -> list[Values]:
@@ -264,36 +244,6 @@ class FreeObstacles(Obstacles):
         self._settled_at = None
         super().hold_back()
 
-    # --- what is told ---
-
-    def where(self, t: float) -> list[Placed]:
-        """Each obstacle at the time t of the state, s (not collective)."""
-        here = super().where(t)
-        for number, each in self.free.items():
-            here[number] = Placed(here[number].shape, each.flight.pose)
-        return here
-
-    def readings(self) -> dict[str, Callable[[], Values]]:
-        """With position_NAME_x, velocity_NAME_x of the centre of mass, m and m/s, turn_NAME_z, spin_NAME_z in rad and
-        rad/s, and kinetic_NAME in J of each that is free."""
-        columns = super().readings()
-        for each in self.free.values():
-            columns |= {name: partial(self._reading, each, place) for place, name in enumerate(_columns(each.body))}
-        return columns
-
-    def _reading(self, each: FreePose, place: int) -> Values:
-        if self.comm.rank:
-            return np.zeros(1)
-        return each.body.told(each.flight)[place : place + 1]
-
 
 def _same(x: Values, before: Values | None) -> bool:
     return before is not None and np.array_equal(x, before)
-
-
-def _columns(body: FreeObstacle) -> list[str]:
-    """Names of what `told` gives."""
-    d = len(body.at)
-    axes, turns = AXES[:d], AXES[2:] if d == 2 else AXES
-    kinds = [("position", axes), ("velocity", axes), ("turn", turns), ("spin", turns)]
-    return [*[f"{kind}_{body.name}_{axis}" for kind, over in kinds for axis in over], f"kinetic_{body.name}"]

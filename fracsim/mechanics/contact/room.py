@@ -27,7 +27,7 @@ OUT = 0.2  # of the arm, that a step gives back
 
 @dataclass(frozen=True)
 class Known:
-    """Copies that are worth knowing again: rows of `identity`, their shares (k,), and gaps (k,) in m; 0: left out."""
+    """Copies that are worth knowing again: rows of `identity`, their shares (k,), and gaps (k,) in m; nan: left out."""
 
     rows: Values
     share: Values
@@ -36,7 +36,7 @@ class Known:
     @classmethod
     def of(cls, rows: Values, share: Values, gap: Values, width: float) -> Known:
         """Of all copies those that are within `width` m, or drawn in."""
-        which = np.flatnonzero((gap < width) | (share < 1))
+        which = np.flatnonzero(~(gap >= width) | (share < 1))
         return cls(rows[which], share[which], gap[which])
 
     def again(self, rows: Values, width: float) -> tuple[Values, Values]:
@@ -44,7 +44,7 @@ class Known:
         share, gap = np.ones(len(rows)), np.full(len(rows), width)
         at = found_again(self.rows, rows)
         share[at[at >= 0]], gap[at[at >= 0]] = self.share[at >= 0], self.gap[at >= 0]
-        return share, np.where(gap > 0, np.minimum(gap, width), width)
+        return share, np.where(np.isnan(gap), width, np.minimum(gap, width))
 
 
 def drawn_in(
@@ -56,7 +56,8 @@ def drawn_in(
     found[which] = share
     for part in SHARES:
         trial = part * share[left]
-        fits = gaps(at.some(u, which[left], trial)) >= wanted[left] * (1 - 1e-9)  # of what does not move: round-off
+        # of what does not move: round-off
+        fits = gaps(at.some(u, which[left], trial)) >= wanted[left] - 1e-9 * abs(wanted[left])
         found[which[left[fits]]] = trial[fits]
         left = left[~fits]
         if not len(left):

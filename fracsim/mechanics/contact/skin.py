@@ -41,6 +41,15 @@ class Skin:
         self.area: Values = self._surface.area
 
     @property
+    def at(self) -> Places:
+        """Where the points are."""
+        return self._surface.at
+
+    def identity(self, points: Ints) -> Values:
+        """(k, 2 d + 1) rows that tell points (k,) from all others, whatever breaks."""
+        return self._surface.identity(points)
+
+    @property
     def rest(self) -> Values:
         """(n, d) where the points are in the body at rest, m."""
         return self._surface.at.rest
@@ -84,7 +93,7 @@ class Skin:
     def edges_broke(self, pattern: npt.NDArray[np.uint8], u: Values, gaps: Gaps) -> None:
         """New walls are part of it, drawn in where they would lie in an obstacle (collective)."""
         old = self._surface.at
-        gap = np.where(self.area > 0, gaps(self.places(u)), 0.0)
+        gap = np.where(self.area > 0, gaps(self.places(u)), np.nan)
         known = Known.of(self._surface.identity(), old.share[old.copies], gap[old.copies], self._width)
         self._surface.follow_damage(pattern)
         self.follow.destroy()

@@ -14,8 +14,9 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import Barrier, longest_step
+from .barrier import longest_step
 from .bent import Start
+from .law import Repulsion
 from .obstacle import Obstacle
 from .placed import Placed
 from .pose import Pose, turned
@@ -58,7 +59,7 @@ class Stop:
         return [placed.distance(x) for x, placed in self.sides(body, other)]
 
     def touches(
-        self, body: Pose, other: Pose, barrier: Barrier, start: list[Values] | None
+        self, body: Pose, other: Pose, barrier: Repulsion, start: list[Values] | None
     ) -> list[tuple[Touch, Values]]:
         """What acts on the points of each, and where these are; `start`: gaps as the step began (along)."""
         begun: list[Start | None] = [None, None] if start is None else [Start.straight(gap, body.dim) for gap in start]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import Barrier
 from .course import Going
+from .law import Repulsion
 from .obstacle import Obstacle
 from .placed import Placed
 from .pose import Pose
@@ -22,7 +22,7 @@ Values = npt.NDArray[np.float64]
 class Stops:
     """Of one free obstacle; `placed` is where all obstacles are, by their numbers."""
 
-    def __init__(self, body: Obstacle, others: dict[int, Obstacle], barrier: Barrier) -> None:
+    def __init__(self, body: Obstacle, others: dict[int, Obstacle], barrier: Repulsion) -> None:
         """`others`: by their numbers."""
         self._each = {number: Stop.of(body, other) for number, other in others.items()}
         self._barrier, self._count = barrier, len(body.way(0.0, 0.0))

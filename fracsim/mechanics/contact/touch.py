@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .along import Along
-from .barrier import Barrier
 from .bent import Start
 from .friction import Friction
+from .law import Repulsion
 from .placed import Placed
 
 Values = npt.NDArray[np.float64]
@@ -71,7 +71,7 @@ class Touch:
         return positive(self.exact) + self.stick
 
 
-def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Barrier) -> Grip:
+def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Repulsion) -> Grip:
     """Normal forces at places x (n, d) of the start of a step, with gaps (n,), m."""
     near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
     return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near])
@@ -81,7 +81,7 @@ def touch(
     x: Values,
     area: Values,
     placed: Placed,
-    barrier: Barrier,
+    barrier: Repulsion,
     held: Grip | None,
     friction: Friction | None,
     way: Values,

@@ -61,10 +61,11 @@ class LocalSurface:
         out = made.points[self._touching] - middle
         self.at = Places(mean, middle, arms[0] if arms else csr_matrix(mean.shape), out)
 
-    def identity(self) -> Values:
-        """(k, 2 d + 1) rows that tell the copies `at.copies` from all others, whatever breaks (split.identity)."""
-        domain = self._domain
-        return identity(self._made, self._touching[self.at.copies], domain.node_input, domain.size)
+    def identity(self, points: Ints | None = None) -> Values:
+        """(k, 2 d + 1) rows that tell `points` (k,), or the copies `at.copies`, from all others, whatever breaks
+        (split.identity)."""
+        domain, which = self._domain, self.at.copies if points is None else points
+        return identity(self._made, self._touching[which], domain.node_input, domain.size)
 
     def _mean(self, touching: Ints, rows: Ints, nodes: Ints, values: Values) -> PETSc.Mat:
         """(points, nodes) mean over the parents of each point."""
@@ -174,11 +175,15 @@ def _on_columns(matrices: list[PETSc.Mat]) -> tuple[Ints, list[csr_matrix]]:
 
 
 class Following:
-    """Carries values between the nodes of a body, wherever they are, and the points of this rank's surface."""
+    """Carries values between the nodes of a body, wherever they are, and the points of this rank's surface.
+
+    Attributes:
+        dim: of the body.    comm: its ranks.
+    """
 
     def __init__(self, domain: Domain, surface: LocalSurface) -> None:
         """For the surface as it is now (collective)."""
-        self._surface, self._dim = surface, domain.dim
+        self._surface, self.dim, self.comm = surface, domain.dim, domain.comm
         self._nodes = PETSc.Vec().createMPI((domain.node_count * domain.dim, PETSc.DETERMINE), bsize=domain.dim,
                                             comm=domain.comm)  # fmt: skip
         self._here = PETSc.Vec().createSeq(len(surface.columns) * domain.dim, bsize=domain.dim)
@@ -194,11 +199,15 @@ class Following:
         """(columns, d) values at the nodes that the points follow (collective)."""
         self._nodes.array_w[:] = owned
         self._scatter.scatter(self._nodes, self._here, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
-        return np.asarray(self._here.array_r.reshape(-1, self._dim))
+        return np.asarray(self._here.array_r.reshape(-1, self.dim))
 
     def handed_down(self, forces: Values) -> Values:
         """(owned dofs,) nodal forces of forces (n, d) at the points, N (collective)."""
-        self._here.array_w[:] = (self._surface.at.weights.T @ forces).reshape(-1)
+        return self.summed(self._surface.at.weights.T @ forces)
+
+    def summed(self, parts: Values) -> Values:
+        """(owned dofs,) sums over ranks of their parts (columns, d) at the nodes that points follow (collective)."""
+        self._here.array_w[:] = parts.reshape(-1)
         self._nodes.set(0.0)
         self._scatter.scatter(self._here, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return self._nodes.array_r.copy()

@@ -1,0 +1,90 @@
+"""What terms with free obstacles have in common: how these fly is their past, and told in history.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ...meshes.words import AXES
+from .free_obstacle import Flight, FreeObstacle
+from .obstacles import Obstacles
+from .placed import Placed
+
+Values = npt.NDArray[np.float64]
+
+
+class Flying(Protocol):
+    """A free obstacle, and how it moves at the start of a step until that is over."""
+
+    body: FreeObstacle
+    flight: Flight
+
+
+class Flights(Obstacles):
+    """Obstacles of which some are free.
+
+    Attributes:
+        free: those by their number.
+    """
+
+    free: Mapping[int, Flying]
+
+    def _led(self) -> list[int]:
+        return [number for number in super()._led() if number not in self.free]
+
+    def flights(self) -> dict[int, Flight]:
+        """How each moves, by its number."""
+        return {number: each.flight for number, each in self.free.items()}
+
+    def fly(self, flights: Mapping[int, Flight]) -> None:
+        """Move again as `flights` gave it."""
+        for number, each in self.free.items():
+            each.flight = flights[number]
+
+    def saved(self) -> dict[str, Values]:
+        """With rows of how obstacles move (collective)."""
+        return super().saved() | {"flights": np.array([each.flight.flat() for each in self.free.values()])}
+
+    def restore(self, saved: dict[str, Values]) -> None:
+        """Be again what `saved` gave."""
+        super().restore(saved)
+        for k, each in enumerate(self.free.values()):
+            each.flight = each.flight.like(saved["flights"][k])
+
+    def where(self, t: float) -> list[Placed]:
+        """Each obstacle at the time t of the state, s (not collective)."""
+        here = super().where(t)
+        for number, each in self.free.items():
+            here[number] = Placed(here[number].shape, each.flight.pose)
+        return here
+
+    def kinetic(self) -> float:
+        """Energy of motion of the free obstacles, on rank 0, J."""
+        if self.comm.rank:
+            return 0.0
+        return float(sum(each.body.told(each.flight)[-1] for each in self.free.values()))
+
+    def readings(self) -> dict[str, Callable[[], Values]]:
+        """With position_NAME_x, velocity_NAME_x of the centre of mass, m and m/s, turn_NAME_z, spin_NAME_z in rad and
+        rad/s, and kinetic_NAME in J of each that is free."""
+        columns = super().readings()
+        for each in self.free.values():
+            columns |= {name: partial(self._reading, each, place) for place, name in enumerate(_columns(each.body))}
+        return columns
+
+    def _reading(self, each: Flying, place: int) -> Values:
+        if self.comm.rank:
+            return np.zeros(1)
+        return each.body.told(each.flight)[place : place + 1]
+
+
+def _columns(body: FreeObstacle) -> list[str]:
+    """Names of what `told` gives."""
+    d = len(body.at)
+    axes, turns = AXES[:d], AXES[2:] if d == 2 else AXES
+    kinds = [("position", axes), ("velocity", axes), ("turn", turns), ("spin", turns)]
+    return [*[f"{kind}_{body.name}_{axis}" for kind, over in kinds for axis in over], f"kinetic_{body.name}"]

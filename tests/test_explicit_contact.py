@@ -1,0 +1,243 @@
+"""Contact with obstacles in explicit steps, against closed forms, dense matrices and conservation laws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from pydantic import ValidationError
+
+from fracsim.mechanics.contact.carried import Carried
+from fracsim.mechanics.contact.explicit_free import ExplicitFreeObstacles
+from fracsim.mechanics.contact.explicit_obstacles import ExplicitObstacles
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.split.local import Following, LocalSurface
+from fracsim.scene import Scene
+from support.resumed import going_stopped_resumed
+from support.scenes import each_step, make_scene, make_study, march, positions
+from support.torn import RUNS
+
+Values = npt.NDArray[np.float64]
+
+RUBBER = {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0}
+SPEED_OF_SOUND = 31.6  # m/s, sqrt(E / rho)
+G = 10.0
+
+
+def floor(dim: int, height: float, **more: Any) -> dict[str, Any]:
+    """A plane below the body, the last axis upwards."""
+    normal = [0.0] * (dim - 1) + [1.0]
+    return {"name": "floor", "shape": "plane", "at": [height * each for each in normal], "normal": normal} | more
+
+
+def masses(scene: Scene) -> Values:
+    """(nodes, 1) kg."""
+    return scene.balance.mass.lumped.reshape(-1, scene.domain.dim)[:, :1]
+
+
+def test_springs_at_points_are_no_faster_than_said() -> None:
+    """Of a torn body, whose points follow several nodes: omega^2 of M^-1 sum k_p w_p w_p^T (dense) is at most the
+    bound, for any k_p; and at most 1, but not much less, for what points carry of the nodes' masses."""
+    mesh = {"builder": "box", "size": [1.0, 0.6], "h": 0.2, "pattern": "unstructured"}
+    scene, _ = make_scene(mesh=mesh)
+    surface, graph = LocalSurface(scene.domain), EdgeGraph(scene.domain)
+    graph.break_edges(np.random.default_rng(1).random(len(graph.broken)) < 0.4)
+    surface.follow_damage(graph.pattern)
+    carried = Carried(surface.at, Following(scene.domain, surface), scene.balance.mass.lumped)
+    W, m = surface.at.weights.toarray(), masses(scene)[surface.columns, 0]
+
+    def fastest(k: Values) -> float:
+        return float(np.linalg.eigvalsh((W.T * k) @ W / np.sqrt(m[:, None] * m)).max())
+
+    assert len(surface.at.copies) > 30
+    own = carried.masses(surface.area)
+    assert 0.3 < fastest(own) <= 1 + 1e-12
+    for seed in range(5):
+        k = np.random.default_rng(seed).exponential(size=len(own)) ** 3
+        assert fastest(k) <= carried.fastest(k) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_block_bounces_off_a_plane(dim: int) -> None:
+    """At 5 m/s, a sixth of the speed of sound: m v = sum of dt f, energy to 2 % all through, friction never above mu N,
+    and no point deeper than half an edge times v / c."""
+    h = 0.25
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": h, "pattern": "unstructured"}, material=RUBBER,
+        obstacle=[floor(dim, -0.05, friction=0.3)], initial={"velocity": [2.0] + [0.0] * (dim - 2) + [-5.0]},
+        time={"scheme": "explicit", "step": 0.02, "end": 0.12},
+    )  # fmt: skip
+    m, v = masses(scene), state.v.reshape(-1, dim)
+    began, energy = (m * v).sum(axis=0), 0.5 * float((m * v**2).sum())
+    impulse, before, depth = np.zeros(dim), np.zeros(dim), 0.0
+    for report in each_step(scene, state):
+        force = -scene.probes()[:dim]
+        impulse += report.dt * (force + before) / 2
+        before = force
+        assert np.linalg.norm(force[:-1]) <= 0.3 * force[-1] * (1 + 1e-9)
+        x = positions(scene) + state.u.reshape(-1, dim)
+        depth = max(depth, -0.05 - x[:, -1].min())
+        assert report.kinetic + report.elastic + state.dissipated == pytest.approx(energy, rel=0.02)
+    ended = (m * state.v.reshape(-1, dim)).sum(axis=0)
+    np.testing.assert_allclose(ended - began, impulse, atol=1e-9 * abs(began[-1]))
+    assert ended[-1] > 0.5 * 1000 and not before.any()  # it has left
+    assert 0 < depth < 0.5 * h * 5.0 / SPEED_OF_SOUND
+    assert state.dissipated > 0.01 * energy
+
+
+@pytest.mark.parametrize(("share", "sticks"), [(1.1, True), (0.9, False)])
+def test_a_block_on_a_slope(share: float, sticks: bool) -> None:
+    """tan(theta) = 0.5 and mu = `share` of it: it stays where it is, or slides with g (sin - mu cos); the floor carries
+    m g cos. Gravity is turned, not the slope. (Without damping it rocks, and comes down in hops.)"""
+    slope = 0.5
+    along, down = np.array([slope, -1.0]) / np.hypot(1, slope) * G
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=RUBBER,
+        load={"gravity": [along, down]}, damping={"mass": 20.0 * sticks, "stiffness": 1e-3},
+        obstacle=[floor(2, -0.0125 + 1e-3, friction=share * slope)], contact={"itself": False, "distance": 0.0125},
+        time={"scheme": "explicit", "step": 0.01, "end": 0.6},
+    )  # fmt: skip
+    m, moved = masses(scene)[:, 0], []
+    for _ in each_step(scene, state):
+        pushed = scene.probes()[:2]
+        moved.append((state.t, float(m @ state.u.reshape(-1, 2)[:, 0]) / m.sum(), -pushed[0] / pushed[1]))
+    t, way, ratio = np.array(moved[1:]).T
+    assert ratio.max() <= share * slope * (1 + 1e-9)
+    if sticks:
+        assert abs(way[-1] - way[len(way) // 2]) < 1e-5
+        np.testing.assert_allclose(scene.probes()[:2], [500 * along, 500 * down], rtol=1e-3)
+    else:
+        late = t > 0.2
+        assert 2 * np.polyfit(t[late], way[late], 2)[0] == pytest.approx(along + share * slope * down, rel=0.05)
+        assert ratio[late].mean() == pytest.approx(share * slope, rel=0.02)
+
+
+def test_the_work_of_a_driven_obstacle_is_in_the_books() -> None:
+    """A rubbing platen comes down on a block: what it does is stored, moves, or is lost to friction; that to 1 %."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=RUBBER,
+        boundary=[{"on": "bottom", "fix": "xy"}],
+        obstacle=[{"name": "platen", "shape": "plane", "at": [0.0, 0.52], "normal": [0.0, -1.0],
+                   "velocity": [2.0, -1.0], "friction": 0.3}],
+        time={"scheme": "explicit", "step": 0.02, "end": 0.08},
+    )  # fmt: skip
+    (*_, report) = march(scene, state)
+    assert state.dissipated > 0.1 * state.work > 0
+    assert state.work == pytest.approx(report.kinetic + report.elastic + state.dissipated, rel=0.01)
+    assert scene.probes()[0] == pytest.approx(-0.3 * scene.probes()[1], rel=0.05)  # it slides everywhere, nearly
+
+
+@pytest.mark.parametrize("mass", (1.0, 100.0))
+def test_a_ball_that_strikes_a_block(mass: float) -> None:
+    """It spins, rubs and flies off again: linear and angular momentum of the pair to round-off, and what friction takes
+    is in the books; the energy of a ball of a thousandth of the block is kept less well."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * 3, "h": 0.5, "pattern": "unstructured"}, material=RUBBER,
+        obstacle=[{"name": "ball", "shape": "sphere", "radius": 0.25, "at": [0.4, 0.5, 1.26], "mass": mass,
+                   "velocity": [1.0, 0.0, -5.0], "spin": [3.0, 2.0, 1.0], "friction": 0.3}],
+        time={"scheme": "explicit", "step": 0.02, "end": 0.1},
+    )  # fmt: skip
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, ExplicitFreeObstacles)]
+    X, m = positions(scene), masses(scene)
+
+    def momentum() -> Values:
+        flight, p = contact.free[0].flight, m * state.v.reshape(-1, 3)
+        spun = np.cross(flight.pose.centre, flight.momentum[:3]) + flight.momentum[3:]
+        turning = np.cross(X + state.u.reshape(-1, 3), p).sum(axis=0) + spun
+        return np.concatenate([p.sum(axis=0) + flight.momentum[:3], turning])
+
+    began, energies = momentum(), []
+    for report in each_step(scene, state):
+        energies.append(report.kinetic + report.elastic + state.dissipated - state.work)
+    figures = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    assert figures["contact_ball_z"] == 0 and figures["velocity_ball_z"] > 1  # it has left
+    np.testing.assert_allclose(momentum(), began, atol=1e-12 * abs(began).max())
+    np.testing.assert_allclose(energies, energies[0], rtol=0.02 if mass > 10 else 0.1)
+    assert state.dissipated > 0 and abs(state.work) < 1e-12
+
+
+def test_a_weight_dropped_on_a_rail() -> None:
+    """It has received m v + m g t from the block, and what gravity has done moves or is stored."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=RUBBER, load={"gravity": [0.0, -G]},
+        boundary=[{"on": "bottom", "fix": "xy"}],
+        obstacle=[{"name": "weight", "shape": "box", "size": [0.5, 0.2], "at": [0.5, 0.62], "mass": 500.0,
+                   "guide": "y"}],
+        time={"scheme": "explicit", "step": 0.02, "end": 0.15},
+    )  # fmt: skip
+    impulse, before = 0.0, 0.0
+    for report in each_step(scene, state):
+        figures = dict(zip(scene.probes.names, scene.probes(), strict=True))
+        impulse += report.dt * (figures["contact_weight_y"] + before) / 2
+        before = figures["contact_weight_y"]
+    assert impulse > 100 and abs(figures["velocity_weight_x"]) == 0
+    assert impulse == pytest.approx(500 * (figures["velocity_weight_y"] + G * state.t), rel=1e-9)
+    assert state.work == pytest.approx(report.kinetic + report.elastic, rel=0.03)
+
+
+def test_a_stiff_penalty_takes_a_shorter_step() -> None:
+    """A user's stiffness is not reduced, but the step is; the default leaves at least 0.8 of it."""
+    steps = []
+    for contact in (None, {"itself": False}, {"itself": False, "stiffness": 1e7}):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25, "pattern": "unstructured"}, material=RUBBER,
+            time={"scheme": "explicit", "step": 0.02, "end": 0.06}, initial={"velocity": [0.0, -2.0]},
+            **({} if contact is None else {"obstacle": [floor(2, -0.02)], "contact": contact}),
+        )  # fmt: skip
+        began = march(scene, state, 1)[0]
+        steps.append(began.dt)
+        (*_, report) = march(scene, state)
+        assert report.kinetic + report.elastic == pytest.approx(began.kinetic + began.elastic, rel=0.02)
+    assert 0.8 * steps[0] < steps[1] < steps[0]
+    assert steps[2] < 0.4 * steps[0]
+
+
+def test_what_breaks_in_touch_gains_nothing() -> None:
+    """Edges at a floor that carries the body break: the penalty stores no more than before, no force is larger, and
+    springs of points that are still there go on."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.125, "pattern": "unstructured"}, material=RUBBER,
+        load={"gravity": [2.0, -G]}, fracture={"strength": 1e9}, obstacle=[floor(2, -0.002, friction=0.5)],
+        time={"scheme": "explicit", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    march(scene, state, 60)
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, ExplicitObstacles)]
+    before, held, graph = contact.stored(), contact._past.springs[0], scene.fracture.graph
+    assert before > 0 and len(held.points) > 3
+    pushed = contact.forces()
+    graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.4)
+    scene.fracture.changed()
+    scene.balance.edges_broke(graph.pattern)
+    springs = contact._past.springs[0]
+    assert len(springs.points) == len(held.points)
+    np.testing.assert_array_equal(np.sort(springs.slip[:, 0]), np.sort(held.slip[:, 0]))
+    assert 0.3 * before < contact.stored() <= before * (1 + 1e-9)
+    assert abs(contact.forces()).sum() < 1.01 * abs(pushed).sum()
+
+
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """A plate under a driven, rubbing disk that breaks it: stopped in touch and resumed, the same but for round-off.
+    (After 20 steps, when the shape of cells is looked at in any run.)"""
+    time = {"scheme": "explicit", "step": 0.05, "end": 1.0}
+    tables = RUNS["rapped"] | {"output": {"picture": False, "interval": 1.0}, "time": time}
+    going, stopped, again = going_stopped_resumed(tables, tmp_path, 20, 4)
+    assert stopped.breaks.figures[0] > 0
+    assert again.breaks.figures == going.breaks.figures
+    for name in ("work", "dissipated", "elastic"):
+        assert getattr(again.state, name) == pytest.approx(getattr(going.state, name), rel=1e-9)
+    np.testing.assert_allclose(again.scene.probes(), going.scene.probes(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"contact": {}}, r"\[contact\] of the body with itself needs an implicit scheme.*contact\.itself = false"),
+        ({"contact": {"itself": False, "creep": 1e-3}}, "creep is for implicit schemes.*remove it"),
+    ],
+)  # fmt: skip
+def test_what_explicit_steps_have_not_is_refused(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        make_study(**{"time": {"scheme": "explicit", "step": 0.1, "end": 1.0}, "obstacle": [floor(2, -1.0)]} | tables)
