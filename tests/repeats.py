@@ -93,4 +93,12 @@ REPEATS = (
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[stadium]",
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[ring]",
     "test_shapes.py::test_distance_is_that_to_the_closest_point_of_the_surface[drum]",
+    # facets before other shapes: a capsule is a ball along an axis, a cylinder a box about one
+    "test_facets.py::test_the_place_is_the_deepest[capsule]",
+    "test_facets.py::test_the_place_is_the_deepest[cylinder]",
+    "test_facets.py::test_forces_and_stiffness_are_derivatives[capsule]",
+    "test_facets.py::test_forces_and_stiffness_are_derivatives[cylinder]",
+    # a ball of the size of a facet: one far smaller
+    "test_facets.py::test_no_facet_is_cut[2-0.3]",
+    "test_facets.py::test_no_facet_is_cut[3-0.3]",
 )

@@ -57,8 +57,10 @@ class Meetings:
         return [*missed, *small, *fast]
 
     def _sizes(self) -> list[float]:
-        """The least extent of each obstacle, m; infinite of a plane and of one that the body is in."""
-        return [least_extent(each.shape) for each in self._contact.obstacles]
+        """The least extent of each obstacle that points alone feel, m; infinite of a plane and of one that the body is
+        in."""
+        alone = self._contact.felt_by_points_alone()
+        return [least_extent(each.shape) if only else math.inf for each, only in alone]
 
     def _over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`closed` of the rank where it is largest (collective)."""

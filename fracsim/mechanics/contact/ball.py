@@ -34,8 +34,10 @@ class _Swept(Body):
 
     def _normal(self, x: Values) -> Values:
         away, length, _ = self._from_core(x)
-        some = frame(self._core()[0])[:, 0]  # on the segment itself every direction across it is as good
         on_core = length < np.finfo(float).tiny
+        if not on_core.any():
+            return np.asarray(away / length[:, None])
+        some = frame(self._core()[0])[:, 0]  # on the segment itself every direction across it is as good
         return np.where(on_core[:, None], some, away / np.where(on_core, 1.0, length)[:, None])
 
     def _curvature(self, x: Values) -> Values:
@@ -47,6 +49,9 @@ class _Swept(Body):
         on_core = length < np.finfo(float).tiny
         bent = (P - n[:, :, None] * n[:, None, :]) / np.where(on_core, 1.0, length)[:, None, None]
         return np.where(on_core[:, None, None], 0.0, bent)
+
+    def _radius(self) -> float:
+        return self._core()[2]
 
     def _outline(self) -> Outline:
         axis, half, radius = self._core()

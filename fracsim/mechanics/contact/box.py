@@ -59,6 +59,9 @@ class Box(Body):
         signs = _signs(x)
         return signs[:, :, None] * self._corner(x).curvature * signs[:, None, :]
 
+    def _radius(self) -> float:
+        return self.fillet
+
     def _outline(self) -> Outline:
         half = self._half()
         if self.dim == 3:

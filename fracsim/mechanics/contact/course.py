@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from .facets import Facets
 from .obstacle import Obstacle
 from .placed import Placed
-from .reach import safe_shares
+from .reach import Way, safe_shares
 
 Values = npt.NDArray[np.float64]
 type Going = tuple[Placed, Values]  # where an obstacle begins, and the increment (p,) of its pose
@@ -42,9 +43,10 @@ class Course:
         """One whose way is not known yet stays where it began."""
         self.placed[number] = self.at_start[number] = placed
 
-    def known(self) -> list[tuple[Placed, Values]]:
-        """Where each obstacle whose way is known is at the start of the step, and its way (p,) to the end."""
-        return [(self.at_start[number], self.ways[number]) for number in self.led]
+    def known(self, facets: Callable[[int], Facets | None]) -> list[Way]:
+        """Where each obstacle whose way is known is at the start of the step, its way (p,) to the end, and the facets
+        that feel it, by its number."""
+        return [(self.at_start[number], self.ways[number], facets(number)) for number in self.led]
 
     def back_to_start(self) -> None:
         """None has gone any of its way."""
@@ -63,15 +65,15 @@ class Course:
         """Where it is now, and what is left of its way."""
         return {number: (self._after(*way), (1 - self._gone) * way[1]) for number, way in self.whole().items()}
 
-    def go_on(self, x: Values, least: Callable[[Values], float], most: float = 1.0) -> None:
-        """A share of the rest of the way, `most` at most, that is safe with points at x (n, d); `least`: of shares
-        (n,), on all ranks (collective)."""
+    def go_on(self, x: Values, ways: list[Way], least: Callable[[Values], float], most: float = 1.0) -> None:
+        """A share of the rest of the `known` ways, `most` at most, that is safe with points at x (n, d); `least`: of
+        shares (n,), on all ranks (collective)."""
         rest, still = 1 - self._gone, np.zeros_like(x)
-        shares = [safe_shares(self._after(*way), x, still, rest * way[1]) for way in self.known()]
+        shares = [safe_shares(self._after(placed, q), x, still, rest * q, facets) for placed, q, facets in ways]
         share = min(least(np.min(shares, axis=0)) if shares else 1.0, most)
         self._gone = 1.0 if share == 1 else self._gone + share * rest
-        for number, way in zip(self.led, self.known(), strict=True):
-            self.placed[number] = self._after(*way)
+        for number, (placed, q, _) in zip(self.led, ways, strict=True):
+            self.placed[number] = self._after(placed, q)
 
     def _after(self, placed: Placed, way: Values) -> Placed:
         """Where one that began at `placed` is now."""

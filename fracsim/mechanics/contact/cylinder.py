@@ -58,7 +58,9 @@ class Cylinder(Body):
         across = x - height[:, None] * axis
         rho = np.linalg.norm(across, axis=1)
         on_axis = rho < np.finfo(float).tiny
-        away = np.where(on_axis[:, None], frame(axis)[:, 0], across / np.where(on_axis, 1.0, rho)[:, None])
+        away = across / np.where(on_axis, 1.0, rho)[:, None]
+        if on_axis.any():
+            away[on_axis] = frame(axis)[:, 0]
         q = np.stack([rho - radius, abs(height) - half], axis=1)
         return Corner(q), rho, away, np.where(height < 0, -1.0, 1.0)[:, None] * axis
 
@@ -78,6 +80,9 @@ class Cylinder(Body):
         ring = np.where(on_axis, 0.0, corner.slope[:, 0] / np.where(on_axis, 1.0, rho))
         bent = np.einsum("nab,nai,nbj->nij", corner.curvature, plane, plane, optimize=True)
         return np.asarray(bent + ring[:, None, None] * around[:, :, None] * around[:, None, :])
+
+    def _radius(self) -> float:
+        return self.fillet
 
     def _outline(self) -> Outline:
         radius, half = self._core()

@@ -233,7 +233,7 @@ class FreeObstacles(Flights):
         """As far as free obstacles let others."""
         rest, still = self._course.rest(), np.zeros_like(self._course.ways[0])
         shares = [each.stops.safe_share(each.placed.pose, still, rest) for each in self.free.values()]
-        self._course.go_on(x, self.skin.safe, min(shares))
+        self._course.go_on(x, self._course.known(self._facets), self.skin.safe, min(shares))
         self._touches = self._settled_at = None
 
     def hold_back(self) -> None:

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .deepest import Deepest, deepest
 from .placed import Placed
 from .pose import Values, turned
+
+ROUGH = 1e-6  # of the size of a facet: what is left of derivatives where its deepest place is found roughly
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +58,37 @@ class Motion:
         """(n,) the largest distance from the centre on the way, which is at one of its ends."""
         ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), share)), axis=1) for share in (0.0, 1.0)]
         return np.maximum(*ends)
+
+
+class Passing:
+    """Facets with corners x (k, c, d) that go straight by `relative` (k, c, d), m, past a convex obstacle.
+
+    Their deepest places are found roughly: L (deepest) lies above its tangent at any place, which is what counts.
+    """
+
+    def __init__(self, obstacle: Placed, x: Values, relative: Values, soften: float) -> None:
+        self._obstacle, self._x, self._relative, self._soften = obstacle, x, relative, soften
+        self._share: Values = np.full(len(x), np.nan)
+        self._at = deepest(obstacle, x, soften, ROUGH)
+
+    def _there(self, share: Values) -> Deepest:
+        if not np.array_equal(share, self._share):
+            x = self._x + share[:, None, None] * self._relative
+            self._share, self._at = share.copy(), deepest(self._obstacle, x, self._soften, ROUGH)
+        return self._at
+
+    def gap(self, share: Values) -> Values:
+        """(k,) no less is left after shares (k,) of the motion, m."""
+        at = self._there(share)
+        return at.gap + np.minimum(at.slack.min(axis=1), 0.0)
+
+    def speed(self, share: Values) -> Values:
+        """(k,) no gap closes faster than this from `share` to the end, m per whole motion.
+
+        Each corner is over the tangent by its slack, or more: one that comes closer by v may go on by the share
+        (gap + slack) / v.
+        """
+        at, gap = self._there(share), np.maximum(self.gap(share), np.finfo(float).tiny)[:, None]
+        closing = np.maximum(-np.einsum("kcd,kd->kc", self._relative, at.normal), 0.0)
+        over = np.maximum(at.gap[:, None] + at.slack, gap)
+        return np.asarray((closing * gap / over).max(axis=1))

@@ -71,8 +71,10 @@ class Obstacles(Touching, Term):
         if not count:
             return None
         points = np.concatenate([each.points for each in touches])
-        blocks = self._level.blow.factor * np.concatenate([each.stiffness for each in touches])
-        return self._coupling(self.skin.stiffness(points, blocks), self.skin.columns)
+        part = self.skin.stiffness(points, np.concatenate([each.stiffness for each in touches]))
+        for corners, blocks in (each.between for each in touches if each.between is not None):
+            part = part + self.skin.stiffness_between(corners, blocks())
+        return self._coupling((self._level.blow.factor * part).tocsr(), self.skin.columns)
 
     def stored(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
@@ -107,8 +109,9 @@ class Obstacles(Touching, Term):
         """Share of a change of u that closes no gap by more than nine tenths (collective)."""
         self.touching()
         moved = self.skin.follow(np.divide(change, self._level.share))
-        along = zip(self._course.placed, self._taken_along(moved), strict=True)
-        shares = [safe_shares(placed, self.x, moved, q)[self.skin.area > 0] for placed, q in along]
+        along = enumerate(zip(self._course.placed, self._taken_along(moved), strict=True))
+        every = [safe_shares(placed, self.x, moved, q, self._facets(number)) for number, (placed, q) in along]
+        shares = [each[self.skin.area > 0] for each in every]
         return float(min(share.min(initial=1.0) for share in shares))
 
     def _taken_along(self, moved: Values) -> list[Values]:
@@ -120,12 +123,13 @@ class Obstacles(Touching, Term):
         level = self._level
         if not level.dt:
             return u
-        end = within_reach(self.skin, self._course.known(), level.u, level.at_end(u))
+        end = within_reach(self.skin, self._course.known(self._facets), level.u, level.at_end(u))
         return np.asarray(level.u + level.share * (end - level.u))
 
     def clear(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
-        return self.skin.are_apart(least_distance(self._course.placed, self.skin.places(self._level.at_end(u))))
+        x = self.skin.places(self._level.at_end(u))
+        return self.skin.are_apart(least_distance(self._course.placed, x)) and self._are_uncut(x)
 
     def hold_back(self) -> None:
         """Obstacles wait on their way where they would meet the body at the step's start: what is jammed between them
@@ -142,7 +146,7 @@ class Obstacles(Touching, Term):
         return True
 
     def _go_on(self, x: Values) -> None:
-        self._course.go_on(x, self.skin.safe)
+        self._course.go_on(x, self._course.known(self._facets), self.skin.safe)
         self._touches = None
 
     # --- what breaks, and what is drawn ---
@@ -161,7 +165,8 @@ class Obstacles(Touching, Term):
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """New walls are part of the surface, drawn in where they would lie in an obstacle (collective)."""
-        self.skin.edges_broke(pattern, self._at_end(), partial(least_distance, self._course.placed))
+        placed = self._course.placed
+        self.skin.edges_broke(pattern, self._at_end(), partial(least_distance, placed), self._cuts(placed))
         self._forget_start()
 
     def memory(self) -> object:
@@ -174,11 +179,13 @@ class Obstacles(Touching, Term):
 
     def saved(self) -> dict[str, Values]:
         """The same for a checkpoint (collective)."""
-        return {"drawn_in": self.skin.saved()}
+        return {"drawn_in": self.skin.saved()} | ({"cut": self.skin.saved_cut()} if self._sharp else {})
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         self.skin.restore(saved["drawn_in"])
+        if "cut" in saved:
+            self.skin.restore_cut(saved["cut"])
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
@@ -200,12 +207,16 @@ class Obstacles(Touching, Term):
         return read[axis : axis + 1]
 
     def least(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none."""
+        """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none. Of
+        facets that of the place where they feel it."""
         return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
 
     def _gap(self, number: int) -> float:
         self.touching()
-        return self.skin.least(self._course.placed[number].distance(self.x))
+        least, placed = self.skin.least(self._course.placed[number].distance(self.x)), self._course.placed[number]
+        if (facets := self._facets(number)) is None:
+            return least
+        return min(least, float(facets.distances(placed, self.x, self.law.barrier.width).min(initial=np.inf)))
 
     def works(self) -> dict[str, Callable[[], float]]:
         """work_NAME: what each obstacle has done on the body in the step that has ended, J."""

@@ -35,6 +35,11 @@ class Plane:
         return True
 
     @property
+    def least_radius(self) -> float:
+        """Infinite."""
+        return float("inf")
+
+    @property
     def volume(self) -> float:
         """Infinite."""
         return float("inf")

@@ -9,21 +9,23 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ...errors import InputError
-from .barrier import longest_step
-from .motion import Motion
+from .barrier import KEPT, longest_step
+from .facets import Facets
+from .motion import Motion, Passing
 from .obstacle import Obstacle
 from .placed import Placed
 from .skin import Skin
 
 Values = npt.NDArray[np.float64]
-type Way = tuple[Placed, Values]  # where an obstacle begins, and the increment (p,) of its pose
+Ints = npt.NDArray[np.int64]
+type Way = tuple[Placed, Values, Facets | None]  # where an obstacle begins, increment (p,) of its pose, what feels it
 
 ROUNDS = 20  # in which points that follow several nodes are brought back
 
 
-def safe_shares(placed: Placed, x: Values, moved: Values, q: Values) -> Values:
+def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Facets | None = None) -> Values:
     """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
-    moves by q meanwhile; 0 where the gap is closed already."""
+    moves by q meanwhile, and of those of their `facets`; 0 where the gap is closed already."""
     gap = placed.distance(x)
     turn = np.linalg.norm(q[placed.pose.dim :])
     relative = moved - q[: placed.pose.dim]
@@ -33,7 +35,28 @@ def safe_shares(placed: Placed, x: Values, moved: Values, q: Values) -> Values:
     if len(near):
         motion = Motion(placed, x[near], moved[near], q)
         share[near] = longest_step(motion.gap, motion.speed, len(near))
+    if facets is not None:
+        which, free = facet_shares(facets, placed, x, relative, reach)
+        np.minimum.at(share, facets.corners[which], free[:, None])
     return share
+
+
+def facet_shares(facets: Facets, placed: Placed, x: Values, relative: Values, reach: Values) -> tuple[Ints, Values]:
+    """Facets (k,) that may meet an obstacle, and the shares (k,) of the ways `relative` (n, d) to it of points x, no
+    longer than `reach` (n,), that leave a tenth of their gaps. Obstacles with facets do not turn."""
+    longest = 1.2 * reach[facets.corners].max(axis=1, initial=0.0)
+    near = facets.near(placed, x, longest) if longest.any() else np.empty(0, np.int64)
+    if not len(near):
+        return near, np.empty(0)
+    passing = Passing(placed, x[facets.corners[near]], relative[facets.corners[near]], facets.soften)
+    gap, speed = passing.gap(np.zeros(len(near))), passing.speed(np.zeros(len(near)))
+    share = np.where(gap > 0, 1.0, 0.0)
+    which = np.flatnonzero((gap > 0) & (speed > (1 - KEPT) * gap))
+    if len(which):
+        corners = facets.corners[near[which]]
+        passing = Passing(placed, x[corners], relative[corners], facets.soften)
+        share[which] = longest_step(passing.gap, passing.speed, len(which))
+    return near, share
 
 
 def within_reach(skin: Skin, ways: Sequence[Way], start: Values, end: Values) -> Values:
@@ -57,8 +80,8 @@ def within_reach(skin: Skin, ways: Sequence[Way], start: Values, end: Values) ->
 def _brought_back(area: Values, ways: Sequence[Way], x: Values, moved: Values) -> tuple[Values, npt.NDArray[np.bool_]]:
     """(n, d) what is to be added to the ways of points, and which of them are stopped."""
     back, stopped = np.zeros_like(x), np.zeros(len(x), bool)
-    for placed, q in ways:
-        share = np.where(area > 0, safe_shares(placed, x, moved, q), 1.0)
+    for placed, q, facets in ways:
+        share = np.where(area > 0, safe_shares(placed, x, moved, q, facets), 1.0)
         held = share < 1
         back[held] = ((share - 1)[:, None] * (moved - q[: x.shape[1]]))[held]
         stopped |= held
@@ -68,9 +91,14 @@ def _brought_back(area: Values, ways: Sequence[Way], x: Values, moved: Values) -
 def check_apart(comm: MPI.Intracomm, x: Values, obstacles: tuple[Obstacle, ...]) -> None:
     """InputError where a point of the body lies in an obstacle before the first step (collective)."""
     for number, each in enumerate(obstacles):
-        least = comm.allreduce(float(each.placed(0.0).distance(x).min(initial=np.inf)), op=MPI.MIN)
-        if least <= 0:
-            raise InputError(
-                f"obstacle.{number}: {each.name} overlaps the body at the start, by {-least:.4g} m; "
-                "move it away or make it smaller"
-            )
+        refuse_overlap(comm, each.placed(0.0).distance(x), number, each)
+
+
+def refuse_overlap(comm: MPI.Intracomm, gaps: Values, number: int, each: Obstacle) -> None:
+    """InputError where a distance to an obstacle at the start is not positive (collective)."""
+    least = comm.allreduce(float(gaps.min(initial=np.inf)), op=MPI.MIN)
+    if least <= 0:
+        raise InputError(
+            f"obstacle.{number}: {each.name} overlaps the body at the start, by {-least:.4g} m; "
+            "move it away or make it smaller"
+        )

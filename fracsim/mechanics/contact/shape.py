@@ -29,6 +29,10 @@ class Shape(Protocol):
         """Whether the obstacle is convex, and so the distance a convex function."""
 
     @property
+    def least_radius(self) -> float:
+        """Least radius of curvature of its surface where that is convex, m; infinite where it nowhere is."""
+
+    @property
     def volume(self) -> float:
         """m^3, in 2D m^2; of a hollow body the room inside."""
 
@@ -82,6 +86,11 @@ class Body(ABC):
         return points, np.ascontiguousarray(elements[:, ::-1]) if self.hollow else elements
 
     @property
+    def least_radius(self) -> float:
+        """Least radius of curvature, m; infinite of a hollow body."""
+        return float("inf") if self.hollow else self._radius()
+
+    @property
     def volume(self) -> float:
         """m^3, in 2D m^2, of what is enclosed."""
         return self._moments()[0]
@@ -107,6 +116,9 @@ class Body(ABC):
 
     @abstractmethod
     def _curvature(self, x: Values) -> Values: ...
+
+    @abstractmethod
+    def _radius(self) -> float: ...
 
     @abstractmethod
     def _outline(self) -> Outline: ...

@@ -17,13 +17,16 @@ from ...mesh.domain import Domain
 from ...mesh.split.identity import found_again
 from ...mesh.split.local import Following, LocalSurface
 from ...mesh.split.places import Places
+from .facets import SOFTEN, Facets
 from .room import Known, drawn_in, let_out
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 type Gaps = Callable[[Values], Values]  # (n,) distances of places (n, d) to what is nearest, m
+type Cuts = Callable[[Facets, Values], Values]  # (m,) gaps of facets with points at places (n, d), m
 
 TINY = float(np.finfo(float).tiny)
+ROUNDS, IN, LEAST = 10, 0.7, 0.05  # in which facets are drawn in: what is left of an arm each time, and in all
 
 
 class Skin:
@@ -39,6 +42,30 @@ class Skin:
         self._surface = LocalSurface(domain)
         self.follow = Following(domain, self._surface)
         self.area: Values = self._surface.area
+        self._every: Facets | None = None
+        self._kept: tuple[Values, Ints, Facets] | None = None  # of which areas, and facets left out
+        self._cut: Ints = np.empty(0, np.int64)
+
+    @property
+    def facets(self) -> Facets:
+        """Those whose corners are not left out, nor they themselves (not collective)."""
+        if self._kept is None or self._kept[0] is not self.area or self._kept[1] is not self._cut:
+            every = self._all_facets()
+            acts = np.ones(len(every.area), bool)
+            acts[self._cut] = False
+            acts &= (self.area[every.corners] > 0).all(axis=1)
+            self._kept = self.area, self._cut, Facets(every.corners[acts], every.area[acts], every.soften)
+        return self._kept[2]
+
+    def _all_facets(self) -> Facets:
+        if self._every is None:
+            self._every = Facets(*self._surface.facets(), SOFTEN * self._width)
+        return self._every
+
+    def leave_out_cut(self, x: Values, cuts: Cuts) -> None:
+        """Facets that are cut with points at x (n, d) are left out until there is room."""
+        every = self._all_facets()
+        self._cut = np.flatnonzero(cuts(every, x) <= 0)
 
     @property
     def at(self) -> Places:
@@ -88,41 +115,125 @@ class Skin:
         B = bsr_matrix((blocks, np.arange(k), np.arange(k + 1)), shape=(k * d, k * d)).tocsr()
         return (W.T @ B @ W).tocsr()
 
+    def stiffness_between(self, corners: Ints, blocks: Values) -> csr_matrix:
+        """The same of blocks (k, c d, c d) between points (k, c)."""
+        d = blocks.shape[1] // corners.shape[1]
+        points, place = np.unique(corners, return_inverse=True)
+        dofs = (d * place.reshape(corners.shape)[:, :, None] + np.arange(d)).reshape(len(corners), -1)
+        rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, dofs.shape[1])
+        size = d * len(points)
+        B = csr_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
+        W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
+        return (W.T @ B @ W).tocsr()
+
     # --- walls that come to light ---
 
-    def edges_broke(self, pattern: npt.NDArray[np.uint8], u: Values, gaps: Gaps) -> None:
-        """New walls are part of it, drawn in where they would lie in an obstacle (collective)."""
-        old = self._surface.at
+    def edges_broke(self, pattern: npt.NDArray[np.uint8], u: Values, gaps: Gaps, cuts: Cuts | None = None) -> None:
+        """New walls are part of it, drawn in where they would lie in an obstacle; `cuts`: gaps of facets, where these
+        are felt (collective)."""
+        old, rows, cut = self._surface.at, self._surface.identity(), self._named(self._cut)
         gap = np.where(self.area > 0, gaps(self.places(u)), np.nan)
-        known = Known.of(self._surface.identity(), old.share[old.copies], gap[old.copies], self._width)
+        known = Known.of(rows, old.share[old.copies], gap[old.copies], self._width)
         self._surface.follow_damage(pattern)
         self.follow.destroy()
-        self.follow = Following(self._domain, self._surface)
+        self.follow, self._every, self._kept = Following(self._domain, self._surface), None, None
         at, nodal = self._surface.at, self.follow.nodal(u)
         share, gap = known.again(self._surface.identity(), self._width)
         self._surface.at, out = drawn_in(at, nodal, at.copies, share, gap, gaps)
         self._leave_out(out)
+        if cuts is not None:
+            new = np.zeros(len(at.share), bool)
+            new[at.copies] = True
+            again = found_again(rows, self._surface.identity())
+            new[at.copies[again[again >= 0]]] = False
+            self._cut = self._known_again(cut)
+            self._spare_new(new, nodal, gaps, cuts)
 
-    def make_room(self, u: Values, gaps: Gaps) -> None:
-        """Points that were drawn in or left out come back as far as there is room (collective)."""
-        nodal = self.follow.nodal(u)
-        at = let_out(self._surface.at, nodal, self._width, gaps)
-        if len(out := np.flatnonzero(self.area == 0)):
+    def _spare_new(self, new: npt.NDArray[np.bool_], u: Values, gaps: Gaps, cuts: Cuts) -> None:
+        """Draw in new points (n,) of facets that would be cut, or feel anything; leave out those of no use."""
+        for _ in range(ROUNDS):
+            at, facets = self._surface.at, self.facets
+            of_new = new[facets.corners].any(axis=1)
+            close = cuts(facets, at(u)) < np.where(of_new, self._width, TINY)
+            tight = np.unique(facets.corners[close])
+            tight = tight[new[tight] & (at.share[tight] > LEAST)]
+            if not len(tight):
+                break
+            share = at.share.copy()
+            share[tight] *= IN
+            self._surface.at = at.drawn_in(share)
+        lost = np.flatnonzero(new & (self.area > 0))
+        lost = lost[gaps(self._surface.at(u)[lost]) <= 0]
+        if len(lost):
+            self._leave_out(np.union1d(lost, np.flatnonzero(self.area == 0)))
+        self._without(np.flatnonzero(self._close(new, u, cuts)))
+
+    def _close(self, moved: npt.NDArray[np.bool_], u: Values, cuts: Cuts) -> npt.NDArray[np.bool_]:
+        """(m,) facets of all that are cut, or have a point that has `moved` (n,) and would feel anything."""
+        every = self._all_facets()
+        wanted = np.where(moved[every.corners].any(axis=1), self._width, TINY)
+        return np.asarray(cuts(every, self._surface.at(u)) < wanted)
+
+    def _without(self, facets: Ints) -> None:
+        """Leave out these as well."""
+        if len(np.setdiff1d(facets, self._cut)):
+            self._cut = np.union1d(facets, self._cut)
+
+    def make_room(self, u: Values, gaps: Gaps, cuts: Cuts | None = None) -> None:
+        """Points and facets that were drawn in or left out come back as far as there is room (collective)."""
+        nodal, before, none = self.follow.nodal(u), self._surface.at, self.area == 0
+        at = let_out(before, nodal, self._width, gaps)
+        if len(out := np.flatnonzero(none)):
             at, out = drawn_in(at, nodal, out, np.ones(len(out)), np.full(len(out), self._width), gaps)
             self._leave_out(out)
         self._surface.at = at
+        if cuts is not None and (at is not before or len(out) or len(self._cut)):
+            self._make_room_for_facets(before, none, nodal, cuts)
+
+    def _make_room_for_facets(self, before: Places, none: npt.NDArray[np.bool_], u: Values, cuts: Cuts) -> None:
+        """Points that went out go back where a facet would feel it; facets come back that feel nothing."""
+        at = self._surface.at
+        moved = (at.share != before.share) | none
+        close = self._close(moved, u, cuts)
+        back = np.unique(self._all_facets().corners[close])
+        back = back[moved[back]]
+        if len(back):
+            share = at.share.copy()
+            share[back] = before.share[back]
+            self._surface.at = at.drawn_in(share)
+        if len(self._cut):
+            gap = cuts(self._all_facets(), self._surface.at(u))[self._cut]
+            if (gap >= self._width).any():
+                self._cut = self._cut[gap < self._width]
+        self._without(np.flatnonzero(self._close(none, u, cuts)))
+
+    def _named(self, facets: Ints) -> Values:
+        """(k c, 2 d + 1) rows that tell the corners of facets (k,) from all other points."""
+        if not len(facets):
+            return np.empty((0, 2 * self._domain.dim + 1))
+        return self._surface.identity(self._all_facets().corners[facets].reshape(-1))
+
+    def _known_again(self, rows: Values) -> Ints:
+        """The facets of which `_named` gave these rows."""
+        if not len(rows):
+            return np.empty(0, np.int64)
+        every = np.sort(self._all_facets().corners, axis=1)
+        at = found_again(rows, self._surface.identity(np.arange(len(self.area)))).reshape(-1, every.shape[1])
+        at = np.sort(at[(at >= 0).all(axis=1)], axis=1)
+        _, where = np.unique(np.concatenate([at, every]), axis=0, return_inverse=True)
+        return np.flatnonzero(np.isin(where.reshape(-1)[len(at) :], where.reshape(-1)[: len(at)]))
 
     def _leave_out(self, points: Ints) -> None:
         self.area = self._surface.area.copy()
         self.area[points] = 0.0
 
     def memory(self) -> object:
-        """Shares of arms, and areas."""
-        return self._surface.at.share, self.area
+        """Shares of arms, areas, and facets left out."""
+        return self._surface.at.share, self.area, self._cut
 
     def recall(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
-        share, area = cast("tuple[Values, Values]", memory)
+        share, area, self._cut = cast("tuple[Values, Values, Ints]", memory)
         if share is not self._surface.at.share:
             self._surface.at = self._surface.at.drawn_in(share)
         self.area = area
@@ -145,6 +256,15 @@ class Skin:
         share[which] = rows[place >= 0, -2]
         self._surface.at = at.drawn_in(share)
         self._leave_out(which[rows[place >= 0, -1] > 0])
+
+    def saved_cut(self) -> Values:
+        """Rows of the corners of facets that are left out, on rank 0 (collective)."""
+        gathered = self.comm.gather(self._named(self._cut))
+        return np.concatenate(gathered) if gathered is not None else np.empty((0, 2 * self._domain.dim + 1))
+
+    def restore_cut(self, rows: Values) -> None:
+        """Be again what `saved_cut` gave."""
+        self._cut = self._known_again(rows)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

@@ -42,6 +42,8 @@ class Touch:
         energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.
         potential: J, of which both are minus the derivatives.
         make_parts: gives `exact` and `stick`, once they are asked for.
+        between: points (k, c) and what gives (k, c d, c d) of the same between them, positive together (joined);
+            None: it does not act between points.
     """
 
     points: Ints
@@ -50,6 +52,7 @@ class Touch:
     friction: Values
     potential: float
     make_parts: Callable[[], tuple[Values, Values]]
+    between: tuple[Ints, Callable[[], Values]] | None = None
 
     @cached_property
     def _parts(self) -> tuple[Values, Values]:

@@ -8,17 +8,20 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from ...mesh.domain import Domain
 from ..term import Level
 from .bent import Start
 from .course import Course
+from .facets import Facets, between, matters
 from .friction import Friction
+from .joined import joined
 from .law import Law
 from .obstacle import Obstacle
 from .placed import Placed, least_distance
-from .reach import check_apart
-from .skin import Skin
+from .reach import check_apart, refuse_overlap
+from .skin import Cuts, Skin
 from .touch import Grip, Touch, grip, touch
 
 Values = npt.NDArray[np.float64]
@@ -49,6 +52,50 @@ class Touching:
             from .overlap import check_free_apart
 
             check_free_apart(self.obstacles)
+        self._sharp = self._felt_between()
+        if self._sharp:
+            self._check_facets()
+
+    def _felt_between(self) -> list[int]:
+        """Numbers of those that facets feel between their corners (collective)."""
+        edge, width, convex = (
+            self.skin.edge,
+            self.law.barrier.width,
+            [each.shape.least_radius for each in self.obstacles],
+        )
+        return [number for number in self._course.led if matters(convex[number], edge, width)]
+
+    def felt_by_points_alone(self) -> list[tuple[Obstacle, bool]]:
+        """Each obstacle, and whether nothing between points feels it."""
+        return [(each, number not in self._sharp) for number, each in enumerate(self.obstacles)]
+
+    def _check_facets(self) -> None:
+        """InputError where a facet of the body at rest is cut; what is nearly so waits until there is room
+        (collective)."""
+        x, placed = self.skin.rest, [each.placed(0.0) for each in self.obstacles]
+        for number in self._sharp:
+            distances = self.skin.facets.distances(placed[number], x, 0.0)
+            refuse_overlap(self.comm, distances, number, self.obstacles[number])
+        cuts = self._cuts(placed)
+        assert cuts is not None
+        self.skin.leave_out_cut(x, cuts)
+
+    def _facets(self, number: int) -> Facets | None:
+        """Facets that feel an obstacle."""
+        return self.skin.facets if number in self._sharp else None
+
+    def _cuts(self, placed: Sequence[Placed]) -> Cuts | None:
+        """Gaps between facets and the obstacles that they feel, where these are now; None: they feel none."""
+        if not self._sharp:
+            return None
+        sharp, width = [placed[number] for number in self._sharp], self.law.barrier.width
+        return lambda facets, x: np.asarray(np.min([facets.gaps(each, x, width) for each in sharp], axis=0))
+
+    def _are_uncut(self, x: Values) -> bool:
+        """Whether no facet is cut with points at x (n, d) (collective)."""
+        if (cuts := self._cuts(self._course.placed)) is None:
+            return True
+        return bool(self.comm.allreduce(bool((cuts(self.skin.facets, x) > 0).all()), op=MPI.LAND))
 
     def _led(self) -> list[int]:
         """Numbers of those whose way is known: all that are held or driven."""
@@ -72,7 +119,7 @@ class Touching:
 
     def _start_of_step(self) -> None:
         at = self._course.at_start
-        self.skin.make_room(self._level.u, partial(least_distance, at))
+        self.skin.make_room(self._level.u, partial(least_distance, at), self._cuts(at))
         x = self.skin.places(self._level.u)
         gaps = [placed.distance(x) for placed in at]
         held = [grip(x, gap, self.skin.area, placed, self.law.barrier) for gap, placed in zip(gaps, at, strict=True)]
@@ -82,6 +129,10 @@ class Touching:
                 Start(gap, each.points, each.normal, each.start) for gap, each in zip(gaps, held, strict=True)
             ]
         self._pushed = [each.force @ each.normal for each in held]
+        for number in self._sharp:
+            found, _ = between(self.skin.facets, at[number], x, self.law.barrier)
+            self._pushed[number] = self._pushed[number] + found.forces.sum(axis=(0, 1))
+        self._began = x
 
     def _forget_start(self) -> None:
         """The points are others than those that the step began with."""
@@ -106,7 +157,12 @@ class Touching:
         under, start = self._under(number, placed), self._begun[number]
         if start is not None:
             start = start.seen(self._course.at_start[number].pose, placed.pose)
-        return touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, under, start)
+        found = touch(self.x, self.skin.area, placed, self.law.barrier, held, rub, under, start)
+        if number not in self._sharp:
+            return found
+        then = None if start is None else (self._course.at_start[number], self._began)
+        inner, stored = between(self.skin.facets, placed, self.x, self.law.barrier, then)
+        return joined(found, inner, stored)
 
     def _under(self, number: int, placed: Placed) -> Values:
         """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
@@ -123,6 +179,11 @@ class Touching:
         """Work of friction on the body in the step, and what of it an obstacle does by its own way, this rank's share,
         J (collective); the rest is lost."""
         found, held = self.touching()[number], self._grips[number]
+        if held is not None and number in self._sharp:  # which does not turn: facets rub at their corners, too
+            moved, force = self.x[found.points] - self._began[found.points], found.friction.sum(axis=0)
+            return float(np.vdot(found.friction, moved)), float(
+                force @ self._under(number, self._course.placed[number])
+            )
         if held is None or not len(held.points):
             return 0.0, 0.0
         force = found.friction[np.searchsorted(found.points, held.points)]

@@ -67,6 +67,12 @@ class LocalSurface:
         domain, which = self._domain, self.at.copies if points is None else points
         return identity(self._made, self._touching[which], domain.node_input, domain.size)
 
+    def facets(self) -> tuple[Ints, Values]:
+        """(m, d) points of the elements that make up the areas of points, and their measures (m,), m^2 (2D: m)."""
+        elements, measure = _touched(self._made, self._skeleton)
+        real = measure > 0
+        return np.searchsorted(self._touching, elements[real]), measure[real]
+
     def _mean(self, touching: Ints, rows: Ints, nodes: Ints, values: Values) -> PETSc.Mat:
         """(points, nodes) mean over the parents of each point."""
         return self._matrix(len(touching), 1, rows, self._global(nodes), values)
@@ -135,15 +141,20 @@ def _mesh_of(domain: Domain) -> MeshData:
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 
 
-def _areas(made: Split, skeleton: Skeleton) -> Values:
-    """(points,) a d-th of the measure of the elements around each, of cracks and of the body's own boundary."""
+def _touched(made: Split, skeleton: Skeleton) -> tuple[Ints, Values]:
+    """(m, d) elements of cracks and of the body's own boundary, and their measures (m,)."""
     outside = np.flatnonzero([OUTSIDE in name for name in skeleton.origins])
     elements = made.elements[np.isin(made.origin, [CRACK, *outside])]
     corners = made.points[elements]
     if skeleton.dim == 2:
-        measure = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-    else:
-        measure = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        return elements, np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    spanned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return elements, np.linalg.norm(spanned, axis=1) / 2
+
+
+def _areas(made: Split, skeleton: Skeleton) -> Values:
+    """(points,) a d-th of the measure of the elements around each."""
+    elements, measure = _touched(made, skeleton)
     result = np.zeros(len(made.points))
     np.add.at(result, elements, measure[:, None] / skeleton.dim)
     return result

@@ -1,0 +1,187 @@
+"""What an obstacle does to facets between their corners: their deepest place has a barrier, too.
+
+    F(x) = A [ b(gap) - B ],      B = (sum_c b(gap_c)^p)^(1/p)
+
+A the reference area of a facet, gap that of its deepest place (deepest), gap_c those of its corners, whose own energy
+A/c sum_c b(gap_c) is that of the points (touch). B is the largest of the b(gap_c), smoothly: where a facet is flat
+against the obstacle its deepest place is as deep as a corner, and nothing is counted twice; where the obstacle is round
+or small against it, nothing is subtracted, and F grows without bound before the facet is cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from .along import Along
+from .deepest import Deepest, deepest, most_above
+from .law import Repulsion
+from .placed import Placed
+from .touch import positive
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+POWER = 8
+HUGE = 1e200  # Pa, of a facet that is cut: no infinity, of which there is no product with 0
+SOFTEN = 0.1  # of the width of the barrier, of deepest places
+FLAT = 0.1  # of the width: facets that bend away from an obstacle by less are as good as flat
+
+
+def matters(radius: float, edge: float, width: float) -> bool:
+    """Whether facets with edges of that length, m, may come nearer to an obstacle of that least radius of curvature,
+    m, than their corners: by a^2 / (6 R) in the middle of a triangle."""
+    return edge**2 > 6 * radius * FLAT * width
+
+
+@dataclass(frozen=True)
+class Facets:
+    """Facets of a surface: numbers of their corners (m, c) among its points, and their areas (m,), m^2 (2D: m).
+
+    `soften`: m, of their deepest places.
+    """
+
+    corners: Ints
+    area: Values
+    soften: float
+
+    @property
+    def kept(self) -> float:
+        """m, by how much a gap is taken for smaller than it is, at most."""
+        return most_above(self.corners.shape[1], self.soften)
+
+    def near(self, placed: Placed, x: Values, reach: Values | float) -> Ints:
+        """(k,) those that may come nearer than `reach` to an obstacle, with points at x (n, d), m."""
+        corners, reach = x[self.corners], np.broadcast_to(reach + self.kept, len(self.area))
+        middle = corners.mean(axis=1)
+        around = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1, initial=0.0)
+        distance = placed.distance(middle)
+        near = np.flatnonzero(distance < around + reach)
+        # the distance to what is convex lies above its tangent
+        down = np.einsum("kcd,kd->kc", corners[near] - middle[near, None], placed.normal(middle[near]))
+        return near[distance[near] + down.min(axis=1, initial=0.0) < reach[near]]
+
+    def distances(self, placed: Placed, x: Values, reach: float) -> Values:
+        """(k,) of the deepest places of those that are near, m."""
+        near = self.near(placed, x, reach)
+        return placed.distance(deepest(placed, x[self.corners[near]], self.soften).place)
+
+    def gaps(self, placed: Placed, x: Values, reach: float) -> Values:
+        """(m,) to an obstacle, m; infinite of those that are not near."""
+        near, found = self.near(placed, x, reach), np.full(len(self.area), np.inf)
+        found[near] = deepest(placed, x[self.corners[near]], self.soften).gap
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """F of facets near an obstacle.
+
+    Attributes:
+        corners: (k, c) points.    area: (k,).    at: their deepest places.    law: b of their gaps.
+        of_corners: b of the gaps of all their corners.
+    """
+
+    corners: Ints
+    area: Values
+    at: Deepest
+    law: Repulsion | Along
+    of_corners: Repulsion | Along
+
+    @cached_property
+    def _gaps(self) -> Values:
+        """(k, c) of the corners, m."""
+        k, c, d = self.at.x.shape
+        return self.at.placed.distance(self.at.x.reshape(-1, d)).reshape(k, c)
+
+    @cached_property
+    def _normals(self) -> Values:
+        """(k, c, d) at the corners."""
+        k, c, d = self.at.x.shape
+        return self.at.placed.normal(self.at.x.reshape(-1, d)).reshape(k, c, d)
+
+    @cached_property
+    def _largest(self) -> tuple[Values, Values]:
+        """(k,) B and (k, c) b_c / B."""
+        b = self.of_corners.energy(self._gaps.reshape(-1)).reshape(self._gaps.shape)
+        top = b.max(axis=1)
+        scale = np.where((top > 0) & np.isfinite(top), top, 1.0)
+        with np.errstate(invalid="ignore"):
+            B = scale * np.sum((b / scale[:, None]) ** POWER, axis=1) ** (1 / POWER)
+            return B, np.where(top[:, None] > 0, b / np.where(B > 0, B, 1.0)[:, None], 0.0)
+
+    @property
+    def energy(self) -> Values:
+        """(k,) J; infinite where a facet is cut."""
+        inner = self.law.energy(self.at.gap)
+        cut = ~np.isfinite(inner)
+        return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - self._largest[0]))
+
+    @cached_property
+    def forces(self) -> Values:
+        """(k, c, d) on the corners, N."""
+        parts = self._largest[1] ** (POWER - 1)
+        slopes = self.of_corners.slope(self._gaps.reshape(-1)).reshape(self._gaps.shape)
+        own = np.maximum(self.law.slope(self.at.gap), -HUGE)[:, None, None] * self.at.by_corner
+        return np.asarray(-self.area[:, None, None] * (own - (parts * slopes)[:, :, None] * self._normals))
+
+    def exact(self) -> Values:
+        """(k, c d, c d) second derivative of F, N/m."""
+        k, c, d = self.at.x.shape
+        n = self.at.by_corner.reshape(k, c * d)
+        own = self.law.curvature(self.at.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        own = own + self.law.slope(self.at.gap)[:, None, None] * self.at.curvature()
+        B, ratio = self._largest
+        parts = ratio ** (POWER - 1)
+        bent = np.einsum("kc,kcij->kcij", parts, self._of_corners())
+        slopes = self.of_corners.slope(self._gaps.reshape(-1)).reshape(k, c, 1) * self._normals
+        twice = np.eye(c) * (ratio ** (POWER - 2))[:, None, :] - parts[:, :, None] * parts[:, None, :]
+        twice = twice * ((POWER - 1) / np.where(B > 0, B, np.inf))[:, None, None]
+        largest = np.einsum("kce,kci,kej->kciej", twice, slopes, slopes)
+        largest[:, range(c), :, range(c), :] += bent.transpose(1, 0, 2, 3)
+        return np.asarray(self.area[:, None, None] * (own - largest.reshape(k, c * d, c * d)))
+
+    def _of_corners(self) -> Values:
+        """(k, c, d, d) second derivative of b at each corner, Pa/m."""
+        k, c, d = self.at.x.shape
+        gap = self._gaps.reshape(-1)
+        n, H = self._normals.reshape(-1, d), self.at.placed.curvature(self.at.x.reshape(-1, d))
+        bent = self.of_corners.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        return np.asarray(bent + self.of_corners.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
+
+    def stiffness(self) -> Values:
+        """(k, c d, c d) for a tangent: positive semi-definite together with the share of the facet in the stiffness of
+        its corners, which have that already (touch)."""
+        k, c, d = self.at.x.shape
+        own = (self.area / c)[:, None, None, None] * self._of_corners()
+        kept = positive(own.reshape(-1, d, d)).reshape(k, c, d, d)
+        return np.asarray(positive(self.exact() + _diagonal(own)) - _diagonal(kept))
+
+
+def between(
+    facets: Facets, placed: Placed, x: Values, law: Repulsion, start: tuple[Placed, Values] | None = None
+) -> tuple[Between, float]:
+    """What acts on facets with points at x (n, d), and the energy that it stores, J; `start`: the obstacle and the
+    points as the step began, where the barrier acts along the way (along)."""
+    near = facets.near(placed, x, law.width)
+    if start is not None:
+        near = np.union1d(near, facets.near(*start, law.width))
+    corners, area = facets.corners[near], facets.area[near]
+    at = deepest(placed, x[corners], facets.soften)
+    stored = Between(corners, area, at, law, law)
+    if start is None:
+        return stored, float(stored.energy.sum())
+    then = deepest(start[0], start[1][corners], facets.soften).gap
+    of_corners = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
+    return Between(corners, area, at, Along(law, then), Along(law, of_corners)), float(stored.energy.sum())
+
+
+def _diagonal(blocks: Values) -> Values:
+    """(k, c d, c d) of blocks (k, c, d, d)."""
+    k, c, d = blocks.shape[:3]
+    full = np.zeros((k, c, d, c, d))
+    full[:, range(c), :, range(c), :] = blocks.transpose(1, 0, 2, 3)
+    return full.reshape(k, c * d, c * d)

@@ -1,0 +1,184 @@
+"""Facets between their corners before an obstacle: the deepest place, and what acts there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fracsim.mechanics.contact.barrier import Barrier
+from fracsim.mechanics.contact.deepest import deepest, most_above
+from fracsim.mechanics.contact.facets import Between, Facets, between
+from fracsim.mechanics.contact.obstacles import Obstacles
+from fracsim.mechanics.contact.placed import Placed
+from fracsim.mechanics.contact.pose import Pose
+from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from support.scenes import each_step, make_scene, march
+
+Values = npt.NDArray[np.float64]
+
+SHAPES: dict[str, Shape] = {
+    "ball": Sphere(0.3), "capsule": Capsule(0.1, 0.5, (1.0, 0.3, 0.2)), "cylinder": Cylinder(0.25, 0.4, 0.05),
+    "box": Box((0.5, 0.4, 0.3), 0.05), "disk": Sphere(0.3, 2), "rectangle": Box((0.5, 0.3), 0.05),
+}  # fmt: skip
+WIDTH, SOFTEN = 0.1, 0.02
+LAW = Barrier(1.0, WIDTH)
+
+
+def facets_near(name: str, count: int) -> tuple[Placed, Values]:
+    """An obstacle, and facets (count, c, d) of half its size to twice that whose gaps are 10 to 90 % of the width."""
+    rng, shape = np.random.default_rng(1), SHAPES[name]
+    placed = Placed(shape, Pose.at(np.full(shape.dim, 0.2)))
+    x = rng.normal(size=(count, shape.dim, shape.dim)) * rng.uniform(0.1, 0.5, size=(count, 1, 1))
+    wanted = rng.uniform(0.1, 0.9, size=count) * WIDTH
+    for _ in range(8):
+        at = deepest(placed, x, SOFTEN)
+        x = x + (wanted - at.gap)[:, None, None] * at.normal[:, None]
+    return placed, x[abs(deepest(placed, x, SOFTEN).gap - wanted) < 0.05 * WIDTH]
+
+
+def acting(placed: Placed, x: Values) -> Between:
+    corners = np.arange(x.shape[0] * x.shape[1]).reshape(x.shape[:2])
+    return Between(corners, np.ones(len(x)), deepest(placed, x, SOFTEN), LAW, LAW)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_place_is_the_deepest(name: str) -> None:
+    """Against a lattice of places: none is nearer than the gap, nor is the gap smaller by more than the softening; and
+    the softened least of the lattice is never below it."""
+    placed, x = facets_near(name, 60)
+    c, d = x.shape[1:]
+    steps = np.stack(np.meshgrid(*[np.arange(41)] * (c - 1), indexing="ij"), axis=-1).reshape(-1, c - 1) / 40
+    shares = np.column_stack([steps, 1 - steps.sum(axis=1)])
+    shares = shares[shares[:, -1] >= -1e-12]
+    places = np.einsum("sc,kcd->ksd", shares, x)
+    distance = placed.distance(places.reshape(-1, d)).reshape(len(x), -1)
+    at = deepest(placed, x, SOFTEN)
+    assert (at.gap <= distance.min(axis=1) + 1e-12).all()
+    coarse = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) / 20
+    assert (at.gap > distance.min(axis=1) - most_above(c, SOFTEN) - coarse).all()
+    softened = distance + SOFTEN / 2 * np.sum((shares - 1 / c) ** 2, axis=1) - most_above(c, SOFTEN)
+    assert (softened.min(axis=1) >= at.gap - 1e-12).all()
+    kinds = (at.share > 0).sum(axis=1)
+    assert all((kinds == kind).sum() > 1 for kind in range(1, c + 1))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_forces_and_stiffness_are_derivatives(name: str) -> None:
+    """By finite differences of the energy, and of the forces; the tangent's share is positive with that of corners."""
+    placed, x = facets_near(name, 30)
+    n, size = len(x), x[0].size
+    found, h = acting(placed, x), 1e-6
+    by_force, by_energy = np.zeros((n, size, size)), np.zeros((n, size))
+    for place in range(size):
+        e = np.zeros(size)
+        e[place] = h
+        up, down = (acting(placed, x + sign * e.reshape(x.shape[1:])) for sign in (1, -1))
+        by_energy[:, place] = (up.energy - down.energy) / (2 * h)
+        by_force[:, place] = -(up.forces - down.forces).reshape(n, -1) / (2 * h)
+    scale = np.linalg.norm(found.forces.reshape(n, -1), axis=1)
+    error = np.linalg.norm(found.forces.reshape(n, -1) + by_energy, axis=1)
+    assert (error < 1e-5 * scale + 1e-7).all() and (scale > 0.1).sum() > n / 8
+    exact = found.exact()
+    np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), atol=1e-9 * abs(exact).max())
+    error = np.linalg.norm(exact - by_force, axis=(1, 2)) / (np.linalg.norm(exact, axis=(1, 2)) + 1.0)
+    assert np.quantile(error, 0.9) < 1e-4  # the rest are at a kink of the curvature: where a rounded edge begins
+
+
+def test_flat_against_flat_is_counted_once() -> None:
+    """Before a plane, with b(g) of the corners counted already: flat, it is b of a gap less by the softening, and the
+    largest of three equal numbers is 3^(1/8) of each; where one corner touches, nothing is added."""
+    rng = np.random.default_rng(2)
+    placed = Placed(Plane((0.0, 0.0, 1.0)), Pose.at(np.zeros(3)))
+    x = rng.normal(size=(200, 3, 3))
+    gap = rng.uniform(0.3, 0.9, size=200) * WIDTH
+    x[:, :, 2] = gap[:, None]
+    x[100:, 1:, 2] = rng.uniform(1.1, 5.0, size=(100, 2)) * WIDTH
+    found = acting(placed, x)
+    flat = LAW.energy(gap - most_above(3, SOFTEN)) - 3 ** (1 / 8) * LAW.energy(gap)
+    np.testing.assert_allclose(found.energy[:100], flat[:100], rtol=1e-9)
+    np.testing.assert_allclose(found.energy[100:], 0.0, atol=1e-9)
+
+
+def test_a_facet_over_a_ball_is_held_before_it_is_cut() -> None:
+    """A triangle whose corners are far from a small ball in its middle: the energy has no bound as they meet."""
+    placed = Placed(Sphere(0.05), Pose.at(np.zeros(3)))
+    facet = Facets(np.array([[0, 1, 2]]), np.array([1.0]), SOFTEN)
+    turn = 2 * np.pi / 3 * np.arange(3)
+    flat = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(3)])
+    energies = []
+    for gap in (2e-1, 5e-2, 2e-2, 1e-2, 7e-3, -1e-3):
+        found, stored = between(facet, placed, flat + np.array([0.0, 0.0, 0.05 + gap]), LAW)
+        energies.append(stored)
+        assert found.forces[:, :, 2].sum() > 0 or not 0 < gap < WIDTH
+    assert energies[0] == 0 and (np.diff(energies) > 0).all() and energies[-1] == np.inf
+
+
+# --- in a run ---
+
+
+def pressed(dim: int, radius: float, depth: float) -> dict[str, Any]:
+    """A coarse block on a base that a ball is pressed into, over the middle of a facet."""
+    over = [0.33, 0.17] if dim == 3 else [0.5]
+    down = [0.0] * (dim - 1) + [-depth - 0.02]
+    return {
+        "mesh": {"builder": "box", "size": [1.0] * dim, "h": 0.5 if dim == 3 else 0.34},
+        "material": {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},
+        "boundary": [{"on": "bottom", "fix": "xyz"[:dim]}], "probe": [{"name": "base", "on": "bottom"}],
+        "obstacle": [{"name": "ball", "shape": "sphere", "radius": radius, "at": [*over, 1.02 + radius],
+                      "displacement": {"time": [0.0, 1.0], "value": [[0.0] * dim, down]}}],
+        "time": {"scheme": "quasi-static", "step": 0.25, "end": 1.0}, "solver": {"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("dim", "radius"), [(2, 0.3), (2, 0.02), (3, 0.3), (3, 0.05)])
+def test_no_facet_is_cut(dim: int, radius: float) -> None:
+    """Of a ball, which may be far smaller than an edge, every place of every facet is outside, though their corners
+    are far from it: by dense sampling of the boundary of the mesh. The base carries what the ball presses with, and the
+    work of that is stored."""
+    scene, state = make_scene(**pressed(dim, radius, 0.06))
+    data = scene.domain.source
+    assert data is not None
+    top = data.facet_groups["top"]
+    shares = np.stack(np.meshgrid(*[np.arange(31)] * dim, indexing="ij"), axis=-1).reshape(-1, dim) / 30
+    shares = shares[abs(shares.sum(axis=1) - 1) < 1e-9]
+    for report in each_step(scene, state):  # noqa: B007
+        u = scene.domain.gather_nodes(state.u.reshape(-1, dim))
+        assert u is not None
+        x = (data.points + u)[top]
+        centre = np.array(scene.study.obstacle[0].at) - [*[0.0] * (dim - 1), 0.08 * state.t]
+        from_centre = np.linalg.norm(np.einsum("sc,kcd->ksd", shares, x) - centre, axis=2)
+        assert from_centre.min() > radius
+        assert radius > 0.1 or np.linalg.norm(x - centre, axis=2).min() > radius + 0.05  # no corner is in touch
+    assert from_centre.min() < radius + 0.05 * 0.7
+    force = scene.probes()[: 2 * dim].reshape(2, dim)
+    np.testing.assert_allclose(force[0], force[1], atol=1e-6 * abs(force).max())
+    assert abs(force).max() > 20
+    assert state.work == pytest.approx(report.elastic, rel=0.05)  # trapezia in a barrier
+
+
+def test_what_breaks_under_a_ball_gains_nothing() -> None:
+    """Edges around a ball that presses on facets break: new walls are drawn in or left out, so that no facet that acts
+    is cut and no more is stored than before; and a checkpoint knows those that are left out."""
+    scene, state = make_scene(
+        **pressed(3, 0.3, 0.1) | {"fracture": {"strength": 1e9}, "time": {"scheme": "backward-euler", "step": 0.5,
+                                                                           "end": 1.0}}
+    )  # fmt: skip
+    march(scene, state)
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
+    before, graph = contact.stored(), scene.fracture.graph
+    assert before > 0
+    graph.break_edges(np.random.default_rng(3).random(len(graph.broken)) < 0.5)
+    scene.fracture.changed()
+    scene.balance.edges_broke(graph.pattern)
+    assert contact.stored() <= before * (1 + 1e-6)
+    skin, placed = contact.skin, contact._course.placed[0]
+    x = skin.places(contact._at_end())
+    assert (skin.facets.gaps(placed, x, 1.0) > 0).all()
+    left_out = skin._cut
+    assert len(left_out) > 0 and len(skin.facets.area) > 100
+    rows = skin.saved_cut()
+    skin.restore_cut(rows)
+    np.testing.assert_array_equal(skin._cut, left_out)
