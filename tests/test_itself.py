@@ -114,6 +114,17 @@ def test_bodies_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
             make_scene(mesh={"file": two_blocks(tmp_path, 2, gap)}, material=SOFT, contact={})
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_walls_thinner_than_the_barrier_do_not_push(dim: int, tmp_path: Path) -> None:
+    """The distance is half of what lies between them; one that is given is refused."""
+    thin = {"mesh": {"file": two_blocks(tmp_path, dim, 0.004)}, "material": SOFT}
+    scene, _ = make_scene(**thin, contact={})
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    assert contact.stored() == 0 and contact.law.distance == pytest.approx(0.002)
+    with pytest.raises(InputError, match="lies between parts of the body at rest, 0.004 m; give at most 0.002"):
+        make_scene(**thin, contact={"distance": 0.01})
+
+
 def test_friction_between_bodies_is_in_the_books(tmp_path: Path) -> None:
     """A block that grazes another: what is lost beside the scheme's own loss is friction, and no energy is gained."""
     lost = []

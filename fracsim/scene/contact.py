@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +35,7 @@ STIFFNESS = 0.1  # of Young's modulus
 DISTANCE_ITSELF = 0.03  # the same: ipctk's barrier presses 3.6 times as hard
 # of Young's modulus: with 0.03 crumbs that are caught between pieces are pressed to a thousandth of the distance, and
 # Newton's method takes 20 iterations and factors where this takes 6 and multigrid
-STIFFNESS_ITSELF = 1.0
+STIFFNESS_ITSELF = 0.3
 # of the square of the highest frequency of the body, that the penalty of explicit steps may add to it: steps are at
 # least 0.82 of what they would be without, however light a node of the surface
 ADDED = 0.5
@@ -87,8 +88,17 @@ def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material:
     distance = contact.distance or DISTANCE_ITSELF * domain.mean_edge
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
-    pieces = contact.itself == "pieces"
-    return itself.SelfContact(domain, u, crowd.Law(distance, stiffness, contact.friction, creep, of_speed, pieces))
+    law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, contact.itself == "pieces")
+    term = itself.SelfContact(domain, u, law)
+    if (gap := term.least_gap()) == np.inf:
+        return term
+    term.destroy()  # thin walls would push each other apart from the start
+    if contact.distance:
+        raise InputError(
+            f"contact.distance = {distance:g} m is more than what lies between parts of the body at rest, {gap:.3g} m; "
+            f"give at most {0.5 * gap:.2g}, or leave it out"
+        )
+    return itself.SelfContact(domain, u, replace(law, distance=0.5 * gap))
 
 
 def _obstacle(entry: Placing, number: int) -> Obstacle:

@@ -109,5 +109,5 @@ class Contact(Table):
     itself: Flag | Literal["pieces"] = True
     friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
     distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
-    stiffness: Positive | None = None  # Pa; default Young's modulus, obstacles a tenth
+    stiffness: Positive | None = None  # Pa; default 0.3 of Young's modulus, obstacles a tenth
     creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the size, 0.05 of the speed

@@ -172,6 +172,16 @@ class SelfContact(Term):
             return self._coupling(csr_matrix((0, 0)), np.empty(0, np.int64))
         return self._coupling(self._surface.stiffness(H), self._numbers)
 
+    def least_gap(self) -> float:
+        """Between elements on which the barrier acts at the current u, m; infinite where there are none (collective)."""
+        x = self._placed(self._u.x.array[: self._owned])
+
+        def found() -> float:
+            assert self._surface is not None and x is not None
+            return self._surface.pairs.least_gap(x)
+
+        return from_root(self.comm, found)
+
     def stored(self) -> float:
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
         x = self._places()
