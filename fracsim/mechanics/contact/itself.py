@@ -173,7 +173,7 @@ class SelfContact(Term):
         return self._coupling(self._surface.stiffness(H), self._numbers)
 
     def least_gap(self) -> float:
-        """Between elements on which the barrier acts at the current u, m; infinite where there are none (collective)."""
+        """Between elements on which the barrier acts at the current u, m; infinite where none do (collective)."""
         x = self._placed(self._u.x.array[: self._owned])
 
         def found() -> float:
