@@ -121,7 +121,7 @@ def test_walls_thinner_than_the_barrier_do_not_push(dim: int, tmp_path: Path) ->
     scene, _ = make_scene(**thin, contact={})
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     assert contact.stored() == 0 and contact.law.distance == pytest.approx(0.002)
-    with pytest.raises(InputError, match="lies between parts of the body at rest, 0[.]004 m; give at most 0[.]002"):
+    with pytest.raises(InputError, match=r"lies between parts of the body at rest, 0[.]004 m; give at most 0[.]002"):
         make_scene(**thin, contact={"distance": 0.01})
 
 
