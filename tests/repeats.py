@@ -101,4 +101,12 @@ REPEATS = (
     # a ball of the size of a facet: one far smaller
     "test_facets.py::test_no_facet_is_cut[2-0.3]",
     "test_facets.py::test_no_facet_is_cut[3-0.3]",
+    # a striker of the size of an edge, felt between points: a large one
+    "test_obstacles.py::test_a_striker_faster_than_its_step_does_not_tunnel[0.1]",
+    # the other scheme of second order
+    "test_bent.py::test_a_round_press_gains_nothing[newmark]",
+    "test_blow.py::test_a_body_that_breaks_as_it_lands_keeps_the_books[newmark]",
+    "test_stops.py::test_a_weight_bounces_on_a_held_floor[newmark-0.8]",
+    "test_obstacles.py::test_the_impulse_of_contact_is_what_balances_momentum[newmark]",
+    "test_obstacles.py::test_a_step_that_balances_inside_books_what_its_obstacle_did[newmark]",
 )

@@ -78,7 +78,7 @@ class Cylinder(Body):
         around = np.cross(away, up)
         on_axis = rho < np.finfo(float).tiny
         ring = np.where(on_axis, 0.0, corner.slope[:, 0] / np.where(on_axis, 1.0, rho))
-        bent = np.einsum("nab,nai,nbj->nij", corner.curvature, plane, plane, optimize=True)
+        bent = plane.transpose(0, 2, 1) @ corner.curvature @ plane
         return np.asarray(bent + ring[:, None, None] * around[:, :, None] * around[:, None, :])
 
     def _radius(self) -> float:

@@ -146,7 +146,8 @@ def _along(placed: Placed, ends: Values, soften: float, found: float) -> Values:
     low, high, every = np.zeros(len(ends)), np.ones(len(ends)), np.arange(len(ends))
     at_first, at_last = slope(every, low) >= 0, slope(every, high) <= 0
     t, left = np.where(at_first, 0.0, np.where(at_last, 1.0, 0.5)), every[~at_first & ~at_last]
-    for number in range(ITERATIONS):
+    last = np.full(len(ends), np.inf)
+    for _ in range(ITERATIONS):
         now = slope(left, t[left])
         left, now = left[abs(now) > small[left]], now[abs(now) > small[left]]
         if not len(left):
@@ -155,8 +156,9 @@ def _along(placed: Placed, ends: Values, soften: float, found: float) -> Values:
         low[left[now < 0]], high[left[now > 0]] = at[now < 0], at[now > 0]
         H = placed.curvature(ends[left, 0] + at[:, None] * side[left])
         ahead = at - now / (np.einsum("kd,kde,ke->k", side[left], H, side[left]) + 2 * soften)
-        # where the curvature jumps Newton's method may go to and fro: every third step halves the bracket
-        inside = (ahead > low[left]) & (ahead < high[left]) & (number % 3 < 2)
+        # where the curvature jumps Newton's method may go to and fro: the bracket is halved where it gains too little
+        inside = (ahead > low[left]) & (ahead < high[left]) & (abs(now) <= 0.5 * last[left])
+        last[left] = abs(now)
         t[left] = np.where(inside, ahead, (low[left] + high[left]) / 2)
     return t
 
