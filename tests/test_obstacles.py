@@ -305,7 +305,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
         "solver": FINE,
         "output": {"picture": False},
     }
-    going, stopped, again = going_stopped_resumed(tables, tmp_path, 5, 3)
+    going, stopped, again = going_stopped_resumed(tables, tmp_path, 6, 2)
     assert stopped.breaks.figures[0] > 0
     assert again.breaks.figures == going.breaks.figures
     for name in ("work", "dissipated", "elastic"):
