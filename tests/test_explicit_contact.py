@@ -16,7 +16,7 @@ from fracsim.mechanics.contact.explicit_obstacles import ExplicitObstacles
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.split.local import Following, LocalSurface
 from fracsim.scene import Scene
-from support.resumed import going_stopped_resumed
+from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import each_step, make_scene, make_study, march, positions
 from support.torn import RUNS
 
@@ -225,10 +225,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     tables = RUNS["rapped"] | {"output": {"picture": False, "interval": 1.0}, "time": time}
     going, stopped, again = going_stopped_resumed(tables, tmp_path, 20, 4)
     assert stopped.breaks.figures[0] > 0
-    assert again.breaks.figures == going.breaks.figures
-    for name in ("work", "dissipated", "elastic"):
-        assert getattr(again.state, name) == pytest.approx(getattr(going.state, name), rel=1e-9)
-    np.testing.assert_allclose(again.scene.probes(), going.scene.probes(), atol=1e-9)
+    assert_alike(again, going, 1e-9)
 
 
 @pytest.mark.parametrize(

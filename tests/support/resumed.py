@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 from mpi4py import MPI
 
 from fracsim.run import Run
@@ -25,6 +27,14 @@ def going_stopped_resumed(tables: dict[str, Any], path: Path, before: int, after
     again = begun("stopped", restart=True)
     _step((going, again), after)
     return going, stopped, again
+
+
+def assert_alike(again: Run, going: Run, tolerance: float) -> None:
+    """The same cracks, and the same energies and forces to a tolerance."""
+    assert again.breaks.figures == going.breaks.figures
+    for name in ("work", "dissipated", "elastic"):
+        assert getattr(again.state, name) == pytest.approx(getattr(going.state, name), rel=tolerance)
+    np.testing.assert_allclose(again.scene.probes(), going.scene.probes(), atol=tolerance)
 
 
 def _step(runs: tuple[Run, Run], count: int) -> None:

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, kron
+from scipy.sparse import csr_matrix
 
 from ...errors import InputError
 from ...mesh.split.build import Split, split
 from ...mesh.split.identity import found_again, identity
-from ...mesh.split.places import Places, whole
+from ...mesh.split.places import whole
 from ...mesh.split.skeleton import Skeleton
 from ...mesh.split.solid import split_of_pieces
 from ...meshes.words import format_point
@@ -71,7 +71,6 @@ class Surface:
         self._walls = np.flatnonzero(copies[self.made.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
         self.pairs = self._all_pairs()
-        self._wide: tuple[Places, csr_matrix] | None = None  # (n d, nodes d) weights of components, and of which places
         self._out: Ints = np.empty(0, np.int64)
         if before is None:
             _check_apart(self.pairs, self.made)
@@ -190,9 +189,7 @@ class Surface:
 
     def stiffness(self, H: csr_matrix) -> csr_matrix:
         """(nodes d, nodes d) of (n d, n d), N/m."""
-        if self._wide is None or self._wide[0] is not self.at:
-            self._wide = self.at, kron(self.at.weights, np.eye(self.at.rest.shape[1]), format="csr")
-        W = self._wide[1]
+        W = self.at.by_component
         return (W.T @ H @ W).tocsr()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,7 @@ from ...mesh.ranks import total
 from .drift import Drift
 from .explicit_obstacles import ExplicitObstacles
 from .flights import Flights
-from .free_obstacle import Flight, FreeObstacle
+from .free_obstacle import FreeObstacle
 from .law import Law
 from .obstacle import Obstacle
 from .placed import Placed
@@ -51,11 +50,6 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
 
     # --- a step ---
 
-    def _take_places(self, start: float, end: float) -> None:
-        super()._take_places(start, end)
-        for number, each in self.free.items():
-            self._course.put_at_start(number, each.look())
-
     def _start_of_step(self) -> None:
         super()._start_of_step()
         for number, each in self.free.items():
@@ -80,16 +74,6 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
         return work + (0.0 if self.comm.rank else sum(each.weighed for each in self.free.values())), lost
 
     # --- its past ---
-
-    def memory(self) -> object:
-        """That of the points and springs, and how obstacles move."""
-        return super().memory(), self.flights()
-
-    def recall(self, memory: object) -> None:
-        """Be again what `memory` gave (not collective)."""
-        points, flights = cast("tuple[object, dict[int, Flight]]", memory)
-        super().recall(points)
-        self.fly(flights)
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""

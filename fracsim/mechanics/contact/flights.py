@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,9 @@ class Flying(Protocol):
 
     body: FreeObstacle
     flight: Flight
+
+    def look(self) -> Placed:
+        """Where it is between two steps."""
 
 
 class Flights(Obstacles):
@@ -44,6 +47,21 @@ class Flights(Obstacles):
         """Move again as `flights` gave it."""
         for number, each in self.free.items():
             each.flight = flights[number]
+
+    def _take_places(self, start: float, end: float) -> None:
+        super()._take_places(start, end)
+        for number, each in self.free.items():
+            self._course.put_at_start(number, each.look())
+
+    def memory(self) -> object:
+        """That of the points, and how obstacles move."""
+        return super().memory(), self.flights()
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave (not collective)."""
+        points, flights = cast("tuple[object, dict[int, Flight]]", memory)
+        super().recall(points)
+        self.fly(flights)
 
     def saved(self) -> dict[str, Values]:
         """With rows of how obstacles move (collective)."""

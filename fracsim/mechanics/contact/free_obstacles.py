@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,7 @@ from ...forms.schemes import Scheme
 from ...mesh.domain import Domain
 from ...mesh.ranks import total
 from .flights import Flights
-from .free_obstacle import Flight, FreeObstacle
+from .free_obstacle import FreeObstacle
 from .free_pose import Around, FreePose
 from .law import Law
 from .obstacle import Obstacle
@@ -65,11 +64,6 @@ class FreeObstacles(Flights):
 
     # --- a step ---
 
-    def _take_places(self, start: float, end: float) -> None:
-        super()._take_places(start, end)
-        for number, each in self.free.items():
-            self._course.put_at_start(number, each.look())
-
     def _start_of_step(self) -> None:
         super()._start_of_step()
         level, self._settled_at = self._level, None
@@ -77,16 +71,6 @@ class FreeObstacles(Flights):
             step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, level.blow.factor)
             self._course.ways[number] = each.begin(step, self._grips[number])
             each.stops.begin(each.flight.pose, self._course.at_start, along=level.blow.along)
-
-    def memory(self) -> object:
-        """That of the points, and how obstacles move."""
-        return super().memory(), self.flights()
-
-    def recall(self, memory: object) -> None:
-        """Be again what `memory` gave (not collective)."""
-        points, flights = cast("tuple[object, dict[int, Flight]]", memory)
-        super().recall(points)
-        self.fly(flights)
 
     def arrive(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
