@@ -26,6 +26,7 @@ from .blow import Blow, given
 from .inertia import Mass
 from .kernels import CellForm, cells_measure
 from .prescribed_motion import PrescribedMotion
+from .stiff import Stiff
 from .stress import Stress
 from .tangent import Assembly
 from .term import Form, Level, Term
@@ -45,6 +46,7 @@ class Balance:
         blow: how contact enters a step of that scheme.
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
+        springs: the rest of what it lacks.
         moves: how often u has been put elsewhere.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
@@ -71,6 +73,7 @@ class Balance:
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
         self._touches = True  # whether the tangent has contact in it
         self.low_rank: list[tuple[Values, Values]] = []
+        self.springs: list[Stiff] = []
         self.moves = 0
         self.vector = assembler.vector()
         self._kept = assembler.vector()
@@ -250,6 +253,7 @@ class Balance:
         self._tangent(self.motion.bcs)
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
+        self.springs = []
         for term in self.terms:
             term.add_stiffness(K)
             if self._touches and (coupling := term.coupling()) is not None:
@@ -265,8 +269,13 @@ class Balance:
         yield
         self._touches = True
 
-    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat) -> None:
-        """K += a matrix of another pattern, but for prescribed dofs (collective)."""
+    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat | Stiff) -> None:
+        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it (collective)."""
+        if isinstance(coupling, Stiff):
+            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            coupling.directions[self.motion.owned] = 0.0
+            self.springs.append(coupling)
+            return
         before = K.getInfo()["nz_used"]
         part = coupling.copy()
         part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
@@ -282,9 +291,9 @@ class Balance:
         return np.asarray(self.motion.owned + first * d, PETSc.IntType)
 
     @property
-    def condenses(self) -> bool:
-        """Whether K may lack a part of low rank."""
-        return any(term.condenses for term in self.terms)
+    def is_incomplete(self) -> bool:
+        """Whether K may lack `low_rank` or `springs`."""
+        return any(term.beside for term in self.terms)
 
     @cached_property
     def limits_steps(self) -> bool:

@@ -21,6 +21,7 @@ from ufl.core.expr import Expr
 
 from .blow import NONE, Blow
 from .drawn import Drawn
+from .stiff import Stiff
 
 if TYPE_CHECKING:
     from ..mesh.split.places import Places
@@ -108,14 +109,15 @@ class Term:
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the derivative of `add_force` to the assembled tangent, within the pattern of its cells."""
 
-    def coupling(self) -> PETSc.Mat | None:
+    def coupling(self) -> PETSc.Mat | Stiff | None:
         """The rest of that derivative, a matrix of any pattern over the dofs; None: there is none (collective).
 
-        The tangent takes its entries; the preconditioner is made anew where they are at other places than before.
+        The tangent takes its entries; the preconditioner is made anew where they are at other places than before. What
+        is Stiff stays beside it.
         """
         return None
 
-    condenses: ClassVar[bool] = False  # whether it has unknowns of its own that it eliminates: `low_rank`
+    beside: ClassVar[bool] = False  # whether the tangent may lack a share of its own: `low_rank`, or a Stiff
 
     def low_rank(self) -> list[tuple[Values, Values]]:
         """What the tangent loses with unknowns that the term has eliminated: U C U^T of U (owned dofs, k) and C (k, k),

@@ -95,10 +95,11 @@ class Solver:
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
         tangent = self._operator = self.balance.tangent
-        if self.balance.condenses:
+        if self.balance.is_incomplete:
             from .condensed import Condensed
 
-            self._operator = Condensed(tangent, lambda: self.balance.low_rank).matrix()
+            parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
+            self._operator = Condensed(tangent, parts, springs).matrix()
         self.snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), self._operator, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
@@ -176,16 +177,17 @@ class Solver:
         thread, or no compressibility. A shorter step would be no easier.
         """
         ksp = self.snes.ksp
-        kind, preconditioner = ksp.getType(), ksp.pc.getType()
+        pc = self._preconditioner.pc
+        kind, preconditioner = ksp.getType(), pc.getType()
         ksp.setType("preonly")
-        ksp.pc.reset()
-        ksp.pc.setType("lu")
-        ksp.pc.setFactorSolverType("mumps")
+        pc.reset()
+        pc.setType("lu")
+        pc.setFactorSolverType("mumps")
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
         yield
-        ksp.pc.reset()
-        ksp.pc.setType(preconditioner)
-        ksp.pc.setFromOptions()
+        pc.reset()
+        pc.setType(preconditioner)
+        pc.setFromOptions()
         ksp.setType(kind)
         self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
 
@@ -269,11 +271,26 @@ class Solver:
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
         self._assemble(tangent)
-        if self.balance.low_rank and self.snes.ksp.getType() == "preonly":
+        if (self.balance.low_rank or self.balance.springs) and self.snes.ksp.getType() == "preonly":
             self.snes.ksp.setType("gmres")  # factors are of the rest
         if self.balance.pattern_changed:
             self._preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
         self._preconditioner.refresh(tangent)
+        self._hold()
+
+    def _hold(self) -> None:
+        """Precondition with the body's springs as well, where there are any."""
+        ksp, body = self.snes.ksp, self._preconditioner.pc
+        springs = [each for each in self.balance.springs if len(each.stiffness)]
+        if not springs:
+            ksp.setPC(body)
+            return
+        from .woodbury import Woodbury
+
+        body.setReusePreconditioner(True)
+        pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.vector), comm=ksp.comm)
+        ksp.setPC(pc)
+        pc.destroy()
 
     def damage_changed(self) -> None:
         """Some cells lost stiffness: refresh the preconditioner at the next tangent."""

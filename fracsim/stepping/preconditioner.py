@@ -52,11 +52,12 @@ class Preconditioner:
 
     Attributes:
         due: what has to be done before the next solve.    keep: whether it serves more than one tangent.
+        pc: that of the body alone, also where the KSP uses one that is made of it.
     """
 
     def __init__(self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart."""
-        self._ksp, self._options = ksp, options
+        self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
         self.due, self.keep = Due.REBUILD, keep
         self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
         self._fresh_its = self._whole_its = 0
@@ -72,9 +73,10 @@ class Preconditioner:
         if self.due == Due.NOTHING:
             return
         if self.due == Due.REBUILD:
-            ksp.pc.reset()
+            self.pc.reset()
             self._fresh_its = 0
-        ksp.pc.setReusePreconditioner(False)
+        ksp.setPC(self.pc)
+        self.pc.setReusePreconditioner(False)
         ksp.setOperators(tangent)
         ksp.setUp()
         self.due = Due.NOTHING
@@ -101,5 +103,5 @@ class Preconditioner:
     def _change(self) -> None:
         self._may_change, self._rebuild_above, self.due = False, REBUILD_ABOVE_OF_PIECES, Due.REBUILD
         self._options.change(OF_PIECES)
-        self._ksp.pc.reset()
-        self._ksp.pc.setFromOptions()
+        self.pc.reset()
+        self.pc.setFromOptions()

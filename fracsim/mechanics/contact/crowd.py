@@ -21,6 +21,7 @@ from ...mesh.split.places import whole
 from ...mesh.split.skeleton import Skeleton
 from ...mesh.split.solid import split_of_pieces
 from ...meshes.words import format_point
+from ..stiff import stiff_directions
 from .near import longest
 from .pairs import Pairs
 from .recede import receded
@@ -28,13 +29,16 @@ from .recede import receded
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+Memory = tuple[Values, Ints, tuple[int, int]]
+
 GAP = 2.0  # between the sides of a new crack, in distances of the barrier (recede)
 IN, LEAST = 0.7, 0.2  # what is left of an arm each time that it is shortened, and in all
+LONGEST_PAUSE = 16  # steps
 NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
 ROUND_OFF = 1e-6  # of a pressure
 # of the barrier's distance: steps below it are taken with the exact tangent. Without its negative eigenvalues Newton's
 # method gains a digit in two iterations to the end
-NEAR_END = 0.1
+NEAR_END = 1.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,7 @@ class Surface:
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
         self.pairs = self._all_pairs()
         self._out: Ints = np.empty(0, np.int64)
+        self._pause = (1, 1)  # steps between two looks for room, and to the next
         if before is None:
             _check_apart(self.pairs, self.made)
         else:
@@ -88,13 +93,13 @@ class Surface:
             self.pairs = Pairs(self._rest, np.delete(self.made.elements, elements, axis=0), **self._how)
         self._out = elements
 
-    def memory(self) -> tuple[Values, Ints]:
-        """Shares of arms, and elements that are left out."""
-        return self.at.share, self._out
+    def memory(self) -> Memory:
+        """Shares of arms, elements that are left out, and when room is looked for again."""
+        return self.at.share, self._out, self._pause
 
-    def recall(self, memory: tuple[Values, Ints]) -> None:
+    def recall(self, memory: Memory) -> None:
         """Be again what `memory` gave of this surface."""
-        share, out = memory
+        share, out, self._pause = memory
         if share is not self.at.share:
             self.at = self.at.drawn_in(share)
         if out is not self._out:
@@ -130,12 +135,15 @@ class Surface:
     def _cutting(self, u: Values) -> Ints:
         return np.intersect1d(self._walls, self.pairs.overlaps(self.at(u)))
 
-    def _shorten(self, walls: Ints) -> bool:
+    def _shorten(self, u: Values, walls: Ints) -> bool:
         """Whether the arms of any of these walls can be shortened, which they are."""
         share, tight = self.at.share.copy(), np.unique(self.made.elements[walls])
-        share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
+        share[tight] = np.maximum(IN * share[tight], least := np.minimum(LEAST, share[tight]))
         changed = not np.array_equal(share, self.at.share)
         if changed:
+            end = (x := self.at(u)).copy()
+            end[tight] = self.at.some(u, tight, least)
+            self.pairs.look_along(x, end)  # once for all the shares that follow
             self.at = self.at.drawn_in(share)
         return changed
 
@@ -143,7 +151,7 @@ class Surface:
         """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
         so. Pairs are those of all elements."""
         start = self.at.share
-        while self._shorten(self._pressed(u, load)) or self._shorten(cut := self._cutting(u)):
+        while self._shorten(u, self._pressed(u, load)) or self._shorten(u, cut := self._cutting(u)):
             pass
         crowded = np.union1d(self._pressed(u, np.maximum(load, NEAR * self._how["stiffness"])), cut)
         self._leave_out(crowded)
@@ -153,16 +161,26 @@ class Surface:
             self.at = self.at.drawn_in(np.where(gone, start, self.at.share))
 
     def make_room(self, u: Values) -> None:
-        """A step begins at u (nodes, d), m: what was drawn in or left out comes back where there is room."""
-        inside = self.at.share < 1
-        if not (inside.any() or len(self._out)):
+        """A step begins at u (nodes, d), m: what was drawn in or left out comes back where there is room.
+
+        Not in a step after one in which edges broke, and ever more seldom where there is none: each look costs as much
+        as two of Newton's iterations.
+        """
+        share, out, (pause, waits) = self.memory()
+        if np.all(share == 1) and not len(out):
+            return
+        if waits:
+            self._pause = pause, waits - 1
             return
         load = self.pairs.pressure(self.at(u))
-        if inside.any():
+        if np.any(share < 1):
             self._let_out(u, load)
-        if len(self._out):
+        if len(out):
             self.pairs = self._all_pairs()
             self._settle(u, load)
+        stays = np.array_equal(share, self.at.share) and np.array_equal(out, self._out)
+        pause = min(2 * pause, LONGEST_PAUSE) if stays else 1
+        self._pause = pause, pause - 1
 
     def _let_out(self, u: Values, load: Values) -> None:
         before = self.at.share
@@ -187,10 +205,15 @@ class Surface:
         """(nodes, d) of forces (n, d) at the points, N."""
         return np.asarray(self.at.weights.T @ forces)
 
-    def stiffness(self, H: csr_matrix) -> csr_matrix:
-        """(nodes d, nodes d) of (n d, n d), N/m."""
-        W = self.at.by_component
-        return (W.T @ H @ W).tocsr()
+    def stiffness(self, H: csr_matrix, least: float) -> tuple[csr_matrix, tuple[Values, Values] | None]:
+        """(nodes d, nodes d) of (n d, n d), N/m; and where it is little, (nodes, d m) directions stiffer than `least`
+        N/m with their (m,) stiffness."""
+        W, d = self.at.by_component, self._rest.shape[1]
+        K = (W.T @ H @ W).tocsr()
+        if (found := stiff_directions(H, least)) is None:
+            return K, None
+        directions, stiffness = found
+        return K, ((W.T @ directions).toarray().reshape(self._nodes, d * len(stiffness)), stiffness)
 
 
 def _check_apart(pairs: Pairs, made: Split) -> None:

@@ -45,7 +45,7 @@ class FreeObstacles(Flights):
         free: the free ones by their number.
     """
 
-    condenses = True
+    beside = True
     free: dict[int, FreePose]
 
     def __init__(

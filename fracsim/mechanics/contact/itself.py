@@ -18,24 +18,28 @@ from ...mesh.ranks import from_root, on_root, total
 from ...mesh.split.places import Places
 from ...mesh.split.skeleton import Skeleton
 from ..coupling import Coupling
+from ..stiff import Stiff
 from ..term import Level, Term
 from .crowd import Law, Surface
 from .slip import Friction
 
 Values = npt.NDArray[np.float64]
 
+STIFF = 100.0  # of what a wall of an edge's size has: from there on directions are worth to be told apart (Stiff)
+
 
 class SelfContact(Term):
     """A body that cannot pass through itself."""
 
     name = "contact"
-    keeps_apart = True
+    keeps_apart = beside = True
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
         """InputError where the surface at rest cuts itself (collective)."""
         self.law, self._domain, self._u = law, domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = Coupling(domain)
+        self._stiff = STIFF * law.stiffness * domain.mean_edge ** (domain.dim - 2)
         self._skeleton = None if domain.source is None else Skeleton(domain.source)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
@@ -89,18 +93,19 @@ class SelfContact(Term):
             self._surface.recall(memory[0])
 
     def saved(self) -> dict[str, Values]:
-        """Shares of arms, and numbers of elements that are left out."""
-        share, out = (np.empty(0), np.empty(0)) if self._surface is None else self._surface.memory()
-        return {"share": share, "left_out": np.asarray(out, float)}
+        """Shares of arms, numbers of elements that are left out, and steps to the next look for room."""
+        share, out, pause = (np.empty(0), np.empty(0), (0, 0)) if self._surface is None else self._surface.memory()
+        return {"share": share, "left_out": np.asarray(out, float), "pause": np.array(pause, float)}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         if self._surface is not None:
-            self._surface.recall((saved["share"], saved["left_out"].astype(np.int64)))
+            pause, waits = (int(each) for each in saved.get("pause", (1, 1)))
+            self._surface.recall((saved["share"], saved["left_out"].astype(np.int64), (pause, waits)))
 
     def begin(self, level: Level) -> None:
         """A step begins: friction is that of its start."""
-        self._level, self._moved, self._rubbing = level, True, None
+        self._level, self._moved, self._rubbing, self._tangent_at = level, True, None, None
         if not level.dt:
             return
         nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
@@ -154,23 +159,29 @@ class SelfContact(Term):
         """(owned dofs,) the same as they enter r, N (collective)."""
         return np.asarray(self._level.weight * self.struck())
 
-    def coupling(self) -> PETSc.Mat | None:
-        """Minus the derivative of the forces, where anything is in touch (collective)."""
+    def coupling(self) -> PETSc.Mat | Stiff | None:
+        """Minus the derivative of the forces, where anything is in touch; Stiff where it is little (collective)."""
         x = self._places()
 
-        def found() -> csr_matrix:
+        def found() -> tuple[csr_matrix, tuple[Values, Values] | None]:
             assert self._surface is not None and x is not None
             exact, self._tangent_at = self._surface.is_near(x, self._tangent_at), x
             H = self._surface.pairs.hessian(x, exact=exact)
-            whole = H if self._rubbing is None else (H + self._rubbing.hessian(x, exact=exact)).tocsr()
-            return csr_matrix(self._level.blow.factor * whole)
+            if self._rubbing is not None:
+                H = (H + self._rubbing.hessian(x, exact=exact)).tocsr()
+            return self._surface.stiffness(self._level.blow.factor * H, self._stiff)
 
-        H = on_root(self.comm, found)
-        if not self.comm.bcast(H is not None and H.nnz):
+        K, stiff = on_root(self.comm, found) or (None, None)
+        if not self.comm.bcast(K is not None and K.nnz):
             return None
-        if H is None or self._surface is None or self._numbers is None:
-            return self._coupling(csr_matrix((0, 0)), np.empty(0, np.int64))
-        return self._coupling(self._surface.stiffness(H), self._numbers)
+        if K is None or self._numbers is None:
+            matrix = self._coupling(csr_matrix((0, 0)), np.empty(0, np.int64))
+        else:
+            matrix = self._coupling(K, self._numbers)
+        if (stiffness := self.comm.bcast(stiff and stiff[1])) is None:
+            return matrix
+        directions = self._domain.gather_nodes.scatter(stiff and stiff[0])
+        return Stiff(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def least_gap(self) -> float:
         """Between elements on which the barrier acts at the current u, m; infinite where none do (collective)."""

@@ -44,20 +44,23 @@ class Kind:
 
 
 class Near:
-    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points."""
+    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points.
+
+    They are looked for on the whole way of a step of Newton's method, and serve all that stays within `margin` of it:
+    where the line search stops, the steps after it, and the way of the next one, which mostly goes on along it.
+    """
 
     def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[Kind], distance: float, margin: float) -> None:
         self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
         self._candidates: list[ipctk.Candidates] = []
         self._found: list[tuple[Kind, ipctk.NormalCollisions]] = []
-        self._looked_at = self._found_at = np.full(mesh.rest_positions.shape, np.nan)
+        self._from = self._way = self._found_at = np.full(mesh.rest_positions.shape, np.nan)
 
     def touching(self, x: Values) -> list[tuple[Kind, ipctk.NormalCollisions]]:
         """The pairs of each kind on which its barrier acts; those of the last x are kept."""
         if not np.array_equal(x, self._found_at):
             if not self._holds(x):
-                self._candidates = [kind.candidates(self._mesh, x, radius=self._radius) for kind in self._kinds]
-                self._looked_at = x.copy()
+                self._look(x, x)
             each = zip(self._kinds, self._candidates, strict=True)
             self._found = [(kind, kind.touching(candidates, self._mesh, x)) for kind, candidates in each]
             self._found_at = x.copy()
@@ -65,15 +68,32 @@ class Near:
 
     def free(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the way from x to `to` on which nothing meets: KEPT of each gap is left."""
-        near = self._candidates
+        self.look_along(x, to)
+        steps = (each.compute_collision_free_stepsize(self._mesh, x, to, 0.0, CCD) for each in self._candidates)
+        return float(min(steps))
+
+    def look_along(self, x: Values, to: Values) -> None:
+        """Have candidates for all the way from x to `to`."""
         if not (self._holds(x) and self._holds(to)):
-            near = [kind.candidates(self._mesh, x, to, radius=0.0) for kind in self._kinds]
-        return float(min(each.compute_collision_free_stepsize(self._mesh, x, to, 0.0, CCD) for each in near))
+            self._look(x, to)
+
+    def _look(self, x: Values, to: Values) -> None:
+        """Candidates on the way from x to `to`; what all points have in common brings nothing together."""
+        start, end = centred(x), centred(to)
+        self._candidates = [kind.candidates(self._mesh, start, end, radius=self._radius) for kind in self._kinds]
+        self._from, self._way = start, end - start
 
     def _holds(self, x: Values) -> bool:
-        """Whether no pair within reach can be missing: points have moved little but for what they have in common."""
-        moved = x - self._looked_at
-        return longest(moved - moved.mean(axis=0)) <= self._margin
+        """Whether no pair within reach can be missing: points are near the way on which was looked."""
+        off, squares = centred(x) - self._from, np.sum(self._way**2, axis=1)
+        along = np.clip(np.sum(off * self._way, axis=1) / np.where(squares > 0, squares, 1.0), 0.0, 1.0)
+        return longest(off - along[:, None] * self._way) <= self._margin
+
+
+def centred(x: Values) -> Values:
+    """x (n, d) about their mean."""
+    result: Values = x - x.mean(axis=0)
+    return result
 
 
 def longest(vectors: Values) -> float:

@@ -86,6 +86,10 @@ class Pairs:
         squared = [pairs.compute_minimum_distance(self._mesh, on) for _, pairs in self._near.touching(on)]
         return float(np.sqrt(min(squared)))
 
+    def look_along(self, x: Values, to: Values) -> None:
+        """Have candidates for all the way from x to `to` (n, d), m."""
+        self._near.look_along(self._mesh.vertices(x), self._mesh.vertices(to))
+
     # --- friction ---
 
     def lag_friction(self, x: Values, start: Values, slip: float) -> Friction:
