@@ -21,13 +21,15 @@ import numpy as np
 import numpy.typing as npt
 
 from .placed import Placed
+from .shares import least_over_shares
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-ITERATIONS, HALVINGS = 60, 30
-STARTS = 0.0, 0.9, 0.5  # from the middle; from near the best of the sides, where that does not lead anywhere
-OUTSIDE = 0.2  # how far below 0 shares may fall on the way
+ITERATIONS, LOOKS = 40, 40
+ENOUGH = 0.1  # of the slope along a step: what is left where it ends
+FAR = 1e3  # of its size, from which on an obstacle is as good as flat for a facet
+STILL = 1e-13  # of all shares: a step that is none
 FOUND = 1e-11  # of the size of a facet: what is left of a derivative by shares
 
 
@@ -93,34 +95,86 @@ def most_above(corners: int, soften: float) -> float:
     return soften / 2 * (1 - 1 / corners)
 
 
-def deepest(placed: Placed, x: Values, soften: float, found: float = FOUND) -> Deepest:
-    """Of facets with corners x (k, c, d): along their sides, and inside where that is deeper; `found`: what is left of
-    derivatives by shares, of the size of a facet."""
-    k, c, _ = x.shape
-    share, least = np.zeros((k, c)), np.full(k, np.inf)
-    sides = [[first, (first + 1) % c] for first in range(c if c == 3 else 1)]
-    parts = _along(placed, np.concatenate([x[:, ends] for ends in sides]), soften, found)
-    for ends, along in zip(sides, parts.reshape(len(sides), k), strict=True):
-        trial = np.zeros((k, c))
-        trial[:, ends] = np.column_stack([1 - along, along])
-        height = _height(placed, x, trial, soften)
-        better = height < least
-        share[better], least[better] = trial[better], height[better]
-    if c == 3:
-        for start in STARTS if k else ():
-            inner = _lower_inside(placed, x, soften, share, 100 * found)
-            if not len(inner):
-                break
-            begin = start * share[inner] + (1 - start) / 3
-            share[inner] = _inside(placed, x[inner], soften, begin, share[inner], found)
+def deepest(placed: Placed, x: Values, soften: float, start: Values | None = None, found: float = FOUND) -> Deepest:
+    """Of facets with corners x (k, c, d); `start`: shares (k, c) to look first at, `found`: what is left of derivatives
+    by shares, of the size of a facet.
+
+    By Newton's method, each step of which goes towards the least of a quadratic over all shares, as far as L goes down.
+    """
+    small = found * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+    share = before_the_core(placed, x, soften) if start is None else start.copy()
+    slope, left = _Slope(placed, x, soften)(share), np.arange(len(x))
+    for _ in range(ITERATIONS):
+        rise = _over(slope[left], share[left])
+        left = left[np.where(share[left] > 0, abs(rise), -rise).max(axis=1) > small[left]]
+        if not len(left):
+            break
+        now, corners = share[left], x[left]
+        step = least_over_shares(_bent(placed, corners, now, soften), slope[left], now) - now
+        part, slope[left] = _down(_Slope(placed, corners, soften), now, step, slope[left])
+        share[left] = now + part[:, None] * step
+        left = left[part * abs(step).max(axis=1) > STILL]
     return Deepest(placed, x, soften, share)
 
 
-def _lower_inside(placed: Placed, x: Values, soften: float, share: Values, by: float) -> Ints:
-    """Facets that have a place nearer to the obstacle on the way from this one to a corner."""
-    slope = _slope(x, placed.normal(np.einsum("kc,kcd->kd", share, x)), share, soften)
-    below = slope.min(axis=1) - np.einsum("kc,kc->k", share, slope)
-    return np.flatnonzero(below < -by * np.linalg.norm(x[:, 1] - x[:, 0], axis=1))
+def before_the_core(placed: Placed, x: Values, soften: float) -> Values:
+    """(k, c) shares of the places of facets nearest to that point of the core of an obstacle, which its least radius
+    rounds, that is nearest to their middles: before a ball the deepest, but for what is softened."""
+    k, c, _ = x.shape
+    middle = x.mean(axis=1)
+    arms = x - middle[:, None]
+    size = np.linalg.norm(arms, axis=2).max(axis=1, initial=0.0)
+    away = np.minimum(placed.distance(middle) + placed.shape.least_radius, FAR * size)
+    bent = np.einsum("kci,kei->kce", arms, arms) + soften * (abs(away) + soften)[:, None, None] * np.eye(c)
+    fall = away[:, None] * np.einsum("kcd,kd->kc", arms, placed.normal(middle))
+    return least_over_shares(bent, fall, np.full((k, c), 1 / c))
+
+
+def _bent(placed: Placed, x: Values, share: Values, soften: float) -> Values:
+    """(k, c, c) second derivative of L by the shares, but for what is the same of all."""
+    place = np.einsum("kc,kcd->kd", share, x)
+    arms = x - place[:, None]
+    return np.asarray(arms @ placed.curvature(place) @ arms.transpose(0, 2, 1) + soften * np.eye(x.shape[1]))
+
+
+@dataclass(frozen=True)
+class _Slope:
+    """Derivative of L by shares (k, c), but for what is the same of all."""
+
+    placed: Placed
+    x: Values
+    soften: float
+
+    def __call__(self, share: Values, of: Ints | slice = slice(None)) -> Values:
+        x = self.x[of]
+        return _slope(x, self.placed.normal(np.einsum("kc,kcd->kd", share, x)), share, self.soften)
+
+
+def _over(slope: Values, share: Values) -> Values:
+    """(k, c) how L rises towards each corner."""
+    return np.asarray(slope - np.einsum("kc,kc->k", slope, share)[:, None])
+
+
+def _down(look: _Slope, share: Values, step: Values, slope: Values) -> tuple[Values, Values]:
+    """(k,) parts of steps (k, c) after which L, a convex function, is no longer steep along them; and the slopes (k, c)
+    there."""
+    part, after = np.ones(len(share)), look(share + step)
+    # right to the last digits where it is almost nothing: steps sum to 0 but for round-off
+    falls, rises = (np.einsum("kc,kc->k", _over(each, share), step) for each in (slope, after))
+    low, high, at_low, at_high = np.zeros(len(share)), np.ones(len(share)), falls.copy(), rises
+    left = np.flatnonzero((rises > -ENOUGH * falls) & (falls < 0))
+    for count in range(LOOKS):
+        if not len(left):
+            break
+        falsely = low[left] - at_low[left] * (high[left] - low[left]) / (at_high[left] - at_low[left])
+        part[left] = (low[left] + high[left]) / 2 if count % 3 == 2 else falsely  # which may stall
+        after[left] = look(share[left] + part[left, None] * step[left], left)
+        now = np.einsum("kc,kc->k", _over(after[left], share[left]), step[left])
+        below, above = left[now < 0], left[now >= 0]
+        low[below], at_low[below] = part[below], now[now < 0]
+        high[above], at_high[above] = part[above], now[now >= 0]
+        left = left[(abs(now) > -ENOUGH * falls[left]) & (high[left] - low[left] > STILL)]
+    return part, after
 
 
 def _height(placed: Placed, x: Values, share: Values, soften: float) -> Values:
@@ -132,68 +186,3 @@ def _height(placed: Placed, x: Values, share: Values, soften: float) -> Values:
 def _slope(x: Values, normal: Values, share: Values, soften: float) -> Values:
     """(k, c) its derivative by the shares, but for what is the same of all."""
     return np.asarray(np.einsum("kcd,kd->kc", x - x[:, :1], normal) + soften * (share - 1 / x.shape[1]))
-
-
-def _along(placed: Placed, ends: Values, soften: float, found: float) -> Values:
-    """(k,) share of the second end (k, 2, d) of a side: the zero of a derivative that never falls, between brackets."""
-    side = ends[:, 1] - ends[:, 0]
-    small = found * np.linalg.norm(side, axis=1)
-
-    def slope(of: Ints, t: Values) -> Values:
-        n = placed.normal(ends[of, 0] + t[:, None] * side[of])
-        return np.asarray(np.einsum("kd,kd->k", n, side[of]) + soften * (2 * t - 1))
-
-    low, high, every = np.zeros(len(ends)), np.ones(len(ends)), np.arange(len(ends))
-    at_first, at_last = slope(every, low) >= 0, slope(every, high) <= 0
-    t, left = np.where(at_first, 0.0, np.where(at_last, 1.0, 0.5)), every[~at_first & ~at_last]
-    last = np.full(len(ends), np.inf)
-    for _ in range(ITERATIONS):
-        now = slope(left, t[left])
-        left, now = left[abs(now) > small[left]], now[abs(now) > small[left]]
-        if not len(left):
-            break
-        at = t[left]
-        low[left[now < 0]], high[left[now > 0]] = at[now < 0], at[now > 0]
-        H = placed.curvature(ends[left, 0] + at[:, None] * side[left])
-        ahead = at - now / (np.einsum("kd,kde,ke->k", side[left], H, side[left]) + 2 * soften)
-        # where the curvature jumps Newton's method may go to and fro: the bracket is halved where it gains too little
-        inside = (ahead > low[left]) & (ahead < high[left]) & (abs(now) <= 0.5 * last[left])
-        last[left] = abs(now)
-        t[left] = np.where(inside, ahead, (low[left] + high[left]) / 2)
-    return t
-
-
-def _inside(placed: Placed, x: Values, soften: float, begin: Values, otherwise: Values, found: float) -> Values:
-    """(k, 3) shares inside triangles by Newton's method, with steps that are halved; `otherwise` where they leave or
-    are no better."""
-    sides, share, left = x[:, 1:] - x[:, :1], begin, np.arange(len(x))
-    for _ in range(ITERATIONS):
-        now, E = share[left], sides[left]
-        place = np.einsum("kc,kcd->kd", now, x[left])
-        slope = np.einsum("kad,kd->ka", E, placed.normal(place)) + soften * (now[:, 1:] - now[:, :1])
-        H = np.einsum("kai,kij,kbj->kab", E, placed.curvature(place), E) + soften * (np.eye(2) + 1)
-        step = -np.linalg.solve(H, slope[:, :, None])[:, :, 0]
-        share[left] = _lower(placed, x[left], soften, now, np.column_stack([-step.sum(axis=1), step]), slope, step)
-        left = left[abs(slope).max(axis=1) > found * np.linalg.norm(E[:, 0], axis=1)]
-        if not len(left):
-            break
-    better = _height(placed, x, share, soften) < _height(placed, x, otherwise, soften)
-    return np.where((better & (share.min(axis=1) > 0))[:, None], share, otherwise)
-
-
-def _lower(
-    placed: Placed, x: Values, soften: float, share: Values, step: Values, slope: Values, inner: Values
-) -> Values:
-    """Shares after a step, or as much of it as goes down and not far out of the triangle."""
-    height, falls = _height(placed, x, share, soften), np.einsum("ka,ka->k", slope, inner)
-    room = np.divide(share + OUTSIDE, -step, out=np.full_like(step, np.inf), where=step < 0).min(axis=1)
-    part, up = np.minimum(room, 1.0), np.arange(len(x))
-    slack = 1e-15 * np.linalg.norm(x[:, 0] - placed.pose.centre, axis=1)  # round-off goes the whole way
-    for _ in range(HALVINGS):
-        trial = share[up] + part[up, None] * step[up]
-        above = _height(placed, x[up], trial, soften) - height[up] - slack[up]
-        up = up[above > 1e-4 * part[up] * falls[up]]
-        if not len(up):
-            break
-        part[up] /= 2
-    return np.asarray(share + part[:, None] * step)

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .along import Along
-from .deepest import Deepest, deepest, most_above
+from .barrier import KEPT
+from .deepest import Deepest, before_the_core, deepest, most_above
 from .law import Repulsion
 from .placed import Placed
 from .touch import positive
@@ -37,42 +38,69 @@ def matters(radius: float, edge: float, width: float) -> bool:
     return edge**2 > 6 * radius * FLAT * width
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Facets:
     """Facets of a surface: numbers of their corners (m, c) among its points, and their areas (m,), m^2 (2D: m).
 
-    `soften`: m, of their deepest places.
+    `soften`: m, of their deepest places; shares of these, where they were last, are where they are looked for first.
     """
 
     corners: Ints
     area: Values
     soften: float
 
+    @cached_property
+    def _last(self) -> Values:
+        """(m, c) shares; nan: not known yet."""
+        return np.full(self.corners.shape, np.nan)
+
     @property
     def kept(self) -> float:
         """m, by how much a gap is taken for smaller than it is, at most."""
         return most_above(self.corners.shape[1], self.soften)
 
+    def look(self, placed: Placed, x: Values, which: Ints) -> Deepest:
+        """The deepest places of facets (k,) with points at x (n, d), m."""
+        corners, start = x[self.corners[which]], self._last[which]
+        if (new := np.isnan(start[:, 0])).any():
+            start[new] = before_the_core(placed, corners[new], self.soften)
+        at = deepest(placed, corners, self.soften, start)
+        self._last[which] = at.share
+        return at
+
     def near(self, placed: Placed, x: Values, reach: Values | float) -> Ints:
-        """(k,) those that may come nearer than `reach` to an obstacle, with points at x (n, d), m."""
-        corners, reach = x[self.corners], np.broadcast_to(reach + self.kept, len(self.area))
+        """(k,) those that may come nearer than `reach` (m,) to an obstacle, with points at x (n, d), m."""
+        near, _, over, _ = self._tangents(placed, x, reach)
+        return near[over.min(axis=1, initial=np.inf) < np.broadcast_to(reach, len(self.area))[near]]
+
+    def closing(self, placed: Placed, x: Values, relative: Values, reach: Values) -> Ints:
+        """(k,) those whose gaps a motion may close by more than is safe (barrier), on the ways `relative` (n, d) of the
+        points to an obstacle, m, of facets no longer than `reach` (m,)."""
+        near, distance, over, normal = self._tangents(placed, x, reach)
+        after = over + np.einsum("kcd,kd->kc", relative[self.corners[near]], normal)
+        return near[np.minimum(over, after).min(axis=1, initial=np.inf) < KEPT * distance]
+
+    def _tangents(self, placed: Placed, x: Values, reach: Values | float) -> tuple[Ints, Values, Values, Values]:
+        """Facets (k,) within `reach` of an obstacle but for their size; distances (k,) and normals (k, d) at their
+        middles, and those (k, c) of their corners less `kept` were it flat: the distance to what is convex is more."""
+        corners = x[self.corners]
         middle = corners.mean(axis=1)
         around = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1, initial=0.0)
         distance = placed.distance(middle)
-        near = np.flatnonzero(distance < around + reach)
-        # the distance to what is convex lies above its tangent
-        down = np.einsum("kcd,kd->kc", corners[near] - middle[near, None], placed.normal(middle[near]))
-        return near[distance[near] + down.min(axis=1, initial=0.0) < reach[near]]
+        near = np.flatnonzero(distance < around + reach + self.kept)
+        distance, middle = distance[near], middle[near]
+        normal = placed.normal(middle)
+        over = distance[:, None] - self.kept + np.einsum("kcd,kd->kc", corners[near] - middle[:, None], normal)
+        return near, distance, over, normal
 
     def distances(self, placed: Placed, x: Values, reach: float) -> Values:
         """(k,) of the deepest places of those that are near, m."""
-        near = self.near(placed, x, reach)
-        return placed.distance(deepest(placed, x[self.corners[near]], self.soften).place)
+        return placed.distance(self.look(placed, x, self.near(placed, x, reach)).place)
 
     def gaps(self, placed: Placed, x: Values, reach: float) -> Values:
         """(m,) to an obstacle, m; infinite of those that are not near."""
         near, found = self.near(placed, x, reach), np.full(len(self.area), np.inf)
-        found[near] = deepest(placed, x[self.corners[near]], self.soften).gap
+        found[near] = self.look(placed, x, near).gap
         return found
 
 
@@ -170,11 +198,11 @@ def between(
     if start is not None:
         near = np.union1d(near, facets.near(*start, law.width))
     corners, area = facets.corners[near], facets.area[near]
-    at = deepest(placed, x[corners], facets.soften)
+    at = facets.look(placed, x, near)
     stored = Between(corners, area, at, law, law)
     if start is None:
         return stored, float(stored.energy.sum())
-    then = deepest(start[0], start[1][corners], facets.soften).gap
+    then = deepest(start[0], start[1][corners], facets.soften, at.share).gap
     of_corners = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
     return Between(corners, area, at, Along(law, then), Along(law, of_corners)), float(stored.energy.sum())
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from .deepest import Deepest, deepest
 from .placed import Placed
 from .pose import Values, turned
+
+Ints = npt.NDArray[np.int64]
 
 ROUGH = 1e-6  # of the size of a facet: what is left of derivatives where its deepest place is found roughly
 
@@ -61,20 +64,26 @@ class Motion:
 
 
 class Passing:
-    """Facets with corners x (k, c, d) that go straight by `relative` (k, c, d), m, past a convex obstacle.
+    """Facets whose deepest places are `at`, and whose corners go straight by `relative` (k, c, d), m, past a convex
+    obstacle.
 
-    Their deepest places are found roughly: L (deepest) lies above its tangent at any place, which is what counts.
+    On the way these are found roughly: L (deepest) lies above its tangent at any place, which is what counts.
     """
 
-    def __init__(self, obstacle: Placed, x: Values, relative: Values, soften: float) -> None:
-        self._obstacle, self._x, self._relative, self._soften = obstacle, x, relative, soften
-        self._share: Values = np.full(len(x), np.nan)
-        self._at = deepest(obstacle, x, soften, ROUGH)
+    def __init__(self, at: Deepest, relative: Values) -> None:
+        self._start, self._relative = at.x, relative
+        self._share: Values = np.zeros(len(at.x))
+        self._at = at
+
+    def of(self, which: Ints) -> Passing:
+        """Some of them, at the start."""
+        at = self._at
+        return Passing(Deepest(at.placed, at.x[which], at.soften, at.share[which]), self._relative[which])
 
     def _there(self, share: Values) -> Deepest:
         if not np.array_equal(share, self._share):
-            x = self._x + share[:, None, None] * self._relative
-            self._share, self._at = share.copy(), deepest(self._obstacle, x, self._soften, ROUGH)
+            x, at = self._start + share[:, None, None] * self._relative, self._at
+            self._share, self._at = share.copy(), deepest(at.placed, x, at.soften, at.share, ROUGH)
         return self._at
 
     def gap(self, share: Values) -> Values:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ...errors import InputError
-from .barrier import KEPT, longest_step
+from .barrier import longest_step
 from .facets import Facets
 from .motion import Motion, Passing
 from .obstacle import Obstacle
@@ -44,18 +44,13 @@ def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Fac
 def facet_shares(facets: Facets, placed: Placed, x: Values, relative: Values, reach: Values) -> tuple[Ints, Values]:
     """Facets (k,) that may meet an obstacle, and the shares (k,) of the ways `relative` (n, d) to it of points x, no
     longer than `reach` (n,), that leave a tenth of their gaps. Obstacles with facets do not turn."""
-    longest = 1.2 * reach[facets.corners].max(axis=1, initial=0.0)
-    near = facets.near(placed, x, longest) if longest.any() else np.empty(0, np.int64)
-    if not len(near):
-        return near, np.empty(0)
-    passing = Passing(placed, x[facets.corners[near]], relative[facets.corners[near]], facets.soften)
-    gap, speed = passing.gap(np.zeros(len(near))), passing.speed(np.zeros(len(near)))
-    share = np.where(gap > 0, 1.0, 0.0)
-    which = np.flatnonzero((gap > 0) & (speed > (1 - KEPT) * gap))
-    if len(which):
-        corners = facets.corners[near[which]]
-        passing = Passing(placed, x[corners], relative[corners], facets.soften)
-        share[which] = longest_step(passing.gap, passing.speed, len(which))
+    near = facets.closing(placed, x, relative, 1.2 * reach[facets.corners].max(axis=1, initial=0.0))
+    passing = Passing(facets.look(placed, x, near), relative[facets.corners[near]])
+    gap, share = passing.gap(np.zeros(len(near))), np.zeros(len(near))
+    open_ = np.flatnonzero(gap > 0)
+    if len(open_):
+        passing = passing.of(open_)
+        share[open_] = longest_step(passing.gap, passing.speed, len(open_))
     return near, share
 
 
