@@ -14,6 +14,7 @@ from ..mechanics.balance import Balance
 
 # Potentials that differ by less than this share of their terms are the same.
 ROUND_OFF = 1e4 * float(np.finfo(float).eps)
+NEARLY = 1e3  # times that: whole steps that rise by no more are near the solution
 DOWN = -1e100  # J: taken as it is
 
 
@@ -27,6 +28,7 @@ class Descent:
 
     def begin(self) -> None:
         """A solve begins: nothing is known of it."""
+        self._whole: float | None = None  # J, what the whole step of an iteration rises by
         self._known, self._known_at, self._residual_at = (0.0, 0.0), -1, -1  # after how many moves of the body
         self._height, self._norm, self._sets_out, self._by_norm = 0.0, 0.0, True, False
 
@@ -46,7 +48,7 @@ class Descent:
         """J, at x (collective).
 
         Near the solution potentials differ by round-off alone: such a step counts as one downwards, so that it is taken
-        whole.
+        whole. One that was cut until it made no difference is none: its direction goes up.
         """
         self._balance.displace_to(x)
         if self._sets_out:
@@ -58,10 +60,12 @@ class Descent:
             self._ask_for_the_start(x)
         potential, size = self._potential()
         rise, slack = potential - self._height, ROUND_OFF * size
-        return -slack if abs(rise) <= slack else rise
+        if self._whole is None:
+            self._whole = rise
+        return -slack if abs(rise) <= slack and self._whole <= NEARLY * slack else rise
 
     def _set_out_from(self, x: PETSc.Vec) -> None:
-        self._sets_out, self._by_norm = False, not self._balance.acts()
+        self._sets_out, self._by_norm, self._whole = False, not self._balance.acts(), None
         if self._by_norm:
             x.copy(self._from)
             self._norm = self._snes.getFunctionNorm()
