@@ -144,6 +144,30 @@ def test_a_facet_over_a_ball_is_held_before_it_is_cut() -> None:
     assert energies[0] == 0 and (np.diff(energies) > 0).all() and energies[-1] == np.inf
 
 
+@pytest.mark.parametrize("name", SHAPES)
+def test_no_facet_near_an_obstacle_is_passed_over(name: str) -> None:
+    """As points go from far to within it and on: of facets that are not `near` the deepest place is no nearer than was
+    asked, and those that are not `closing` keep a tenth of their gaps on the way; nothing of them is nearer than what
+    is `beyond`."""
+    rng, shape = np.random.default_rng(6), SHAPES[name]
+    placed, d = Placed(shape, Pose.at(np.full(shape.dim, 0.2))), shape.dim
+    x = 0.3 * rng.normal(size=(80, d)) + 3.0
+    corners = np.sort(np.stack([rng.permutation(80)[:d] for _ in range(120)]), axis=1)
+    facets, skipped = Facets(corners, np.ones(120), 1e-3), []
+    for way in np.linspace(0.3, -0.9, 12):
+        relative = way * (1 + 0.1 * rng.normal(size=x.shape))
+        gaps = [deepest(placed, (x + part * relative)[corners], 1e-3).gap for part in (0.0, 0.3, 0.6, 1.0)]
+        reach = float(np.quantile(gaps[0], 0.1))
+        assert placed.beyond(x) <= gaps[0].min() + facets.kept + 1e-12
+        far = np.setdiff1d(np.arange(120), facets.near(placed, x, reach))
+        assert (gaps[0][far] >= reach).all()
+        free = np.setdiff1d(np.arange(120), facets.closing(placed, x, relative, 1.2 * np.linalg.norm(relative, axis=1)))
+        assert (np.min(gaps, axis=0)[free] >= 0.1 * gaps[0][free] - 1e-12).all()
+        skipped += [len(far), len(free)]
+        x = x + 0.3 * relative
+    assert np.mean(skipped) > 30
+
+
 # --- in a run ---
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +55,11 @@ class Facets:
         """(m, c) shares; nan: not known yet."""
         return np.full(self.corners.shape, np.nan)
 
+    @cached_property
+    def _sides(self) -> list[Any]:
+        """Points (n, d) with which sides were measured, m, and the longest, m; nothing: they never were."""
+        return []
+
     @property
     def kept(self) -> float:
         """m, by how much a gap is taken for smaller than it is, at most."""
@@ -68,30 +74,48 @@ class Facets:
         self._last[which] = at.share
         return at
 
-    def near(self, placed: Placed, x: Values, reach: Values | float) -> Ints:
-        """(k,) those that may come nearer than `reach` (m,) to an obstacle, with points at x (n, d), m."""
-        near, _, over, _ = self._tangents(placed, x, reach)
-        return near[over.min(axis=1, initial=np.inf) < np.broadcast_to(reach, len(self.area))[near]]
+    def near(self, placed: Placed, x: Values, reach: float) -> Ints:
+        """(k,) those that may come nearer than `reach` m to an obstacle, with points at x (n, d), m."""
+        near, _, over, _ = self._tangents(placed, x, np.full(1, reach))
+        return near[over.min(axis=1, initial=np.inf) < reach]
 
     def closing(self, placed: Placed, x: Values, relative: Values, reach: Values) -> Ints:
         """(k,) those whose gaps a motion may close by more than is safe (barrier), on the ways `relative` (n, d) of the
-        points to an obstacle, m, of facets no longer than `reach` (m,)."""
+        points to an obstacle, m, no longer than `reach` (n,)."""
         near, distance, over, normal = self._tangents(placed, x, reach)
         after = over + np.einsum("kcd,kd->kc", relative[self.corners[near]], normal)
         return near[np.minimum(over, after).min(axis=1, initial=np.inf) < KEPT * distance]
 
-    def _tangents(self, placed: Placed, x: Values, reach: Values | float) -> tuple[Ints, Values, Values, Values]:
-        """Facets (k,) within `reach` of an obstacle but for their size; distances (k,) and normals (k, d) at their
-        middles, and those (k, c) of their corners less `kept` were it flat: the distance to what is convex is more."""
-        corners = x[self.corners]
+    def _tangents(self, placed: Placed, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
+        """Facets (k,) within `reach` m of an obstacle, of all or of points (n,), as far as their sizes tell;
+        distances (k,) and normals (k, d) at their middles, and those (k, c) of their corners less `kept` were it flat:
+        the distance to what is convex is more."""
+        near: Ints = np.empty(0, np.int64)
+        within: Values = np.empty(0)
+        if placed.beyond(x) < reach.max(initial=0.0) + self.kept:
+            wide = np.broadcast_to(reach, len(x))
+            within = np.max([wide[column] for column in self.corners.T], axis=0) + self.kept
+            near = np.flatnonzero(placed.distance(x)[self.corners[:, 0]] < within + self._longest(x))
+            within = within[near]
+        corners = x[self.corners[near]]
         middle = corners.mean(axis=1)
-        around = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1, initial=0.0)
-        distance = placed.distance(middle)
-        near = np.flatnonzero(distance < around + reach + self.kept)
-        distance, middle = distance[near], middle[near]
-        normal = placed.normal(middle)
-        over = distance[:, None] - self.kept + np.einsum("kcd,kd->kc", corners[near] - middle[:, None], normal)
-        return near, distance, over, normal
+        around, distance = np.linalg.norm(corners - middle[:, None], axis=2), placed.distance(middle)
+        left = distance < around.max(axis=1, initial=0.0) + within
+        distance, normal, arms = distance[left], placed.normal(middle[left]), (corners - middle[:, None])[left]
+        return near[left], distance, distance[:, None] - self.kept + np.einsum("kcd,kd->kc", arms, normal), normal
+
+    def _longest(self, x: Values) -> float:
+        """m, no side of a facet is longer with points at x (n, d): measured anew once points have gone far."""
+        if self._sides:
+            before, longest = self._sides
+            gone = 2 * float(np.sqrt(np.einsum("nd,nd->n", x - before, x - before).max(initial=0.0)))
+            if gone < longest:
+                return longest + gone
+        c = self.corners.shape[1]
+        sides = [x[self.corners[:, k]] - x[self.corners[:, (k + 1) % c]] for k in range(c)]
+        longest = float(np.sqrt(max(np.einsum("md,md->m", side, side).max(initial=0.0) for side in sides)))
+        self._sides[:] = x, longest
+        return longest
 
     def distances(self, placed: Placed, x: Values, reach: float) -> Values:
         """(k,) of the deepest places of those that are near, m."""

@@ -43,6 +43,19 @@ class Placed:
         """(n, d, d) Hessian of the distance, 1/m."""
         return self.pose.tensors_to_space(self.shape.curvature(self.pose.to_body(x)))
 
+    def beyond(self, x: Values) -> float:
+        """m, no point of x (n, d), nor any place between them, is nearer than this: a convex distance lies above its
+        tangent, over the box around the points too."""
+        if not len(x):
+            return np.inf
+        if not self.shape.convex:
+            return -np.inf
+        # by columns, of which a reduction is ten times as fast
+        lower, upper = (np.array([each(column) for column in x.T]) for each in (np.min, np.max))
+        nearest = np.clip(self.pose.centre, lower, upper)[None]
+        n = self.normal(nearest)
+        return float((self.distance(nearest) + np.minimum(n * (lower - nearest), n * (upper - nearest)).sum()).item())
+
     def by_pose(self, x: Values) -> Values:
         """(n, p) derivative of the distance of fixed points with respect to q = (t, w)."""
         n = self.normal(x)

@@ -26,10 +26,12 @@ ROUNDS = 20  # in which points that follow several nodes are brought back
 def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Facets | None = None) -> Values:
     """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
     moves by q meanwhile, and of those of their `facets`; 0 where the gap is closed already."""
-    gap = placed.distance(x)
     turn = np.linalg.norm(q[placed.pose.dim :])
     relative = moved - q[: placed.pose.dim]
     reach = np.linalg.norm(relative, axis=1) + turn * (np.linalg.norm(x - placed.pose.centre, axis=1) + 1.0)
+    if placed.beyond(x) > 1.2 * reach.max(initial=0.0):
+        return np.ones(len(x))
+    gap = placed.distance(x)
     share = np.where(gap > 0, 1.0, 0.0)
     near = np.flatnonzero((gap > 0) & (gap < 1.2 * reach))
     if len(near):
@@ -44,7 +46,7 @@ def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Fac
 def facet_shares(facets: Facets, placed: Placed, x: Values, relative: Values, reach: Values) -> tuple[Ints, Values]:
     """Facets (k,) that may meet an obstacle, and the shares (k,) of the ways `relative` (n, d) to it of points x, no
     longer than `reach` (n,), that leave a tenth of their gaps. Obstacles with facets do not turn."""
-    near = facets.closing(placed, x, relative, 1.2 * reach[facets.corners].max(axis=1, initial=0.0))
+    near = facets.closing(placed, x, relative, 1.2 * reach)
     passing = Passing(facets.look(placed, x, near), relative[facets.corners[near]])
     gap, share = passing.gap(np.zeros(len(near))), np.zeros(len(near))
     open_ = np.flatnonzero(gap > 0)
