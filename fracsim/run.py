@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -31,7 +31,7 @@ from .study import Study
 from .study.file import study_text
 
 if TYPE_CHECKING:
-    from .output.meetings import Meetings
+    from .output.meetings import Meetings, Met
     from .output.overlapping import Overlapping
     from .output.passing import Passing
 
@@ -130,12 +130,12 @@ class Run:
             from .mechanics.contact.obstacles import Obstacles
             from .output.meetings import Meetings
 
-            contact = next(term for term in self.scene.balance.terms if isinstance(term, Obstacles))
-            meetings = Meetings(contact)
+            terms = [term for term in self.scene.balance.terms if term.name in ("obstacles", "solids")]
+            meetings = Meetings(cast("list[Met]", terms))
             if len(study.obstacle) > 1 and any(each.free for each in study.obstacle):
                 from .output.overlapping import Overlapping
 
-                overlapping = Overlapping(contact)
+                overlapping = Overlapping(next(term for term in terms if isinstance(term, Obstacles)))
         if wants_surface(study) and (study.contact is None or not study.contact.itself):
             from .output.passing import Passing
 
@@ -325,7 +325,7 @@ def run_study(
 def _check(
     folder: Path, study: Study, text: str, source: Path | None = None, *, restart: bool, overwrite: bool
 ) -> None:
-    inputs = (source, study.mesh.file, study.mesh.surface)
+    inputs = (source, study.mesh.file, study.mesh.surface, *(each.file for each in study.obstacle))
     check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs)
 
 

@@ -194,7 +194,7 @@ def _groups_cells(key: str, values: list[Any]) -> bool:
     parts = [np.asarray(part) for part in values]
     if key in NOT_TAGS or any(part.ndim != 1 or part.dtype.kind not in "iu" for part in parts):
         return False
-    return len(np.unique(np.concatenate(parts))) <= MOST_TAGS
+    return not parts or len(np.unique(np.concatenate(parts))) <= MOST_TAGS
 
 
 def _top(blocks: list[Block]) -> int:

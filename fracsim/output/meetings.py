@@ -4,11 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
+
+from mpi4py import MPI
 
 from ..mechanics.contact.drawing import least_extent
-from ..mechanics.contact.obstacles import Obstacles
+from ..mechanics.contact.obstacle import Obstacle
 from ..stepping.state import State
+
+
+class Met(Protocol):
+    """A term of obstacles.
+
+    Attributes:
+        obstacles: with their names.    edge: of the body's mesh in the mean, m.    width: of the barrier, m.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    comm: MPI.Intracomm
+
+    @property
+    def edge(self) -> float: ...
+
+    @property
+    def width(self) -> float: ...
+
+    def closings(self) -> list[float]:
+        """How far each and what it touches would have come closer in the last step, m, on this rank (collective)."""
+
+    def felt_by_points_alone(self) -> list[tuple[Obstacle, bool]]:
+        """Each, and whether only points of the body feel it."""
 
 
 class Meetings:
@@ -20,15 +45,17 @@ class Meetings:
             step ended, s; its size, s); of this rank.
     """
 
-    def __init__(self, contact: Obstacles) -> None:
-        """`contact`: the term of the obstacles (collective)."""
-        self._contact, self._edge = contact, contact.skin.edge
-        self.gap = dict.fromkeys((each.name for each in contact.obstacles), (math.inf, 0.0))
+    def __init__(self, contacts: Sequence[Met]) -> None:
+        """`contacts`: terms of obstacles (collective)."""
+        self._contacts, self._edge = contacts, contacts[0].edge
+        self._width = {each.name: contact.width for contact in contacts for each in contact.obstacles}
+        self.gap = dict.fromkeys(self._width, (math.inf, 0.0))
         self.closed = dict.fromkeys(self.gap, (0.0, 0.0, 0.0))
 
     def look(self, state: State, dt: float, figures: dict[str, float]) -> None:
         """Note a step of dt s that was taken; `figures`: the columns gap_NAME of history.csv (collective)."""
-        for (name, gap), closing in zip(self.gap.items(), self._contact.closings(), strict=True):
+        closings = [closing for contact in self._contacts for closing in contact.closings()]
+        for (name, gap), closing in zip(self.gap.items(), closings, strict=True):
             if figures[f"gap_{name}"] < gap[0]:
                 self.gap[name] = figures[f"gap_{name}"], state.t
             if closing > self.closed[name][0]:
@@ -49,7 +76,7 @@ class Meetings:
 
     def notes(self, *, done: bool) -> list[str]:
         """A sentence of each obstacle that has one; `done`: the run came to its end (collective)."""
-        met = [name for name, (gap, _) in self.gap.items() if gap < self._contact.law.barrier.width]
+        met = [name for name, (gap, _) in self.gap.items() if gap < self._width[name]]
         closed, sizes = self._over_ranks(), zip(self.gap, self._sizes(), strict=True)
         missed = [self._missed(name) for name in self.gap if done and name not in met]
         small = [_too_small(name, size, self._edge) for name, size in sizes if size < self._edge]
@@ -59,12 +86,12 @@ class Meetings:
     def _sizes(self) -> list[float]:
         """The least extent of each obstacle that points alone feel, m; infinite of a plane and of one that the body is
         in."""
-        alone = self._contact.felt_by_points_alone()
+        alone = [each for contact in self._contacts for each in contact.felt_by_points_alone()]
         return [least_extent(each.shape) if only else math.inf for each, only in alone]
 
     def _over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`closed` of the rank where it is largest (collective)."""
-        every: Sequence[dict[str, tuple[float, float, float]]] = self._contact.comm.allgather(self.closed)
+        every: Sequence[dict[str, tuple[float, float, float]]] = self._contacts[0].comm.allgather(self.closed)
         return {name: max(each[name] for each in every) for name in self.closed}
 
     def _missed(self, name: str) -> str:

@@ -21,8 +21,10 @@ from ..mechanics.material import MaterialFields
 from ..mechanics.stress import Stress
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
+from ..mesh.ranks import from_root
 from ..study import Contact, Study
 from ..study.conditions import Loose, Placing, obstacles
+from ..study.mesh_source import open_solid
 
 if TYPE_CHECKING:
     from ..mechanics.contact.explicit_obstacles import ExplicitObstacles
@@ -45,9 +47,15 @@ CREEP = 1e-3  # of the body's size, a second
 OF_SPEED = 0.05
 
 
+def _by_distance(study: Study, dim: int) -> list[Obstacle]:
+    """Obstacles that are felt by their distance: all but those from files."""
+    every = enumerate(obstacles(study, dim))
+    return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
+
+
 def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
-    entries = [_obstacle(each, number) for number, each in enumerate(obstacles(study, domain.dim))]
+    entries = _by_distance(study, domain.dim)
     law = _law(study.contact or Contact(), domain, material)
     if not any(each.free for each in study.obstacle):
         return Obstacles(domain, u, entries, law)
@@ -64,7 +72,7 @@ def explicit_obstacles_of(
     from ..mechanics.contact.penalty import Penalty
     from ..stepping.frequencies import cell_frequencies
 
-    entries = [_obstacle(each, number) for number, each in enumerate(obstacles(study, domain.dim))]
+    entries = _by_distance(study, domain.dim)
     contact = study.contact or Contact()
     law = _law(contact, domain, stress.material, Penalty)
     most = np.inf
@@ -75,6 +83,33 @@ def explicit_obstacles_of(
     from ..mechanics.contact.explicit_free import ExplicitFreeObstacles
 
     return ExplicitFreeObstacles(domain, u, entries, law, mass, most)
+
+
+def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
+    """The term of the obstacles that are read from files (collective). InputError where one overlaps the body at the
+    start, or without ipctk."""
+    try:
+        from ..mechanics.contact import crowd
+        from ..mechanics.contact.solids.term import Solids
+    except ImportError:
+        raise InputError(
+            'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
+        ) from None
+    every = enumerate(obstacles(study, domain.dim))
+    entries = {number: _solid(domain.comm, each, number) for number, each in every if each.shape == "mesh"}
+    contact = study.contact or Contact()
+    law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
+    of_speed = 0.0 if contact.creep else OF_SPEED
+    return Solids(domain, u, entries, crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed))
+
+
+def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
+    """Read on rank 0 (collective)."""
+    from ..mechanics.contact.solids.solid import Solid
+
+    given = entry.geometry
+    surface = from_root(comm, lambda: open_solid(given["file"], given.get("scale", 1.0), f"obstacle.{number}"))
+    return Obstacle(entry.name, Solid(surface.points, surface.triangles), entry.at, entry.moved, entry.friction)
 
 
 def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:

@@ -76,13 +76,21 @@ def _dead_loads(parts: Parts) -> Term | None:
 
 
 def _obstacles(parts: Parts) -> Term | None:
-    if not parts.study.obstacle:
+    if all(each.shape == "mesh" for each in parts.study.obstacle):
         return None
     from .contact import explicit_obstacles_of, obstacles_of
 
     if not parts.scheme.implicit:
         return explicit_obstacles_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
     return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
+
+
+def _solids(parts: Parts) -> Term | None:
+    if not any(each.shape == "mesh" for each in parts.study.obstacle):
+        return None
+    from .contact import solids_of
+
+    return solids_of(parts.study, parts.domain, parts.u, parts.stress.material)
 
 
 def _contact(parts: Parts) -> Term | None:
@@ -112,6 +120,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
     "pressure": _pressure,
     "dead loads": _dead_loads,
     "obstacles": _obstacles,
+    "solids": _solids,
     "contact": _contact,
     "inertia": _inertia,
     "drag": _drag,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..meshes.topology import boundary_facets, signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Obstacle, Study
 from .conditions import conditions, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
-from .mesh_source import build_mesh, cells_inside, find_builder, open_surface
+from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
@@ -180,7 +181,11 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
     if study.obstacle:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
-        yield f"            touched by the points of {anatomy.surface()}, {_MORE}; {_PRICE_OF_OBSTACLES}"
+        if any(each.shape != "mesh" for each in study.obstacle):
+            yield f"            touched by the points of {anatomy.surface()}, {_MORE}; {_PRICE_OF_OBSTACLES}"
+        for i, each in enumerate(study.obstacle):
+            if each.file is not None:
+                yield f"            {each.name}: {_solid(each.file, each.scale or 1.0, f'obstacle.{i}')}"
     if study.contact is not None and study.contact.itself:
         of = "of pieces alone with one another" if study.contact.itself == "pieces" else "of the body with itself"
         yield f"contact     {of}, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
@@ -207,6 +212,11 @@ def _motion(obstacle: Obstacle) -> str:
         how = " on a hinge" if obstacle.hinge is not None else f" along {obstacle.guide}" if obstacle.guide else ""
         return f"free{how}, {much},"
     return "fixed" if obstacle.displacement is None and obstacle.velocity is None else "driven"
+
+
+def _solid(file: Path, scale: float, key: str) -> str:
+    surface = open_solid(file, scale, key)
+    return f"{len(surface.triangles):,} triangles, {surface.extent}, {surface.volume:.4g} m^3; {_PRICE_OF_CONTACT}"
 
 
 def _size(anatomy: Anatomy) -> str:

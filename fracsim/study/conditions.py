@@ -149,6 +149,8 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values) -> Placing:
         given["dim"] = dim
     elif entry.shape == "cylinder" and dim == 2:
         raise InputError(f'{key}.shape = "cylinder": a 2D mesh has none; choose "sphere", which is a disk there')
+    elif entry.shape == "mesh":
+        _check_file(entry, dim, key)
     moved: TimeFunction | None = None
     if entry.displacement is not None:
         moved = in_time(entry.displacement, f"{key}.displacement", dim)
@@ -156,6 +158,13 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values) -> Placing:
         moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
     loose = _loose(entry, dim, key, gravity) if entry.free else None
     return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction, loose)
+
+
+def _check_file(entry: Obstacle, dim: int, key: str) -> None:
+    if dim == 2:
+        raise InputError(f'{key}.shape = "mesh": a 2D mesh has none; choose "box", "sphere", "capsule" or "plane"')
+    if entry.file is None or not entry.file.is_file():
+        raise InputError(f'{key}.file = "{entry.file}": there is no such file')
 
 
 def _loose(entry: Obstacle, dim: int, key: str, gravity: Values) -> Loose:

@@ -95,13 +95,17 @@ def _check_whole_numbers(value: Any, key: str = "") -> None:
 
 
 def _anchor(data: dict[str, Any], folder: Path) -> None:
-    """Mesh files are looked for beside the study file (those given with --set: in the working folder)."""
-    mesh = data.get("mesh")
-    for key in ("file", "surface"):
-        if isinstance(mesh, dict) and isinstance(mesh.get(key), str):
-            if not mesh[key].isprintable():
-                raise InputError(f"mesh.{key} = {mesh[key]!a}: a path has no control characters")
-            mesh[key] = str((folder / mesh[key]).resolve())
+    """Files of the body and of obstacles are looked for beside the study file (those given with --set: in the working
+    folder)."""
+    obstacles = data.get("obstacle")
+    tables = [("mesh", data.get("mesh"))]
+    tables += [(f"obstacle.{i}", each) for i, each in enumerate(obstacles if isinstance(obstacles, list) else [])]
+    for name, table in tables:
+        for key in ("file", "surface"):
+            if isinstance(table, dict) and isinstance(table.get(key), str):
+                if not table[key].isprintable():
+                    raise InputError(f"{name}.{key} = {table[key]!a}: a path has no control characters")
+                table[key] = str((folder / table[key]).resolve())
 
 
 def _apply(data: dict[str, Any], override: str) -> None:

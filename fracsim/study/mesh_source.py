@@ -95,6 +95,16 @@ def open_surface(mesh: Mesh) -> ClosedSurface | None:
         return read_surface(mesh.surface, float(mesh.parameters.get("scale", 1.0)))
 
 
+def open_solid(file: Path, scale: float, key: str) -> ClosedSurface:
+    """The closed surface of an obstacle in metres. InputError; `key`: of its table."""
+    from ..meshes.surfaces.closed import read_surface
+
+    try:
+        return read_surface(file, scale)
+    except MeshError as error:
+        raise InputError(f"{key}.file: {error}") from None
+
+
 def cells_inside(mesh: Mesh, surface: ClosedSurface) -> int:
     """About how many cells will fill the surface. InputError where they are too many, or larger than it."""
     from ..meshes.surfaces.fill import expected_cells

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -15,8 +16,9 @@ OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "capsule": (("radius", "length", "axis"), ()),
     "cylinder": (("radius", "length", "axis"), ("rounding", "hollow")),
     "box": (("size",), ("rounding", "hollow")),
+    "mesh": (("file",), ("scale",)),
 }
-GEOMETRY = ("normal", "radius", "length", "axis", "size", "rounding", "hollow")
+GEOMETRY = ("normal", "radius", "length", "axis", "size", "rounding", "hollow", "file", "scale")
 
 
 FREE = ("spin", "hinge", "guide")  # of a free obstacle alone
@@ -33,14 +35,16 @@ class Obstacle(Table):
     """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity; free where it has a mass."""
 
     name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9-]*$")]
-    shape: Literal["plane", "sphere", "capsule", "cylinder", "box"]
-    at: Vector  # its centre, or a point of the plane, at t = 0, m
+    shape: Literal["plane", "sphere", "capsule", "cylinder", "box", "mesh"]
+    at: Vector  # its centre, a point of the plane, or where the file has its origin, at t = 0, m
     normal: Vector | None = None  # of a plane, out of the half space behind it
     radius: Positive | None = None  # m
     length: Positive | None = None  # m; of a capsule between the centres of its round ends
     axis: Vector | None = None
     size: Annotated[list[Positive], Field(min_length=2, max_length=3)] | None = None  # m, of a box
     rounding: Positive | None = None  # m, of the edges; default 5 % of the smallest radius or half side
+    file: Path | None = None  # of a mesh: a closed surface of triangles (STL, OBJ, PLY, ...)
+    scale: Positive | None = None  # of a mesh: metres for each unit of length of the file; default 1
     hollow: Flag = False  # the body is inside: a bowl, a container
     displacement: InTime[Vector] | None = None  # m
     velocity: InTime[Vector] | None = None  # m/s; of a free obstacle at the start
@@ -73,6 +77,8 @@ class Obstacle(Table):
             raise ValueError("give mass or density, not both")
         if self.shape == "plane":
             raise ValueError("a plane is a half space without end, so it cannot move freely: remove mass and density")
+        if self.shape == "mesh":
+            raise ValueError("an obstacle from a file is held or driven: remove mass and density")
         if self.hollow:
             raise ValueError(f"a hollow {self.shape} has walls without thickness, so it cannot move freely: hold it")
         if self.displacement is not None:

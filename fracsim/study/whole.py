@@ -153,6 +153,12 @@ class Study(Table):
                 )
             if self.contact.creep is not None:
                 raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
+        solids = [number for number, each in enumerate(self.obstacle) if each.shape == "mesh"]
+        if solids and not self.time.kind.implicit:
+            raise ValueError(
+                f"obstacle.{solids[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
+                '"backward-euler", or another shape'
+            )
         if self.contact is not None and not self.contact.itself and not self.obstacle:
             raise ValueError("[contact] has itself = false and there is no [[obstacle]]: nothing can touch; remove it")
         return self

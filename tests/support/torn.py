@@ -279,6 +279,14 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.1, "radius": 0.1}, "contact": {"friction": 0.2},
         "time": {"scheme": "backward-euler", "step": 0.025, "end": 0.325}, "probe": [{"name": "grip", "on": "right"}],
     },
+    # broken by an axe that is read from a file
+    "hewn": {
+        "mesh": MESHES["3d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xyz"}],
+        "fracture": {"strength": 0.1, "radius": 0.2},
+        "obstacle": [{"name": "axe", "shape": "mesh", "file": str(Path(__file__).parent / "axe.obj"), "scale": 0.1,
+                      "at": [0.8, 0.25, 0.52], "velocity": [0.05, 0.0, -0.8], "friction": 0.3}],
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.2}, "probe": [{"name": "grip", "on": "left"}],
+    },
 }  # fmt: skip
 SURFACES = ("plate", "block")  # whose split surface is written
 # the same, each step solved with its own flow

@@ -45,6 +45,8 @@ room, crowd       walls that come to light where there is no room: before obstac
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
 
+solids            obstacles whose surface is read from a file, by the same
+
 All but the terms, what they alone use (touching, skin, course, free_pose) and `reach` are NumPy and SciPy alone: no
 DOLFINx, no MPI. Every rank asks about its own points.
 

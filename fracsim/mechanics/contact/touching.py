@@ -65,6 +65,16 @@ class Touching:
         )
         return [number for number in self._course.led if matters(convex[number], edge, width)]
 
+    @property
+    def edge(self) -> float:
+        """Of the body's mesh in the mean, m (collective)."""
+        return self.skin.edge
+
+    @property
+    def width(self) -> float:
+        """Of the barrier, m."""
+        return self.law.barrier.width
+
     def felt_by_points_alone(self) -> list[tuple[Obstacle, bool]]:
         """Each obstacle, and whether nothing between points feels it."""
         return [(each, number not in self._sharp) for number, each in enumerate(self.obstacles)]

@@ -1,0 +1,204 @@
+"""Barrier, friction and collision detection between the surface of a body and solids that are where they are put.
+
+The points of a solid are no unknowns: x (n, 3) are those of the body, and what acts on a solid is minus the sum of what
+it does to them. Each solid has pairs of its own with the body: its friction, its force, its gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import ipctk
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from ..crossings import NONE
+from ..pairs import Pairs
+from ..slip import Friction
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+ASKED = 500  # points that a solid's box is nearest to
+
+
+class Standing:
+    """A solid, somewhere.
+
+    Attributes:
+        name: where messages find it.    points: (m, 3) at the start, m.    triangles: (k, 3).
+        friction: Coulomb's coefficient.    here: (m, 3) its points now, m.
+    """
+
+    def __init__(self, name: str, points: Values, triangles: Ints, friction: float) -> None:
+        self.name, self.points, self.triangles, self.friction = name, points, triangles, friction
+        self.here = points
+        self._shift: Values = np.zeros(3)
+        self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
+
+    def put(self, shift: Values) -> None:
+        """Moved by `shift` (3,) from the start, m."""
+        self.here, self._shift = self.moved(shift), shift
+
+    def moved(self, shift: Values) -> Values:
+        """(m, 3) its points then."""
+        return self.points + shift
+
+    def is_far(self, x: Values, distance: float) -> bool:
+        """Whether its box is farther than `distance` from that of points x (n, 3), m."""
+        x_low, x_high = x.min(axis=0) - self._shift, x.max(axis=0) - self._shift
+        return bool(np.any(x_low - self._box[1] > distance) or np.any(self._box[0] - x_high > distance))
+
+    def about(self, x: Values) -> float:
+        """Distance from points x (n, 3) to its points, m: half an edge more than to its surface, at most."""
+        x = x - self._shift
+        out = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
+        first = np.argpartition(out, min(ASKED, len(out)) - 1)[:ASKED]
+        least = float(self._tree.query(x[first])[0].min())
+        rest = np.flatnonzero(out < least)
+        return float(self._tree.query(x[rest])[0].min(initial=least))
+
+
+class Facing(Pairs):
+    """The surface of a body before one solid. Points are (n + m, 3): those of the body, then those of the solid."""
+
+    def __init__(self, rest: Values, elements: Ints, solid: Standing, *, distance: float, stiffness: float) -> None:
+        """`rest` (n, 3) m and `elements` (k, 3) of the body; as for Pairs."""
+        self.solid, self.count, self._of_body, self._reach = solid, len(rest), len(elements), distance
+        points, triangles = np.concatenate([rest, solid.here]), np.concatenate([elements, solid.triangles + len(rest)])
+        super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=solid.friction)
+        side = np.repeat(np.array([0, 1], np.int32), [len(rest), len(solid.points)])
+        included = np.unique(triangles)
+        self._mesh.can_collide = ipctk.make_vertex_patches_filter(side[included])
+        self._body = np.unique(elements)
+
+    @property
+    def edge(self) -> float:
+        """The mean length of sides, m."""
+        return float(self._edge)
+
+    def with_solid(self, x: Values) -> Values:
+        """(n + m, 3) the body's points at x (n, 3), and the solid's where it is, m."""
+        return np.concatenate([x, self.solid.here])
+
+    def is_far(self, x: Values) -> bool:
+        """Whether nothing of the body at x (n, 3) can be within the barrier."""
+        return not len(self._body) or self.solid.is_far(x[self._body], self._reach)
+
+    def pushed(self, x: Values) -> Values:
+        """(n, 3) dE/dx with the body at x (n, 3), N: the force of the solid on it is its negative."""
+        return np.zeros_like(x) if self.is_far(x) else self.gradient(self.with_solid(x))[: self.count]
+
+    def cut(self, x: Values) -> Ints:
+        """Elements of the body at x (n, 3) that the solid cuts."""
+        if self.is_far(x):
+            return np.empty(0, np.int64)
+        both = np.sort(self.overlaps(self.with_solid(x)), axis=1)
+        return np.unique(both[(both[:, 0] < self._of_body) & (both[:, 1] >= self._of_body), 0])
+
+    def gap(self, x: Values) -> float:
+        """The least distance with the body at x (n, 3), m; beyond the barrier as Standing.about has it."""
+        if not len(self._body):
+            return float("inf")
+        least = float("inf") if self.is_far(x) else self.least_gap(self.with_solid(x))
+        return least if least < float("inf") else max(self.solid.about(x[self._body]), self._reach)
+
+    def safe_distances(self, x: Values, most: float) -> Values:
+        """(n,) how far each point of the body at x (n, 3) may go by itself, m; infinite from `most` on."""
+        on, near = self._mesh.vertices(self.with_solid(x)), ipctk.Candidates()
+        near.build(self._mesh, on, most, ipctk.LBVH())
+        safe = near.compute_per_vertex_safe_distances(self._mesh, on, most)
+        every = np.asarray(self._mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.count, 0]
+        free = np.ones(self.count, bool)
+        free[self._body] = every[self._body] >= 0.999 * most
+        return np.where(free, np.inf, every)
+
+
+class Facings:
+    """The surface of a body before several solids: what Pairs are to a body and itself."""
+
+    def __init__(self, rest: Values, elements: Ints, solids: Sequence[Standing], *, distance: float, stiffness: float):
+        """As for Facing."""
+        how = {"distance": distance, "stiffness": stiffness}
+        self.each = [Facing(rest, elements, solid, **how) for solid in solids]
+
+    def energy(self, x: Values) -> float:
+        """E, J."""
+        return sum(each.energy(each.with_solid(x)) for each in self.each if not each.is_far(x))
+
+    def gradient(self, x: Values) -> Values:
+        """(n, 3) dE/dx, N."""
+        return np.sum([each.pushed(x) for each in self.each], axis=0)
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(3 n, 3 n) d2E/dx2, N/m; as for Pairs."""
+        H, size = csr_matrix((x.size, x.size)), x.size
+        for each in self.each:
+            if not each.is_far(x):
+                H = H + each.hessian(each.with_solid(x), exact=exact)[:size, :size]
+        return csr_matrix(H)
+
+    def least_gap(self, x: Values) -> float:
+        """The least distance within the barrier, m; infinite where there is none."""
+        return min((each.least_gap(each.with_solid(x)) for each in self.each if not each.is_far(x)), default=np.inf)
+
+    def longest_step(self, x: Values, to: Values) -> float:
+        """The share in (0, 1] of the straight way of the body from x to `to` on which it meets no solid at rest."""
+        return self.along(x, to, [each.solid.here for each in self.each])
+
+    def along(self, x: Values, to: Values, before: Sequence[Values]) -> float:
+        """The same where solids come from `before` (m, 3), each, to where they are."""
+        share = 1.0
+        for each, then in zip(self.each, before, strict=True):
+            ways = np.concatenate([x, then]), np.concatenate([to, each.solid.here])
+            share = min(share, each.longest_step(*ways))
+        return share
+
+    def pressure(self, x: Values) -> Values:
+        """(n,) the sum of the barriers' pressures on each point, Pa."""
+        near = [each.pressure(each.with_solid(x))[: len(x)] for each in self.each if not each.is_far(x)]
+        return np.sum(near, axis=0) if near else np.zeros(len(x))
+
+    def overlaps(self, x: Values) -> Ints:
+        """(k, 2) elements of the body that solids cut, twice."""
+        cut = np.concatenate([each.cut(x) for each in self.each])
+        return np.column_stack([cut, cut]) if len(cut) else NONE
+
+    def lag_friction(self, x: Values, slip: float) -> Rubbing:
+        """Friction of a step that begins with the body at x and solids where they are; `slip` as for Pairs."""
+        rubs = [each for each in self.each if each.solid.friction and not each.is_far(x)]
+        at = [each.with_solid(x) for each in rubs]
+        return Rubbing(rubs, [each.lag_friction(there, there, slip) for each, there in zip(rubs, at, strict=True)])
+
+
+@dataclass(frozen=True)
+class Rubbing:
+    """Lagged friction with some of several solids; x (n, 3) of the body."""
+
+    facings: list[Facing]
+    parts: list[Friction]
+
+    def energy(self, x: Values) -> float:
+        """J, as of Friction."""
+        return sum(part.energy(each.with_solid(x)) for each, part in zip(self.facings, self.parts, strict=True))
+
+    def of(self, which: Facing, x: Values) -> Values:
+        """(n, 3) dE/dx by one of the solids, N."""
+        for each, part in zip(self.facings, self.parts, strict=True):
+            if each is which:
+                return part.gradient(each.with_solid(x))[: len(x)]
+        return np.zeros_like(x)
+
+    def gradient(self, x: Values) -> Values:
+        """(n, 3) dE/dx, N."""
+        return np.sum([np.zeros_like(x), *(self.of(each, x) for each in self.facings)], axis=0)
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(3 n, 3 n) d2E/dx2, N/m."""
+        H, size = csr_matrix((x.size, x.size)), x.size
+        for each, part in zip(self.facings, self.parts, strict=True):
+            H = H + part.hessian(each.with_solid(x), exact=exact)[:size, :size]
+        return csr_matrix(H)

@@ -1,0 +1,85 @@
+"""How deep closed surfaces of triangles lie in one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+type Closed = tuple[Values, Ints]  # points (n, 3), m, and triangles (k, 3)
+
+AT_ONCE = 1_000_000  # pairs of a point and a triangle
+MOST = 30 * AT_ONCE  # of those looked at
+
+
+def depth(one: Closed, other: Closed, *, cut: bool) -> float | None:
+    """How deep a corner of either lies in the other, m; None where neither has any there.
+
+    `cut`: whether they are known to cut each other; where they do not, a part of one is in the other as a whole.
+    """
+    deepest = [_depth_in(x, into, cut=cut) for x, into in ((one, other), (other, one))]
+    found = [each for each in deepest if each is not None]
+    return max(found) if found else None
+
+
+def _depth_in(surface: Closed, other: Closed, *, cut: bool) -> float | None:
+    x, corners = surface[0][_asked(surface, cut=cut)], other[0][other[1]]
+    x = x[((x > corners.min(axis=(0, 1))) & (x < corners.max(axis=(0, 1)))).all(axis=1)]
+    x = x[:: 1 + len(x) * len(corners) // MOST]
+    x = x[is_inside(x, corners)] if len(x) else x
+    return float(distances(x, corners).max()) if len(x) else None
+
+
+def _asked(surface: Closed, *, cut: bool) -> Ints:
+    """Corners: all, or one of each part that hangs together."""
+    points, triangles = surface
+    used = np.unique(triangles)
+    if cut:
+        return used
+    pairs = triangles[:, [0, 0]].ravel(), triangles[:, 1:].ravel()
+    part = connected_components(csr_matrix((np.ones(len(pairs[0])), pairs), (len(points),) * 2))[1]
+    return used[np.unique(part[used], return_index=True)[1]]
+
+
+def is_inside(x: Values, corners: Values) -> Flags:
+    """(n,) whether triangles (k, 3, 3) wind around points x (n, 3): their solid angles over 4 pi come to 1 or more.
+
+    tan(omega / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|)   (Van Oosterom, Strackee 1983)
+    """
+
+    def windings(x: Values) -> Values:
+        a, b, c = (corners[None] - x[:, None, None]).transpose(2, 0, 1, 3)
+        la, lb, lc = (np.linalg.norm(each, axis=2) for each in (a, b, c))
+        ab, bc, ca = (np.einsum("nki,nki->nk", *pair) for pair in ((a, b), (b, c), (c, a)))
+        above = np.einsum("nki,nki->nk", a, np.cross(b, c))
+        return np.asarray(np.arctan2(above, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi))
+
+    return np.concatenate([windings(part) for part in _parts(x, len(corners))]) > 0.5
+
+
+def distances(x: Values, corners: Values) -> Values:
+    """(n,) of points x (n, 3) to the nearest of triangles (k, 3, 3), m: to its plane over it, to its sides else."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def nearest(x: Values) -> Values:
+        to = x[:, None, None] - corners[None]  # from each corner
+        over, least = np.ones(to.shape[:2], bool), np.full(to.shape[:2], np.inf)
+        for k in range(3):
+            side = corners[:, (k + 1) % 3] - corners[:, k]
+            along = np.clip(np.einsum("nki,ki->nk", to[:, :, k], side) / np.einsum("ki,ki->k", side, side), 0.0, 1.0)
+            least = np.minimum(least, np.linalg.norm(to[:, :, k] - along[:, :, None] * side, axis=2))
+            over &= np.einsum("nki,ki->nk", to[:, :, k], np.cross(normal, side)) >= 0
+        height = abs(np.einsum("nki,ki->nk", to[:, :, 0], normal))
+        return np.asarray(np.where(over, height, least).min(axis=1))
+
+    return np.concatenate([nearest(part) for part in _parts(x, len(corners))])
+
+
+def _parts(x: Values, count: int) -> list[Values]:
+    """Of points (n, 3), each few enough for `count` triangles at once."""
+    return np.array_split(x, 1 + len(x) * count // AT_ONCE)

@@ -1,0 +1,266 @@
+"""Contact of a body with solids, obstacles whose surface is read from a file: a term of the balance (METHOD section 9).
+
+As that of a body with itself (itself): the split surface lies on rank 0, which finds what touches and hands forces and
+stiffness down to the nodes. The points of a solid are no unknowns; they are where its way says at the end of a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ....mesh.domain import Domain
+from ....mesh.ranks import from_root, on_root
+from ....mesh.split.places import Places
+from ....meshes.words import AXES
+from ...drawn import Drawn
+from ...term import Level
+from ..crowd import Law
+from ..drawing import Drawings
+from ..itself import SelfContact
+from ..obstacle import Obstacle
+from ..placed import Placed
+from .facing import Rubbing, Standing
+from .front import Front
+from .led import led_past
+from .refined import refined
+from .solid import Solid
+
+Values = npt.NDArray[np.float64]
+
+
+class Solids(SelfContact):
+    """Solids that the body cannot pass through.
+
+    Attributes:
+        obstacles: held or driven, their shapes solids.    law: how they act, but for friction, which each has its own.
+    """
+
+    name = "solids"
+    visible = True
+    _surface: Front | None
+    _rubbing: Rubbing | None  # type: ignore[assignment]
+
+    def __init__(self, domain: Domain, u: fem.Function, obstacles: dict[int, Obstacle], law: Law) -> None:
+        """`obstacles`: by their number in the study. InputError where one overlaps the body at rest (collective)."""
+        self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge
+        self._drawings = Drawings(self.obstacles, domain.lower, domain.upper)
+        self._solids = on_root(domain.comm, lambda: [_standing(*each, edge) for each in obstacles.items()]) or []
+        self._from = self._to = [each.displacement(0.0) for each in self.obstacles]
+        self._gone, self._end, self._dt = 1.0, -np.inf, 0.0
+        self._worked, self._lost = [0.0] * len(obstacles), 0.0
+        self._read: list[Values] | None = None  # forces on each, N; None: not yet
+        super().__init__(domain, u, law)
+
+    @property
+    def edge(self) -> float:
+        """Of the body's mesh in the mean, m."""
+        return self._domain.mean_edge
+
+    @property
+    def width(self) -> float:
+        """Of the barrier, m."""
+        return self.law.distance
+
+    def felt_by_points_alone(self) -> list[tuple[Obstacle, bool]]:
+        """As of other obstacles: points, sides and faces all feel a solid."""
+        return [(each, False) for each in self.obstacles]
+
+    # --- where the surface and the solids are ---
+
+    def _rebuild(self) -> None:
+        pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
+
+        def made() -> Front:
+            assert self._skeleton is not None and pattern is not None and u is not None
+            return Front(self._skeleton, pattern, self._solids, self.law, u, self._surface)
+
+        self._surface = on_root(self.comm, made)
+        self._x = self._start = self._tangent_at = self._rubbing = None
+        self._moved = True
+
+    def apart(self, at: Places, u: Values, t: float) -> Places:
+        """Drawn in as the walls are that touch."""
+        assert self._surface is not None
+        return at.drawn_in(np.minimum(self._surface.at.share, at.share))
+
+    def where(self, t: float) -> list[Placed]:
+        """Each solid at time t, s (not collective)."""
+        return [each.placed(t) for each in self.obstacles]
+
+    def drawn(self, t: float) -> dict[str, Drawn]:
+        """Each solid at time t, s, by its name."""
+        return self._drawings(self.where(t))
+
+    def _put(self, gone: float) -> None:
+        """Solids have gone this share of their way in the step."""
+        self._gone, self._moved = gone, True
+        for each, start, end in zip(self._solids, self._from, self._to, strict=True):
+            each.put(start + gone * (end - start))
+
+    # --- a step ---
+
+    def begin(self, level: Level) -> None:
+        """Solids go to where they are at the end of the step; friction holds what is in touch at its start."""
+        self._level, self._moved = level, True
+        end = level.t + (1 - level.share) * level.dt
+        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
+            return  # a look at what a step has ended with: friction and places are still those of the step
+        self._end, self._dt, self._rubbing, self._began_with = end, level.dt, None, level.v
+        self._from = [each.displacement(end - level.dt) for each in self.obstacles]
+        self._to = [each.displacement(end) for each in self.obstacles]
+        if level.dt:
+            nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
+            if self._surface is not None and nodal is not None:
+                self._put(0.0)
+                self._begin_at(self._surface, nodal, creep * level.dt)
+        self._put(1.0)
+
+    def _begin_at(self, front: Front, nodal: Values, slip: float) -> None:
+        """A step begins at displacements (nodes, 3), m, on rank 0; `slip`: that passes for sticking, m."""
+        front.make_room(nodal)
+        self._start = x = front.at(nodal)
+        self._pushed = [-each.pushed(x).sum(axis=0) for each in front.pairs.each]
+        if any(each.friction for each in self._solids):
+            self._rubbing = front.pairs.lag_friction(x, slip)
+
+    def arrive(self) -> None:
+        """What contact has done in the step is booked (collective)."""
+        x, self._lost = self._places(), 0.0
+        if x is None or self._surface is None or self._start is None:
+            self._read = [np.zeros(3) for _ in self.obstacles]
+            return
+        self._read, end = [], self._level.blow.end
+        for k, each in enumerate(self._surface.pairs.each):
+            way = self._to[k] - self._from[k]
+            normal, friction = -each.pushed(x), np.zeros_like(x)
+            if self._rubbing is not None:
+                friction = -self._rubbing.of(each, x)
+            under = float(friction.sum(axis=0) @ way)
+            self._worked[k] = float((end * normal.sum(axis=0) + (1 - end) * self._pushed[k]) @ way) + under
+            self._lost += under - float(np.vdot(friction, x - self._start))
+            self._read.append(-(normal + friction).sum(axis=0))
+
+    def driven(self) -> tuple[float, float]:
+        """Work of the solids' own motion in the step, and what friction takes, on rank 0, J."""
+        return sum(self._worked), self._lost
+
+    def drag(self) -> None:
+        """Friction is booked step by step: `driven`."""
+
+    # --- how far Newton's method may go ---
+
+    def reachable(self, u: Values) -> Values:
+        """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
+        level = self._level
+        if not level.dt:
+            return u
+        start, end = self._gathered(level.u), self._gathered(level.at_end(u))
+
+        def found() -> Values | None:
+            assert self._surface is not None and start is not None and end is not None
+            led = led_past(self._surface, start, end, self._places_before())
+            return None if led is end else led
+
+        led = on_root(self.comm, found)
+        if not self.comm.bcast(led is not None):
+            return u
+        to = np.asarray(self._domain.gather_nodes.scatter(led)).reshape(-1)
+        return np.asarray(level.u + level.share * (to - level.u))
+
+    def _places_before(self) -> list[Values]:
+        """(m, 3) of each solid at the start of the step."""
+        return [each.moved(shift) for each, shift in zip(self._solids, self._from, strict=True)]
+
+    def clear(self, u: Values) -> bool:
+        """Whether nothing is passed on the straight way from the start to u (collective)."""
+        start, end = self._gathered(self._level.u), self._gathered(self._level.at_end(u))
+
+        def found() -> bool:
+            assert self._surface is not None and start is not None and end is not None
+            at, pairs = self._surface.at, self._surface.pairs
+            return pairs.along(at(start), at(end), self._places_before()) == 1
+
+        return from_root(self.comm, found)
+
+    def hold_back(self) -> None:
+        """Solids wait where the step began (collective)."""
+        self._put(0.0)
+        self._advance(self._level.u)
+
+    def go_on(self) -> bool:
+        """The rest of the way, or as far as the body where it is now lets them (collective)."""
+        if self._gone == 1:
+            return False
+        self._advance(self._level.at_end(self._u.x.array[: self._owned]))
+        return True
+
+    def _advance(self, u: Values) -> None:
+        """As far on their way as the body at the owned displacements u lets solids go (collective)."""
+        nodal, gone = self._gathered(u), self._gone
+
+        def found() -> float:
+            assert self._surface is not None and nodal is not None
+            x, before = self._surface.at(nodal), [each.here for each in self._solids]
+            self._put(1.0)
+            return self._surface.pairs.along(x, x, before)
+
+        share = from_root(self.comm, found)
+        self._put(1.0 if share == 1 else gone + share * (1.0 - gone))
+
+    # --- columns of history.csv, and what the end of a run tells ---
+
+    def readings(self) -> dict[str, Callable[[], Values]]:
+        """contact_NAME_AXIS: (1,) force of the body on each solid in the last step, on rank 0, N."""
+        return {
+            f"contact_{each.name}_{axis}": partial(self._on_solid, number, place)
+            for number, each in enumerate(self.obstacles)
+            for place, axis in enumerate(AXES)
+        }
+
+    def _on_solid(self, number: int, axis: int) -> Values:
+        if self._read is None:
+            x, front = self._places(), self._surface
+            force = np.zeros(3) if x is None or front is None else front.pairs.each[number].pushed(x).sum(axis=0)
+        else:
+            force = self._read[number]
+        return np.asarray(force[axis : axis + 1])
+
+    def least(self) -> dict[str, Callable[[], float]]:
+        """gap_NAME: least distance between each solid and the body, m (on rank 0; infinite elsewhere)."""
+        return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
+
+    def _gap(self, number: int) -> float:
+        x = self._places()
+        return np.inf if x is None or self._surface is None else self._surface.pairs.each[number].gap(x)
+
+    def works(self) -> dict[str, Callable[[], float]]:
+        """work_NAME: what each solid has done on the body in the step that has ended, J."""
+        return {f"work_{each.name}": partial(self._worked.__getitem__, k) for k, each in enumerate(self.obstacles)}
+
+    def closings(self) -> list[float]:
+        """How far each solid and the points that it pushes would have come closer in the step, had nothing stopped
+        them, m, on rank 0 (collective)."""
+        x, v = self._places(), self._gathered(self._began_with)
+        if x is None or v is None or self._surface is None:
+            return [0.0] * len(self.obstacles)
+        moved, result = self._dt * (self._surface.at.weights @ v), []
+        for each, start, end in zip(self._surface.pairs.each, self._from, self._to, strict=True):
+            force = -each.pushed(x)
+            size = np.linalg.norm(force, axis=1)
+            on = size > 0
+            closer = np.einsum("ni,ni->n", (end - start) - moved[on], force[on] / size[on, None])
+            result.append(float(closer.max(initial=0.0)))
+        return result
+
+
+def _standing(number: int, obstacle: Obstacle, edge: float) -> Standing:
+    """A solid where it is at the start, with triangles as small as those of the body (rank 0)."""
+    solid = obstacle.shape
+    assert isinstance(solid, Solid)
+    points, triangles = refined(solid.points + obstacle.at, solid.triangles, edge)
+    return Standing(f"obstacle.{number}: {obstacle.name}", points, triangles, obstacle.friction)

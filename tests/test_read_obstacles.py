@@ -1,0 +1,264 @@
+"""Obstacles whose surface is read from a file, against closed forms, conservation laws and the analytic shapes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import numpy.typing as npt
+import pytest
+from mpi4py import MPI
+
+from fracsim.errors import InputError
+from fracsim.mechanics.contact.box import Box
+from fracsim.mechanics.contact.solids.facing import Facings, Standing
+from fracsim.mechanics.contact.solids.inside import depth, distances, is_inside
+from fracsim.mechanics.contact.solids.refined import refined
+from fracsim.mechanics.contact.solids.solid import Solid
+from fracsim.run import Run
+from fracsim.scene import Scene, build_scene
+from fracsim.study.check import check_study
+from support.scenes import Walk, each_step, make_scene, make_study, march, positions
+from support.torn import RUNS
+
+Values = npt.NDArray[np.float64]
+
+FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
+SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
+CUBE = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.5}
+G = 10.0
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+                  [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+
+
+def block(folder: Path, size: tuple[float, float, float] = (2.0, 2.0, 1.0), kind: str = "stl") -> dict[str, Any]:
+    """An obstacle read from a file of twelve triangles."""
+    meshio.Mesh(CORNERS * size, [("triangle", SIDES.astype(np.int32))]).write(folder / f"block.{kind}")
+    return {"name": "block", "shape": "mesh", "file": str(folder / f"block.{kind}")}
+
+
+def last(scene: Scene) -> dict[str, float]:
+    """The columns of the obstacle after a step."""
+    return dict(zip(scene.probes.names, scene.probes().tolist(), strict=True))
+
+
+def mean_velocity(scene: Scene, state: Walk) -> Values:
+    m = scene.balance.mass.lumped.reshape(-1, 3)
+    return np.asarray((m * state.v.reshape(-1, 3)).sum(axis=0) / m[:, 0].sum())
+
+
+# --- triangles ------------------------------------------------------------------------------------------------------
+
+
+def test_refined_triangles_are_small_and_enclose_the_same() -> None:
+    """No side is longer than asked for; the surface is closed, of the same area and volume, and holds its corners."""
+    X = CORNERS * [3.0, 2.0, 0.1]
+    points, triangles = refined(X, SIDES, 0.23)
+    sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
+    assert np.linalg.norm(sides, axis=2).max() <= 0.23
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
+    assert area == pytest.approx(2 * (3 * 2 + 3 * 0.1 + 2 * 0.1))
+    assert Solid(points, triangles).volume == pytest.approx(3 * 2 * 0.1)
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
+    assert np.array_equal(points[:8], X)
+
+
+def test_distance_and_depth_are_those_of_a_box() -> None:
+    """To a box of triangles, against the signed distance of the box (all but sharp); by how far two boxes overlap."""
+    x = np.random.default_rng(1).uniform(-1.0, 1.0, (400, 3))
+    box = Box((1.0, 0.6, 0.8), rounding=1e-9)
+    corners = (CORNERS * [1.0, 0.6, 0.8])[SIDES]
+    signed = np.where(is_inside(x, corners), -1.0, 1.0) * distances(x, corners)
+    np.testing.assert_allclose(signed, box.distance(x), atol=1e-8)
+    fine = refined(CORNERS, SIDES, 0.3)
+    for way, cut, deep in (([0.0, 0.3, 0.93], True, 0.07), ([0.0, 0.0, 1.01], False, None)):
+        found = depth((fine[0] + way, fine[1]), (CORNERS, SIDES), cut=cut)
+        assert found == (None if deep is None else pytest.approx(deep))
+    assert depth((0.2 * CORNERS, SIDES), (CORNERS, SIDES), cut=False) == pytest.approx(0.4)
+
+
+def test_what_acts_on_a_solid_is_the_derivative_by_its_place() -> None:
+    """Minus the sum of the forces on the body, against differences of the energy as the solid is moved; and the Hessian
+    against those of the gradient."""
+    points, triangles = refined(CORNERS, SIDES, 0.4)
+    solid = Standing("block", *refined(CORNERS * [0.5, 0.4, 0.3] + [0.1, 0.05, 0.68], SIDES, 0.3), 0.0)
+    facings = Facings(points, triangles, [solid], distance=0.1, stiffness=50.0)
+    x, step = points + 0.01 * np.sin(30 * points), 1e-6
+    moved = []
+    for axis in range(3):
+        ends = []
+        for sign in (-1.0, 1.0):
+            solid.put(sign * step * np.eye(3)[axis])
+            ends.append(facings.energy(x))
+        moved.append((ends[1] - ends[0]) / (2 * step))
+    solid.put(np.zeros(3))
+    push = -facings.gradient(x).sum(axis=0)
+    assert abs(push[2]) > 1.0
+    np.testing.assert_allclose(moved, push, atol=1e-6 * np.abs(push).max())
+    way = np.cos(50 * x)
+    ends = [facings.gradient(x + sign * step * way) for sign in (-1.0, 1.0)]
+    bent = (facings.hessian(x, exact=True) @ way.reshape(-1)).reshape(-1, 3)
+    np.testing.assert_allclose((ends[1] - ends[0]) / (2 * step), bent, atol=1e-5 * np.abs(bent).max())
+
+
+# --- impulse, rest, force -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", (pytest.param("backward-euler", marks=pytest.mark.slow), "generalized-alpha"))
+def test_the_impulse_is_what_balances_momentum(scheme: str, tmp_path: Path) -> None:
+    """A cube of jelly falls on a block: m v = sum of dt f - m g t, nothing below the block's face, no energy gained."""
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT, load={"gravity": [0.0, 0.0, -G]}, solver=FINE,
+        obstacle=[block(tmp_path) | {"at": [0.5, 0.5, -0.55], "friction": 0.3}],
+        time={"scheme": scheme, "step": 0.03, "end": 0.24},
+    )  # fmt: skip
+    impulse, touched = np.zeros(3), 0
+    for report in each_step(scene, state):
+        found = last(scene)
+        force = -np.array([found[f"contact_block_{axis}"] for axis in "xyz"])
+        impulse, touched = impulse + report.dt * force, touched + (force[2] > 0)
+        assert (positions(scene) + state.u.reshape(-1, 3))[:, 2].min() > -0.05
+        assert report.kinetic + report.elastic + state.dissipated < state.work + 1e-4
+    np.testing.assert_allclose(100 * mean_velocity(scene, state), impulse - [0, 0, 100 * G * state.t], atol=1e-4)
+    assert touched > 3 and impulse[2] > 200
+
+
+def test_a_body_at_rest_is_carried(tmp_path: Path) -> None:
+    """Laid on a block of a file in centimetres, damped to rest: the load cell reads m g to 1e-6."""
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT, load={"gravity": [0.0, 0.0, -G]}, damping={"mass": 10.0}, solver=FINE,
+        obstacle=[block(tmp_path, (200.0, 200.0, 100.0), "obj") | {"at": [0.5, 0.5, -0.52], "scale": 0.01}],
+        time={"scheme": "backward-euler", "step": 0.5, "end": 4.0},
+    )  # fmt: skip
+    march(scene, state)
+    found = last(scene)
+    assert found["contact_block_z"] == pytest.approx(-100 * G, rel=1e-6)
+    assert abs(found["contact_block_x"]) < 1e-4 * 100 * G and 0 < found["gap_block"] < 0.03
+
+
+def test_it_presses_as_the_analytic_shape_does(tmp_path: Path) -> None:
+    """A block driven down on a body, and a plane: forces by both sorts of barrier within 1 %, gaps within their
+    distance; the work of the block is what the body takes up."""
+    forces, way = [], {"time": [0.0, 1.0], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -0.2]]}
+    plane = {"name": "block", "shape": "plane", "normal": [0.0, 0.0, -1.0]}
+    for shape, high in ((plane, 0.0), (block(tmp_path), 0.5)):
+        scene, state = make_scene(
+            mesh=CUBE, material=SOFT, boundary=[{"on": "bottom", "fix": "xyz"}], solver=FINE,
+            obstacle=[shape | {"at": [0.5, 0.5, 1.002 + high], "displacement": way}],
+            contact={"itself": False, "distance": 2e-3}, time={"scheme": "quasi-static", "step": 0.25, "end": 1.0},
+        )  # fmt: skip
+        done = 0.0
+        stored = [report.elastic for report in each_step(scene, state) if (done := done + last(scene)["work_block"])]
+        forces.append(last(scene)["contact_block_z"])
+        assert 0 < last(scene)["gap_block"] < 2e-3
+    assert forces[0] > 500 and forces[0] == pytest.approx(forces[1], rel=0.01)
+    assert state.work == pytest.approx(done) and done == pytest.approx(stored[-1], rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_striker_far_faster_than_its_steps_does_not_tunnel(tmp_path: Path) -> None:
+    """A block of 0.3 m at 100 m/s, steps of 10 ms: it crosses the cube in one, and takes it along."""
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT | {"young": 1e6},
+        obstacle=[block(tmp_path, (0.3, 0.3, 0.3)) | {"at": [0.5, 0.5, 1.3], "velocity": [0.0, 0.0, -100.0]}],
+        time={"scheme": "backward-euler", "step": 0.01, "end": 0.02},
+    )  # fmt: skip
+    march(scene, state)
+    x = positions(scene) + state.u.reshape(-1, 3)
+    assert x[:, 2].max() < 1.3 - 2.0 + 0.3 and mean_velocity(scene, state)[2] < -50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", (0.25, 0.35))
+def test_on_a_slope_it_sticks_or_slides_as_coulomb_says(mu: float, tmp_path: Path) -> None:
+    """tan = 0.3: beyond it the block stays, below it slides by g (sin - mu cos), and mu N times its way is lost."""
+    slope = np.arctan(0.3)
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT | {"young": 1e6}, load={"gravity": [G * np.sin(slope), 0.0, -G * np.cos(slope)]},
+        obstacle=[block(tmp_path, (4.0, 2.0, 1.0)) | {"at": [1.0, 0.5, -0.525], "friction": mu}], solver=FINE,
+        time={"scheme": "backward-euler", "step": 0.025, "end": 0.5}, contact={"itself": False, "creep": 1e-3},
+    )  # fmt: skip
+    ends = []
+    for _ in each_step(scene, state):
+        ends.append((state.t, mean_velocity(scene, state)[0], state.dissipated))
+    (t0, v0, lost0), (t1, v1, lost1) = ends[-5], ends[-1]
+    if mu > 0.3:
+        assert abs(v1) < 2e-3
+    else:
+        assert (v1 - v0) / (t1 - t0) == pytest.approx(G * (np.sin(slope) - mu * np.cos(slope)), rel=0.01)
+        way = 0.5 * (v0 + v1) * (t1 - t0)
+        assert lost1 - lost0 == pytest.approx(mu * 100 * G * np.cos(slope) * way, rel=0.05)
+
+
+def test_walls_that_come_to_light_are_outside(tmp_path: Path) -> None:
+    """A body broken by an axe: no corner of its walls is in the axe, and none of its elements is cut, in any step."""
+    scene, state = make_scene(**RUNS["hewn"])
+    (term,) = [each for each in scene.balance.terms if each.name == "solids"]
+    broken, drawn_in = 0, 0
+    for report in each_step(scene, state):
+        broken += report.broken
+        x, facing = term._places(), term._surface.pairs.each[0]
+        assert len(facing.cut(x)) == 0
+        used = np.unique(np.delete(term._surface.made.elements, term._surface._out, axis=0))
+        assert not is_inside(x[used], facing.solid.here[facing.solid.triangles]).any()
+        drawn_in += int((term._surface.at.share < 1).sum())
+    assert broken > 5 and drawn_in > 0
+
+
+# --- what is written, and refused -----------------------------------------------------------------------------------
+
+
+def test_it_is_drawn_and_told(tmp_path: Path) -> None:
+    """Its columns, its triangles in surface.pvd where it is at the end, and what `check` says of it."""
+    study = make_study(
+        mesh=CUBE, material=SOFT, boundary=[{"on": "bottom", "fix": "xyz"}],
+        obstacle=[block(tmp_path) | {"at": [0.5, 0.5, 1.6], "velocity": [0.0, 0.0, -0.5]}],
+        time={"scheme": "backward-euler", "step": 0.1, "end": 0.1}, output={"picture": False},
+    )  # fmt: skip
+    said = "\n".join(check_study(study))
+    assert "block (driven mesh)" in said and "block: 12 triangles, 2 x 2 x 1 m, 4 m^3" in said
+    scene = build_scene(MPI.COMM_SELF, study)
+    Run(scene, tmp_path / "out")()
+    points = meshio.read(sorted(tmp_path.glob("out/surface/obstacle_block_*.vtu"))[-1]).points
+    np.testing.assert_allclose(points[:, 2].min(), 1.6 - 0.5 - 0.05, atol=1e-6)
+    head = (tmp_path / "out" / "history.csv").read_text().splitlines()[0]
+    assert all(f"{word}_block" in head for word in ("contact", "gap", "work"))
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"at": [0.5, 0.5, -0.49]}, "obstacle.0: block overlaps the body at the start, by 0[.]01 m; move it away"),
+        ({"at": [0.5, 0.5, 0.5]}, "block overlaps the body at the start, by 0[.]5 m; move it away"),
+        ({"file": "nowhere.stl"}, 'obstacle.0.file = "nowhere.stl": there is no such file'),
+        ({"file": "empty.obj"}, "obstacle.0.file: .*empty.obj"),
+        ({"file": "open.obj"}, "obstacle.0.file: .*is open: 3 edges belong to one triangle only"),
+        ({"mass": 1.0}, "an obstacle from a file is held or driven: remove mass and density"),
+        ({"radius": 1.0}, 'shape = "mesh" has no radius; remove it'),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    more: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty.obj").write_text("v 0 0 0\n")
+    Path("open.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises((InputError, ValueError), match=message):
+        make_scene(mesh=CUBE, material=SOFT, obstacle=[block(tmp_path) | {"at": [0.5, 0.5, -0.6]} | more])
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"mesh": CUBE | {"size": [1.0, 1.0]}}, 'shape = "mesh": a 2D mesh has none; choose "box"'),
+        ({"time": {"scheme": "explicit", "step": 1e-3, "end": 1.0}}, "which needs an implicit scheme"),
+    ],
+)
+def test_scenes_that_have_none(tables: dict[str, Any], message: str, tmp_path: Path) -> None:
+    obstacle = block(tmp_path) | {"at": [0.5, 0.5, -0.6][: len(tables.get("mesh", CUBE)["size"])]}
+    with pytest.raises((InputError, ValueError), match=message):
+        make_scene(**{"mesh": CUBE, "material": SOFT, "obstacle": [obstacle]} | tables)
