@@ -85,6 +85,19 @@ def test_check_tells_what_contact_costs(tmp_path: Path) -> None:
         assert f"its surface has {facets}" in told["its"]
 
 
+@pytest.mark.parametrize(
+    ("step", "scheme", "energy", "told"),
+    [(1e-2, "newmark", "neo-hookean", True), (1e-4, "newmark", "neo-hookean", False),
+     (1e-2, "newmark", "linear", False), (1e-2, "generalized-alpha", "neo-hookean", False)],
+)  # fmt: skip
+def test_check_tells_where_newmark_may_gain_energy(step: float, scheme: str, energy: str, told: bool) -> None:
+    """Rubber, h = 0.125 m, c = 32 m/s: an edge is passed in 4 ms."""
+    rubber = {"energy": energy, "young": 1e6, "poisson": 0.3, "density": 1e3}
+    bar = {"builder": "box", "size": [1.0, 0.25, 0.25], "h": 0.125}
+    data = {"title": "bar", "mesh": bar, "material": rubber, "time": {"scheme": scheme, "step": step, "end": 1.0}}
+    assert any('scheme = "generalized-alpha" does not' in line for line in check_study(validate(data, "bar"))) == told
+
+
 def test_check_tells_of_fracture() -> None:
     lines = check_study(study(STRIP, fracture={"radius": 0.1}))
     assert "fracture    degraded energy (chi), strength 20000 Pa, average over 0.1 m (linear)" in lines

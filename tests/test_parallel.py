@@ -176,6 +176,18 @@ def test_same_motion(results: Results, ranks: int, name: str, quantity: str) -> 
         np.testing.assert_allclose(found[..., column], serial[..., column], atol=1e-7 * scale(serial[..., column]))
 
 
+@pytest.mark.parametrize("ranks", RANKS[1:])
+def test_same_walls_are_drawn_in(results: Results, ranks: int) -> None:
+    """Walls that come to light in a squeezed body: as many, by the same shares, and the same ones are left out, some of
+    which have found room two steps later."""
+    found, serial = results(ranks), results(1)
+    assert (serial["squeezed-at-once-share"] < 1).sum() > 5
+    assert len(serial["squeezed-at-once-left_out"]) > len(serial["squeezed-later-left_out"])
+    for name in ("at-once-share", "at-once-left_out", "later-share", "later-left_out"):
+        np.testing.assert_array_equal(found[f"squeezed-{name}"], serial[f"squeezed-{name}"])
+    np.testing.assert_allclose(found["squeezed-u"], serial["squeezed-u"], atol=1e-7 * scale(serial["squeezed-u"]))
+
+
 @pytest.mark.parametrize("ranks", RANKS)
 def test_same_crack_where_weights_are_made_as_needed(results: Results, ranks: int) -> None:
     """An average of few rows breaks the edges that one of all rows breaks."""

@@ -13,6 +13,13 @@ from ..stepping.stepper import StepReport
 STRAIN = 3e-8
 SHARE = 0.05  # of the energy at play: what steps that are long for the waves in them may gain without a word
 
+# schemes that may do instead; Newmark's keeps the energy of linear bodies alone, in steps that are long for the waves
+_OTHERS = {
+    "backward-euler": "",
+    "quasi-static": "",
+    "newmark": 'time.scheme = "generalized-alpha" or "backward-euler", or ',
+}
+
 
 class EnergyGain:
     """The largest rise of elastic + kinetic + dissipated - work above what it was before.
@@ -49,7 +56,7 @@ class EnergyGain:
         """A sentence where it is too much; `scheme` is that of the study."""
         if self.rise <= max(SHARE * self.scale, self.floor):
             return ""
-        other = 'time.scheme = "backward-euler", or ' if scheme not in ("backward-euler", "quasi-static") else ""
+        other = _OTHERS.get(scheme, 'time.scheme = "backward-euler", or ')
         return (
             f"the body gained {self.rise:.3g} J of energy from nowhere, {self.rise / self.scale:.0%} of all that was "
             f"at play: its motion is not to be trusted; try {other}a shorter time.step"

@@ -193,6 +193,9 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
     yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
+    if _may_ring(study):
+        yield "            note: in steps this long Newmark's method may gain energy at large strains;"
+        yield '            scheme = "generalized-alpha" does not'
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
@@ -217,6 +220,18 @@ def _motion(obstacle: Obstacle) -> str:
 def _solid(file: Path, scale: float, key: str) -> str:
     surface = open_solid(file, scale, key)
     return f"{len(surface.triangles):,} triangles, {surface.extent}, {surface.volume:.4g} m^3; {_PRICE_OF_CONTACT}"
+
+
+RINGS = 2.0  # times that a wave passes an edge in a step, from which on Newmark's method may gain energy
+
+
+def _may_ring(study: Study) -> bool:
+    """Whether steps of Newmark's method are long for the waves in a body of finite strains, whose edges are known: its
+    energy is kept where forces are linear (mechanics.blow)."""
+    h, material = study.mesh.parameters.get("h"), study.material
+    if study.time.scheme != "newmark" or material.energy == "linear" or not isinstance(h, int | float):
+        return False
+    return study.time.step * float(np.sqrt(material.young / material.density)) > RINGS * h
 
 
 def _size(anatomy: Anatomy) -> str:

@@ -279,6 +279,14 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.1, "radius": 0.1}, "contact": {"friction": 0.2},
         "time": {"scheme": "backward-euler", "step": 0.025, "end": 0.325}, "probe": [{"name": "grip", "on": "right"}],
     },
+    # broken as it is crushed, pieces touching one another alone
+    "crushed": {
+        "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
+            "time": [0.0, 0.4], "value": [[0.0, 0.0], [-0.4, 0.2]]}}],
+        "fracture": {"strength": 0.03, "radius": 0.1}, "contact": {"itself": "pieces", "friction": 0.2},
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.4}, "probe": [{"name": "grip", "on": "right"}],
+    },
     # broken by an axe that is read from a file
     "hewn": {
         "mesh": MESHES["3d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xyz"}],
@@ -305,6 +313,32 @@ def run(name: str, folder: Path | None = None) -> Found:
     return result_of(name, scene, state, rows) | ({} if surface is None else surface.result(name))
 
 
+def squeezed() -> Found:
+    """A body pressed to two thirds of its height, then cut through aslant: which walls find no room and are drawn in or
+    left out, between pieces alone, at once and two steps later; and where the body is then."""
+    way = {"time": [0.0, 0.1], "value": [[0.0, 0.0], [0.03, -0.2]]}
+    scene, state = make_scene(
+        mesh=MESHES["2d"], material=SOFT | {"energy": "neo-hookean"}, fracture={"strength": 1e9, "radius": 0.1},
+        boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": way}], contact={"itself": "pieces"},
+        time={"scheme": "backward-euler", "step": 0.05, "end": 0.2}, solver=TIGHT,
+    )  # fmt: skip
+    steps = each_step(scene, state)
+    next(steps), next(steps)
+    graph = scene.fracture.graph
+    height = scene.domain.nodes[graph.edge_nodes] @ np.array([0.3, 1.0])
+    graph.break_edges((height.min(axis=1) < 0.45) & (height.max(axis=1) > 0.45))
+    scene.fracture.restored()
+    scene.balance.damage_changed()
+    scene.balance.edges_broke(graph.pattern)
+    state.remember()
+    at_once = scene.balance.saved()
+    next(steps), next(steps)
+    later, u = scene.balance.saved(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
+    walls = {f"squeezed-{when}-{name.removeprefix('contact.')}": np.array(values)
+             for when, saved in (("at-once", at_once), ("later", later)) for name, values in saved.items()}  # fmt: skip
+    return walls | {"squeezed-u": u}
+
+
 def by_rows() -> Found:
     """Edges that the block breaks where its average makes no row before stress asks for it."""
     at_once, average_module.AT_ONCE = average_module.AT_ONCE, 0
@@ -327,4 +361,4 @@ def compared(folder: Path) -> Found:
         found |= run(name, folder if name in SURFACES else None)
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
-    return found | dead_cells() | by_rows()
+    return found | dead_cells() | squeezed() | by_rows()
