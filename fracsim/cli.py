@@ -91,6 +91,7 @@ def mesh(
     """Build and save the mesh of a study, print its quality."""
     if not _is_root():
         return
+    from .meshes.directions import preferred
     from .meshes.quality import mesh_quality
     from .study.file import load_study
     from .study.mesh_source import build_mesh, save_mesh
@@ -98,7 +99,7 @@ def mesh(
     data = build_mesh(load_study(study, set_).mesh)
     for note in data.notes:
         print(f"note: {note}")
-    for name, value in mesh_quality(data).items():
+    for name, value in (mesh_quality(data) | preferred(data)).items():
         print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {value}")
     save_mesh(data, out)
     print(f"saved in {out}")

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from .data import Indices, MeshError, Points
+from .quality import POOR, radius_ratios
+from .scattered.faces import scatter_faces, scatter_plane
 from .sizing import INNER, Sizing
 from .topology import oriented
 
@@ -46,7 +48,8 @@ def meshed(
 ) -> tuple[Points, Indices]:
     """Points (n, d) and positive cells (m, d + 1) of what `draw` puts into gmsh's OpenCASCADE model.
 
-    `move` maps the nodes of the surface mesh (k, 3) to other places before the volume is filled.
+    A flat body, and the flat and cylindrical faces of a solid, have random points (`scattered`). `move` maps the nodes
+    of the surface mesh (k, 3) to other places before the volume is filled.
 
     Raises:
         MeshError: gmsh failed; the message has its reason.
@@ -55,12 +58,15 @@ def meshed(
         draw(gmsh)
         gmsh.model.occ.synchronize()
         sizing.apply(gmsh)
+        if dim == 2:
+            gmsh.model.mesh.generate(1)
+            return scatter_plane(gmsh, sizing)
         gmsh.model.mesh.generate(2)
+        scatter_faces(gmsh, sizing)
         if move:
             _move_nodes(gmsh, move)
-        if dim == 3:
-            fill_volumes(gmsh, sizing)
-        return cells_in(gmsh, dim)
+        fill_volumes(gmsh, sizing)
+        return _mended(gmsh)
 
 
 def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
@@ -85,6 +91,16 @@ def fill_volumes(gmsh: Any, sizing: Sizing) -> None:
             if algorithm == DELAUNAY:
                 raise
     gmsh.model.mesh.optimize("", True)
+
+
+def _mended(gmsh: Any) -> tuple[Points, Indices]:
+    """Points and tetrahedra; inner nodes are moved first where cells are poor, as a few at random points are."""
+    points, cells = cells_in(gmsh, 3)
+    if radius_ratios(points, cells).min() >= POOR:
+        return points, cells
+    gmsh.model.mesh.optimize("Relocate3D", True, 2)
+    gmsh.model.mesh.optimize("", True)
+    return cells_in(gmsh, 3)
 
 
 def cells_in(gmsh: Any, dim: int) -> tuple[Points, Indices]:

@@ -23,7 +23,7 @@ def crushed(**change: Any) -> dict[str, Any]:
     body: dict[str, Any] = {
         "mesh": {"builder": "box", "size": [0.2, 0.1], "h": 0.016, "pattern": "unstructured"},
         "material": {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0},
-        "fracture": {"strength": 5e4, "radius": 0.02},
+        "fracture": {"strength": 4e4, "radius": 0.02},
         "contact": {},
         "obstacle": [
             {"name": "floor", "shape": "plane", "at": [0.0, FLOOR], "normal": [0.0, 1.0]},

@@ -264,7 +264,7 @@ def test_a_turned_body_has_the_same_cuts(dim: int) -> None:
 @pytest.mark.parametrize("dim", (2, 3))
 def test_a_curved_surface_follows_its_field(dim: int) -> None:
     """Tension along rays from a point: the surface normal to it is a circle or sphere around that point. The deviation
-    is of second order in h: a quarter when h is halved (at most 0.4 here)."""
+    is of second order in h: a quarter when h is halved (at most 0.4 here; on random points by two halvings)."""
     centre = np.array([-0.5, 0.2, 0.1][:dim])
 
     def rays(places: Any) -> Any:
@@ -272,14 +272,15 @@ def test_a_curved_surface_follows_its_field(dim: int) -> None:
         return away / np.linalg.norm(away, axis=1)[:, None]
 
     deviation = []
-    for h in (0.1, 0.05):
+    halvings = 2 if dim == 2 else 1
+    for h in (0.1, 0.1 / 2**halvings):
         mesh = box(dim, h)
         start = [0.5, 0.3, 0.25][:dim]
         made = open_at(mesh, [start], [(np.array(start) - centre).tolist()], field=rays, curved=True)
         radius = np.linalg.norm(made.opened.starts[0] - centre)
         deviation.append(np.abs(np.linalg.norm(made.places - centre, axis=1) - radius).max())
         assert made.surface.pieces == 2
-    assert deviation[0] < 0.01 and deviation[1] < 0.4 * deviation[0]
+    assert deviation[0] < 0.01 and deviation[1] < 0.4**halvings * deviation[0]
 
 
 def test_without_tension_a_curved_surface_goes_straight_on() -> None:

@@ -102,7 +102,7 @@ def test_the_stable_step_follows_every_break(approach: str, unilateral: bool, mo
     """Each step is that of the damage it starts from, to the last bit; what edges do to it is worked out after breaks
     alone, though chi falls in other steps too."""
     scene, state = make_scene(
-        mesh=MESH,
+        mesh=MESH | {"h": 0.3},
         boundary=[{"on": "left", "velocity": [-0.5, 0.0]}, {"on": "right", "velocity": [0.5, 0.0]}],
         fracture={"strength": 0.2, "approach": approach, "unilateral": unilateral},
         time={"scheme": "explicit", "step": 1.0, "end": 100.0},

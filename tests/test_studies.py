@@ -91,7 +91,7 @@ def test_full_sizes_are_those_of_the_paper() -> None:
 @pytest.mark.parametrize("approach", ["chi", "edge"])
 def test_the_strip_by_both_approaches(approach: str, tmp_path: Path) -> None:
     """One study serves both: the edge form needs a linear energy. Both break at the same time of the loading."""
-    options = ["mesh.h=0.03", "material.energy=linear", f"fracture.approach={approach}", "time.end=0.1", *QUIET]
+    options = ["mesh.h=0.03", "material.energy=linear", f"fracture.approach={approach}", "time.end=0.14", *QUIET]
     summary = Run(build_scene(MPI.COMM_SELF, load_study(folder() / "bar-2d.toml", options)), tmp_path)()
     assert summary["broken_edges"] > 0 and summary["steps_failed"] == 0
 

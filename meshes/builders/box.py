@@ -24,7 +24,8 @@ class Box:
         origin: the corner with the least coordinates [m]; zeros where left out.
         h: cell size [m]. Structured: each side has round(size / h) equal steps, at least one.
         pattern: "structured": a lattice, each square cut into 2 triangles or each cube into 6 tetrahedra, all alike
-            (Kuhn's subdivision: conforming, and quick for any size); "unstructured": gmsh, no preferred directions.
+            (Kuhn's subdivision: conforming, and quick for any size); "unstructured": random points, no preferred
+            directions.
 
     Groups: left, right (least and greatest x), bottom, top (y in 2D, z in 3D), and in 3D front, back (least and
     greatest y).

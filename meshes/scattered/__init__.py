@@ -1,0 +1,1 @@
+"""Triangles between random points: meshes whose edges have no preferred directions."""

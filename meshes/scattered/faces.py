@@ -1,0 +1,117 @@
+"""Random points on the faces of gmsh's models: in the plane of a 2D body, and on flat and round faces in space.
+
+gmsh draws the outline and places nodes on it; its own triangles are pieces of lattices turned along the outline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..data import Indices, Points
+from ..sizing import Sizing
+from ..topology import Floats
+from .outline import Outline
+from .points import scatter
+
+LINE, TRIANGLE = 1, 2  # gmsh's numbers for cell types
+TURN = 2 * np.pi
+
+
+def scatter_plane(gmsh: Any, sizing: Sizing) -> tuple[Points, Indices]:
+    """Points (n, 2) and positive triangles (m, 3) of a flat body whose curves are meshed; MeshError as of `scatter`."""
+    nodes = _Curves.of(gmsh, [tag for _, tag in gmsh.model.getEntities(1)])
+    return scatter(Outline(nodes.points[:, :2], nodes.pieces), sizing.at)
+
+
+def scatter_faces(gmsh: Any, sizing: Sizing) -> None:
+    """Mesh the flat and cylindrical faces of a meshed surface anew; others stay as gmsh made them.
+
+    Sizes are those at the first two coordinates of gmsh's model, as everywhere.
+    """
+    for _, face in gmsh.model.getEntities(2):
+        if gmsh.model.getType(2, face) in ("Plane", "Cylinder"):
+            _mesh_anew(gmsh, face, sizing)
+
+
+@dataclass(frozen=True)
+class _Curves:
+    """The nodes of some curves of a model.
+
+    Attributes:
+        tags: (n,) gmsh's number of each node.
+        points: (n, 3) [m].
+        pieces: (k, 2) places in `tags` of the ends of each straight piece.
+    """
+
+    tags: Indices
+    points: Points
+    pieces: Indices
+
+    @classmethod
+    def of(cls, gmsh: Any, curves: list[int]) -> _Curves:
+        ends = [gmsh.model.mesh.getElementsByType(LINE, curve)[1] for curve in curves]
+        tags, pieces = np.unique(np.concatenate(ends).astype(np.int64), return_inverse=True)
+        points = np.array([gmsh.model.mesh.getNode(tag)[0] for tag in tags])
+        return cls(tags, points, pieces.reshape(-1, 2))
+
+
+def _mesh_anew(gmsh: Any, face: int, sizing: Sizing) -> None:
+    """Lay the face out in a plane, scatter points there, and put them and their triangles in the place of gmsh's."""
+    sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, oriented=False)]
+    seams = {side for side in sides if sides.count(side) == 2}
+    nodes = _Curves.of(gmsh, sorted(set(sides)))
+    flat = _parameters(gmsh, face, nodes.points)
+    tags, pieces = nodes.tags, nodes.pieces
+    if seams:
+        seam = np.isin(tags, _Curves.of(gmsh, sorted(seams)).tags)
+        tags, flat, pieces = _cut_open(tags, flat, pieces, seam)
+    scale = _scale(gmsh, face)
+    outward = _turning(gmsh, face)
+
+    def place(points: Points) -> Points:
+        return np.array(gmsh.model.getValue(2, face, (points / scale).ravel())).reshape(-1, 3)
+
+    points, cells = scatter(Outline(flat * scale, pieces), lambda points: sizing.at(place(points)), seed=face)
+    gmsh.model.mesh.clear([(2, face)])
+    last = gmsh.model.mesh.getMaxNodeTag()
+    inner = points[len(tags) :]
+    new = last + 1 + np.arange(len(inner))
+    gmsh.model.mesh.addNodes(2, face, new, place(inner).ravel(), (inner / scale).ravel())
+    corners = np.concatenate([tags, new])[cells]
+    gmsh.model.mesh.addElementsByType(face, TRIANGLE, [], (corners if outward else corners[:, ::-1]).ravel())
+
+
+def _parameters(gmsh: Any, face: int, points: Points) -> Floats:
+    return np.array(gmsh.model.getParametrization(2, face, points.ravel())).reshape(-1, 2)
+
+
+def _scale(gmsh: Any, face: int) -> Floats:
+    """Metres for each unit of the face's two parameters, the same all over a plane or a cylinder: (2,)."""
+    return np.linalg.norm(np.array(gmsh.model.getDerivative(2, face, [0.0, 0.0])).reshape(2, 3), axis=1)
+
+
+def _turning(gmsh: Any, face: int) -> bool:
+    """Whether gmsh's triangles turn as the parameters do."""
+    triangle = gmsh.model.mesh.getElementsByType(TRIANGLE, face)[1][:3]
+    corners = np.array([gmsh.model.mesh.getNode(tag)[0] for tag in triangle])
+    middle = _parameters(gmsh, face, corners.mean(axis=0))
+    along = np.array(gmsh.model.getDerivative(2, face, middle.ravel())).reshape(2, 3)
+    return bool(np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ np.cross(*along) > 0)
+
+
+def _cut_open(tags: Indices, flat: Floats, pieces: Indices, seam: Any) -> tuple[Indices, Floats, Indices]:
+    """A face that closes on itself, cut along its seam: nodes on it at 0 and, a second time, after a whole turn."""
+    flat[seam, 0] = 0.0
+    copy = np.full(len(tags), -1)
+    copy[seam] = len(tags) + np.arange(seam.sum())
+    along = seam[pieces].all(axis=1)
+    far = seam[pieces] & (flat[pieces[:, ::-1], 0] > TURN / 2)  # the other end lies before the end of the turn
+    closed = np.where(far, copy[pieces], pieces)
+    return (
+        np.concatenate([tags, tags[seam]]),
+        np.concatenate([flat, flat[seam] + [TURN, 0.0]]),
+        np.concatenate([closed, copy[pieces[along]]]),
+    )

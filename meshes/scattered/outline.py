@@ -1,0 +1,95 @@
+"""A plane outline in straight pieces, and the triangles that lie inside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..components import components
+from ..data import Indices, MeshError, Points
+from ..topology import Mask, distinct_rows, facets_of, signed_measures
+
+ROUNDS = 40  # most times that pieces are halved before the outline is given up
+FLAT = 1e-9  # area over squared longest edge of the triangles between points of one straight line: they are no cells
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Closed polygons, in any order; what lies inside an odd number of them is the body.
+
+    Attributes:
+        points: (n, 2) [m].
+        pieces: (k, 2) numbers of the two ends of each straight piece.
+    """
+
+    points: Points
+    pieces: Indices
+
+    def conforming(self) -> Outline:
+        """The outline with pieces halved until each of them is an edge of the Delaunay triangles of its points.
+
+        Raises:
+            MeshError: pieces cross one another.
+        """
+        outline = self
+        for _ in range(ROUNDS):
+            lost = outline._lost(delaunay(outline.points).simplices)
+            if not lost.any():
+                return outline
+            where = outline.points[outline.pieces[lost][0]].mean(axis=0)
+            outline = outline._halved(lost)
+        raise MeshError(
+            f"the outline meets itself near ({where[0]:.4g}, {where[1]:.4g}) m: {int(lost.sum())} of its pieces are "
+            "cut by others, however short they are made; mend it there."
+        )
+
+    def _lost(self, simplices: Indices) -> Mask:
+        """Which pieces are no edges of the triangles: (k,)."""
+        edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
+        _, _, place = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
+        return ~np.isin(place[: len(self.pieces)], place[len(self.pieces) :])
+
+    def _halved(self, chosen: Mask) -> Outline:
+        """The outline with the chosen pieces cut at their middles."""
+        ends = self.pieces[chosen]
+        new = len(self.points) + np.arange(len(ends))
+        halves = [np.stack([ends[:, 0], new], axis=1), np.stack([new, ends[:, 1]], axis=1)]
+        points = np.concatenate([self.points, self.points[ends].mean(axis=1)])
+        return Outline(points, np.concatenate([self.pieces[~chosen], *halves]))
+
+    def inside(self, points: Points, simplices: Indices) -> Mask:
+        """Which triangles of a Delaunay triangulation that holds every piece are part of the body: (m,).
+
+        Triangles that are joined across edges that are no pieces lie on the same side.
+        """
+        edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
+        rows, _, place = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
+        wall = np.zeros(len(rows), bool)
+        wall[place[: len(self.pieces)]] = True
+        place = place[len(self.pieces) :]
+        order = np.argsort(place, kind="stable")
+        same = np.flatnonzero((np.diff(place[order]) == 0) & ~wall[place[order][:-1]])
+        _, part = components(np.stack([order[same], order[same + 1]], axis=1) // 3, len(simplices))
+        area = np.abs(signed_measures(points, simplices))
+        ranked = np.lexsort((-area, part))
+        largest = ranked[np.unique(part[ranked], return_index=True)[1]]
+        spans = np.ptp(points[simplices], axis=1).max(axis=1)
+        return self._around(points[simplices[largest]].mean(axis=1))[part] & (area > FLAT * spans**2)
+
+    def _around(self, points: Points) -> Mask:
+        """Whether points lie inside: a ray towards +x crosses an odd number of pieces. Few points, one a part: (m,)."""
+        start, end = self.points[self.pieces[:, 0]], self.points[self.pieces[:, 1]]
+        x, y = points[:, :1], points[:, 1:]
+        spans = (start[:, 1] > y) != (end[:, 1] > y)
+        rise = np.where(end[:, 1] == start[:, 1], 1.0, end[:, 1] - start[:, 1])
+        at = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
+        return np.asarray((spans & (at > x)).sum(axis=1) % 2 == 1)
+
+
+def delaunay(points: Points) -> Any:
+    """SciPy's Delaunay triangulation of points (n, 2)."""
+    from scipy.spatial import Delaunay
+
+    return Delaunay(points)

@@ -1,0 +1,121 @@
+"""Meshes without preferred directions: the measure on meshes of known directions, and what builders make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fracsim.meshes import BUILDERS
+from fracsim.meshes.data import MeshData, MeshError
+from fracsim.meshes.directions import preferred
+from fracsim.meshes.quality import mesh_quality
+from fracsim.meshes.scattered.outline import Outline
+from fracsim.meshes.scattered.points import APART, scatter
+from fracsim.meshes.sizing import Sizing
+from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
+
+
+def ring(*corners: tuple[float, float], h: float, first: int = 0) -> Outline:
+    """A polygon with steps of about h along its sides, its nodes numbered from `first`."""
+    ends = np.array(corners)
+    steps = [
+        start + (end - start) * (np.arange(n) / n)[:, None]
+        for start, end in zip(ends, np.roll(ends, -1, axis=0), strict=True)
+        for n in [max(1, round(float(np.linalg.norm(end - start)) / h))]
+    ]
+    points = np.concatenate(steps)
+    number = np.arange(len(points))
+    return Outline(points, first + np.stack([number, np.roll(number, -1)], axis=1))
+
+
+SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+
+
+def test_a_lattice_has_three_directions() -> None:
+    """All edges lie in three directions, where 6 x 3.5 of 180 degrees would by chance: 180 / 21."""
+    for size in ((1.0, 1.0), (2.0, 0.5)):
+        mesh = BUILDERS["box"](size=size, h=0.1).build()
+        assert preferred(mesh)["directions"] == pytest.approx(180 / 21, rel=1e-12)
+
+
+def test_the_measure_does_not_depend_on_how_the_body_lies() -> None:
+    """A lattice turned by 22.5 degrees is a lattice; in space one direction has its share over that of its cone."""
+    flat = BUILDERS["box"](size=(1.0, 1.0), h=0.1).build()
+    c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
+    turned = MeshData(flat.points @ np.array([[c, s], [-s, c]]), flat.cells)
+    assert preferred(turned)["directions"] == pytest.approx(180 / 21, rel=1e-12)
+    solid = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.1).build()
+    edges, outer = edges_of(solid.cells), set(map(tuple, edges_of(boundary_facets(solid.cells)).tolist()))
+    inner = np.array([tuple(edge) not in outer for edge in edges.tolist()])
+    spans = np.diff(solid.points[edges], axis=1)[:, 0]
+    along = (np.abs(spans[inner]) > 1e-9).astype(int) @ [1, 2, 4]  # Kuhn: seven directions
+    share = np.bincount(along).max() / inner.sum()
+    assert preferred(solid)["directions"] == pytest.approx(share / (1 - np.cos(np.radians(6))), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("box", {"size": (1.0, 1.0), "h": 0.03, "pattern": "unstructured"}),
+        ("disk", {"h": 0.002}),
+        ("plate-hole", {"h": 0.0015}),
+        ("notched-plate", {}),
+        ("notched-bar", {"thickness": 0.0, "h": 6e-4}),
+    ],
+)
+def test_unstructured_bodies_have_none(name: str, parameters: dict[str, object]) -> None:
+    assert preferred(BUILDERS[name](**parameters).build())["directions"] < 1.3
+
+
+def test_flat_and_round_faces_have_none() -> None:
+    """Lattices of gmsh have 4.5 (flat) and 5.4 (round); so few edges as here 1.4 by chance."""
+    box = preferred(BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.08, pattern="unstructured").build())
+    cylinder = preferred(BUILDERS["cylinder"](h=0.012).build())
+    assert max(box["directions_faces"], cylinder["directions_faces"]) < 1.6
+    assert max(box["directions"], cylinder["directions"]) < 1.6
+
+
+def test_points_are_apart_and_leave_no_gap() -> None:
+    """No edge is shorter than 0.75 h, no circle around a triangle larger: angles of 30 degrees, and area exact."""
+    h = 0.05
+    points, cells = scatter(ring(*SQUARE, h=h), Sizing(h).at)
+    quality = mesh_quality(MeshData(points, cells))
+    assert quality["edge_min"] >= APART * h * (1 - 1e-12)
+    assert quality["edge_max"] <= 2 * APART * h * 1.001
+    assert quality["angle_min"] >= 29.9
+    assert signed_measures(points, cells).sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_seeds() -> None:
+    """The same seed, the same mesh; another seed, other points."""
+    outline = ring(*SQUARE, h=0.1)
+    first, again, other = (scatter(outline, Sizing(0.1).at, seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert len(first) != len(other) or not np.allclose(first, other)
+
+
+def test_holes_and_narrow_slits() -> None:
+    """A hole with an island in it, and a slit far narrower than the cells, whose nodes do not face each other."""
+    outer, hole = ring(*SQUARE, h=0.1), ring((0.2, 0.2), (0.5, 0.2), (0.5, 0.5), (0.2, 0.5), h=0.1, first=40)
+    island = ring((0.3, 0.3), (0.4, 0.3), (0.4, 0.4), (0.3, 0.4), h=0.1, first=52)
+    slit = ring((0.6, 0.7), (0.83, 0.702), (0.6, 0.704), h=0.09, first=56)
+    parts = [outer, hole, island, slit]
+    outline = Outline(np.concatenate([p.points for p in parts]), np.concatenate([p.pieces for p in parts]))
+    points, cells = scatter(outline, Sizing(0.1).at)
+    assert signed_measures(points, cells).sum() == pytest.approx(1 - 0.09 + 0.01 - 0.23 * 0.004 / 2, rel=1e-12)
+
+
+def test_an_outline_that_crosses_itself_is_refused() -> None:
+    with pytest.raises(MeshError, match="the outline meets itself near"):
+        scatter(ring((0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.83), h=0.2), Sizing(0.2).at)
+
+
+def test_graded_meshes_are_as_fine_as_they_are_asked_to_be() -> None:
+    """Median edges near the fine place and far from it are those asked for, within 15 %."""
+    sizing = Sizing(0.08, 0.01, (0.5, 0.5), (0.5, 0.5))
+    points, cells = scatter(ring(*SQUARE, h=0.08), sizing.at)
+    edges = edges_of(cells)
+    middle, length = points[edges].mean(axis=1), np.linalg.norm(np.diff(points[edges], axis=1)[:, 0], axis=1)
+    for low, high in ((0.0, 0.05), (0.1, 0.15), (0.3, 0.5)):
+        there = np.abs(np.linalg.norm(middle - 0.5, axis=1) - (low + high) / 2) < (high - low) / 2
+        assert np.median((length / sizing.at(middle))[there]) == pytest.approx(0.96, abs=0.15)
