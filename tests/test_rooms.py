@@ -18,7 +18,7 @@ ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
 LAYERS = ("mesh", "mechanics", "fracture", "stepping", "output")  # each may use those before it
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
-WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.places", "mechanics.time_functions"}
+WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}
 # a sweep asks the schema and who owns a folder; runs ask how groups are driven; colours and pictures read files
 OF_REPORT = {
     "picture": {"output.surface.collection"},

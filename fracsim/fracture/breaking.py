@@ -56,6 +56,7 @@ class Breaking:
         graph: edges and their integrity.    criterion: which edges fail.    law: what is left of an edge that does.
         degradation: what broken edges take out of the energy.
         passes: most passes in a step; None: until nothing changes.
+        opened: (edges,) where edges that were broken before the start are cut, NaN elsewhere; None: there are none.
         not_finite: cells whose stress was no number when it was looked at (crushed flat), over all passes of this rank.
     """
 
@@ -69,11 +70,14 @@ class Breaking:
         law: EdgeLaw | None = None,
         *,
         passes: int | None = 1,
+        opened: Values | None = None,
     ) -> None:
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = make_degradation(stress, graph)
-        self.not_finite = 0
+        self.not_finite, self.opened = 0, opened
+        if opened is not None:
+            self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
         tensor = symmetric_components(cauchy_stress(energy, F, stress.R))
         both = ufl.as_vector([*tensor, energy.psi(F, stress.R)])  # one kernel: F is worked out once

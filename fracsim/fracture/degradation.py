@@ -52,6 +52,9 @@ class Degradation(Protocol):
     def restore(self) -> None:
         """Take up the damage of a graph that was read from a checkpoint."""
 
+    def opened(self) -> None:
+        """Take up the damage of a graph with cracks, before anything is loaded."""
+
 
 class Chi:
     """chi of the damaged cells, from the normal stress along their edges."""
@@ -89,6 +92,10 @@ class Chi:
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""
+
+    def opened(self) -> None:
+        """Cells that have come apart carry nothing; what others lose is seen once they are loaded."""
+        self._chi[np.flatnonzero(self._graph.split)] = 0.0
 
 
 class _Edges:
@@ -132,6 +139,10 @@ class Projection:
         """Integrity follows from that of the edges."""
         self._edges.update()
 
+    def opened(self) -> None:
+        """Integrity follows from that of the edges."""
+        self._edges.update()
+
 
 class ClosingChi(Chi):
     """chi beside the springs of broken edges (forms.closing)."""
@@ -151,6 +162,11 @@ class ClosingChi(Chi):
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""
+        self._edges.update()
+
+    def opened(self) -> None:
+        """As without springs, and these are there where edges are broken."""
+        super().opened()
         self._edges.update()
 
 

@@ -43,6 +43,8 @@ class Breaks:
             self.record = EdgeRecord(breaking.graph)
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
+            if breaking.opened is not None:
+                self.record.note(0.0, breaking.opened)
             self.count()
 
     def note(self, t: float) -> None:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
+
 from ..mechanics.balance import Balance
 from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
 from ..stepping.after_step import Flow, NoFlow
 from ..study import Brittle, Study
-from ..study.conditions import fibre_direction
+from ..study.conditions import cracks, fibre_direction
 from .material import per_cell
+
+Values = npt.NDArray[np.float64]
 
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
@@ -40,7 +45,21 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     passes = study.fracture.passes
     if passes is None and balance.scheme.inertia:
         passes = 1
-    return Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes)
+    opened = _opened(study, balance, graph)
+    breaking = Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes, opened=opened)
+    if opened is not None:
+        balance.edges_broke(graph.pattern)
+        balance.damage_changed()
+    return breaking
+
+
+def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
+    """[[crack]]: break its edges; where they are cut, None without any."""
+    if not study.crack:
+        return None
+    from ..fracture.cracks import open_cracks
+
+    return open_cracks(graph, cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
 
 
 def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:

@@ -16,7 +16,7 @@ catalogue       `fracsim list`
 """
 
 from .body import Damping, Elastic, Material, Mesh, Region
-from .breaking import Brittle, Fibre, Fracture, Grains, Heterogeneity, Plasticity
+from .breaking import Brittle, Crack, Fibre, Fracture, Grains, Heterogeneity, Plasticity
 from .loading import CONDITIONS, MOTIONS, Boundary, Box, Initial, Load, Plane
 from .running import FIELDS, Output, Probe, Time
 from .touching import Contact, Hinge, Obstacle
@@ -24,7 +24,7 @@ from .values import Table, TimeTable
 from .whole import Study
 
 __all__ = [
-    "CONDITIONS", "FIELDS", "MOTIONS", "Boundary", "Box", "Brittle", "Contact", "Damping", "Elastic", "Fibre",
+    "CONDITIONS", "FIELDS", "MOTIONS", "Boundary", "Box", "Brittle", "Contact", "Crack", "Damping", "Elastic", "Fibre",
     "Fracture", "Grains", "Heterogeneity", "Hinge", "Initial", "Load", "Material", "Mesh", "Obstacle", "Output",
     "Plane", "Plasticity", "Probe", "Region", "Study", "Table", "Time", "TimeTable",
 ]  # fmt: skip

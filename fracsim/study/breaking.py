@@ -46,6 +46,28 @@ class Fracture(Table):
     fibre: Fibre | None = None
 
 
+class CrackPlane(Table):
+    """All of the body's section with a plane (2D: a line)."""
+
+    point: Vector
+    normal: Vector
+
+
+class Crack(Table):
+    """[[crack]]: broken before the start, with the places of its cuts. Give exactly one of the three."""
+
+    segment: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = None  # m, 2D
+    polygon: Annotated[list[Vector], Field(min_length=3)] | None = None  # m, 3D, flat
+    plane: CrackPlane | None = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Crack:
+        given = [key for key in ("segment", "polygon", "plane") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give exactly one of segment, polygon, plane; found {' and '.join(given) or 'none'}")
+        return self
+
+
 class Plasticity(Table):
     """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1."""
 

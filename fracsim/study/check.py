@@ -22,7 +22,7 @@ from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Obstacle, Study
-from .conditions import conditions, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
+from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 
 if TYPE_CHECKING:
@@ -144,6 +144,9 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     initial_motion(study, dim)
     obstacles(study, dim)
     fibre_direction(study, dim)
+    for crack in cracks(study, dim):
+        if not crack.meets(np.array(anatomy.lower), np.array(anatomy.upper)):
+            raise InputError(f"{crack.name} lies outside the body, which spans {_extent(anatomy)}")
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, anatomy, f"probe.{i}.point")
@@ -175,6 +178,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"plasticity  {_plasticity(study)}"
     if study.brittle is not None:
         yield f"brittle     {_brittle(study.brittle)}"
+    if study.crack:
+        yield f"cracks      {len(study.crack)}, broken before the start"
     yield f"damping     {_damping(study)}"
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"

@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
+from ..mesh.cracks import Crack, plane, polygon, segment
 from ..mesh.places import Group, InBox, OnPlane, Place
 from ..meshes.words import AXES
 from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, TimeTable
+from .breaking import Crack as CrackTable
 
 Flags = npt.NDArray[np.bool_]
 
@@ -210,6 +212,25 @@ def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None
     velocity = None if initial.velocity is None else of_size(initial.velocity, dim, "initial.velocity")
     spin = None if initial.spin is None else of_size(initial.spin, 1 if dim == 2 else 3, "initial.spin")
     return velocity, spin
+
+
+def cracks(study: Study, dim: int) -> list[Crack]:
+    """[[crack]] of a body with d dimensions. InputError where they are of another, or have no extent."""
+    return [_crack(entry, f"crack.{i}", dim) for i, entry in enumerate(study.crack)]
+
+
+def _crack(entry: CrackTable, key: str, dim: int) -> Crack:
+    if entry.plane is not None:
+        point = of_size(entry.plane.point, dim, f"{key}.plane.point")
+        return plane(key, point, of_size(entry.plane.normal, dim, f"{key}.plane.normal"))
+    if entry.segment is not None:
+        if dim == 3:
+            raise InputError(f"{key}.segment is for 2D meshes; this one has 3 dimensions: give a polygon or a plane")
+        return segment(key, np.array([of_size(end, dim, f"{key}.segment") for end in entry.segment]))
+    assert entry.polygon is not None
+    if dim == 2:
+        raise InputError(f"{key}.polygon is for 3D meshes; this one has 2 dimensions: give a segment or a plane")
+    return polygon(key, np.array([of_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
 
 
 def fibre_direction(study: Study, dim: int) -> Values | None:

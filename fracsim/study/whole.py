@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from .body import Damping, Material, Mesh
-from .breaking import Brittle, Fracture, Plasticity
+from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
@@ -30,6 +30,7 @@ class Study(Table):
     fracture: Fracture | None = None
     plasticity: Plasticity | None = None
     brittle: Brittle | None = None
+    crack: list[Crack] = Field(default_factory=list)
     damping: Damping | None = None
     boundary: list[Boundary] = Field(default_factory=list)
     load: Load | None = None
@@ -121,6 +122,12 @@ class Study(Table):
             raise ValueError(
                 'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _cracks_need_fracture(self) -> Study:
+        if self.crack and self.fracture is None:
+            raise ValueError("[[crack]] needs a [fracture] table: without it no edge can be broken (strength = inf)")
         return self
 
     @model_validator(mode="after")

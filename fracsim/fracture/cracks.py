@@ -1,0 +1,70 @@
+"""Cracks that are there before the start: which edges they cut, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..mesh.cracks import Crack
+from ..mesh.edges import EdgeGraph
+from ..mesh.pieces import find_pieces
+from ..mesh.ranks import total
+
+Values = npt.NDArray[np.float64]
+
+CLOSEST = 0.02  # share of an edge that is left at either end of a cut: no slivers of surface
+ON = 1e-9  # of the body's size: nodes as near as this to a crack lie on one side of it
+
+
+def cut_edges(graph: EdgeGraph, crack: Crack) -> Values:
+    """(edges,) where the crack cuts local edges, from the end that comes first in the input mesh; NaN elsewhere."""
+    domain, ends = graph.domain, ends_in_order(graph)
+    slack = ON * domain.size
+    height = (domain.nodes[ends] - crack.point) @ crack.normal
+    height[np.abs(height) <= slack] = 0.0
+    crossed = np.flatnonzero((height[:, 0] >= 0) != (height[:, 1] >= 0))
+    low, high = height[crossed].T
+    share = low / (low - high)
+    corners = domain.nodes[ends[crossed]]
+    held = crack.holds(corners[:, 0] + share[:, None] * (corners[:, 1] - corners[:, 0]), slack)
+    cut = np.full(len(graph.broken), np.nan)
+    cut[crossed[held]] = np.clip(share[held], CLOSEST, 1 - CLOSEST)
+    return cut
+
+
+def ends_in_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
+    """(edges, 2) local nodes of owned and ghost edges, the one that comes first in the input mesh first."""
+    ends = graph.edge_nodes
+    swap = graph.domain.node_input[ends[:, 0]] > graph.domain.node_input[ends[:, 1]]
+    return np.where(swap[:, None], ends[:, ::-1], ends)
+
+
+def open_cracks(graph: EdgeGraph, cracks: Sequence[Crack], *, in_one: bool) -> Values:
+    """Break the edges that cracks cut; returns where, as `cut_edges` (collective).
+
+    `in_one`: the body must stay in as many pieces as it is, as one without inertia has to.
+
+    Raises:
+        InputError: a crack cuts no edge, or cuts the body in two where it must not.
+    """
+    domain, cut = graph.domain, np.full(len(graph.broken), np.nan)
+    for crack in cracks:
+        before = find_pieces(graph).count if in_one else 0
+        own = cut_edges(graph, crack)
+        if not total(domain.comm, np.count_nonzero(~np.isnan(own)))[0]:
+            raise InputError(
+                f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.extent()}, or "
+                "is shorter than the cells there"
+            )
+        new = np.isnan(cut) & ~np.isnan(own)
+        cut[new] = own[new]
+        graph.break_edges(~np.isnan(own))
+        if in_one and find_pieces(graph).count > before:
+            raise InputError(
+                f"{crack.name} cuts the body in two, and quasi-static loads have no answer for a piece that comes off; "
+                "make it shorter, or choose a time.scheme with inertia"
+            )
+    return cut

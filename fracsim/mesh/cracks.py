@@ -1,0 +1,92 @@
+"""Flat cracks in a body, and which points of their planes belong to them. No DOLFINx here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+FLAT = 1e-6  # of a polygon's size: how far its corners may lie off their plane
+
+
+@dataclass(frozen=True)
+class Crack:
+    """A flat crack.
+
+    Attributes:
+        name: how messages call it.
+        point, normal: (d,) of its plane (2D: line), m and unit.
+        corners: (k, d) of the segment (k = 2, in 2D) or polygon (k > 2, in 3D), m; None: all of the plane.
+    """
+
+    name: str
+    point: Values
+    normal: Values
+    corners: Values | None = None
+
+    def meets(self, lower: Values, upper: Values) -> bool:
+        """Whether it may reach into a bounding box: no face of the box, nor the crack's own plane, keeps them apart."""
+        corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(len(lower), -1).T
+        heights = (corners - self.point) @ self.normal
+        if heights.min() > 0 or heights.max() < 0:
+            return False
+        return self.corners is None or bool(
+            np.all(self.corners.min(axis=0) <= upper) and np.all(self.corners.max(axis=0) >= lower)
+        )
+
+    def holds(self, points: Values, slack: float) -> Flags:
+        """Whether points (n, d) of its plane lie within its corners, or no farther than `slack` (m) outside."""
+        if self.corners is None:
+            return np.ones(len(points), bool)
+        if len(self.corners) == 2:
+            along = self.corners[1] - self.corners[0]
+            length = float(np.linalg.norm(along))
+            place = (points - self.corners[0]) @ along / length
+            return np.asarray((place >= -slack) & (place <= length + slack))
+        return _in_polygon(self.corners, self.normal, points, slack)
+
+
+def plane(name: str, point: Values, normal: Values) -> Crack:
+    """A crack over all of the body's section with a plane (2D: a line). InputError where the normal is zero."""
+    if not (length := float(np.linalg.norm(normal))):
+        raise InputError(f"{name}.plane: the normal must not be zero")
+    return Crack(name, point, normal / length)
+
+
+def segment(name: str, corners: Values) -> Crack:
+    """A crack along the segment between two points (2, 2) of a 2D body. InputError where they are one."""
+    along = corners[1] - corners[0]
+    if not (length := float(np.linalg.norm(along))):
+        raise InputError(f"{name}.segment: both ends are {corners[0].tolist()}; give two different points (m)")
+    return Crack(name, corners[0], np.array([-along[1], along[0]]) / length, corners)
+
+
+def polygon(name: str, corners: Values) -> Crack:
+    """A crack over a flat polygon (k, 3). InputError where its corners do not lie in one plane."""
+    centre = corners.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(corners - centre)
+    if sizes[1] <= FLAT * sizes[0] or sizes[2] > FLAT * sizes[0]:
+        raise InputError(f"{name}.polygon: its {len(corners)} corners do not span a plane; give a flat polygon (m)")
+    return Crack(name, centre, axes[2], corners)
+
+
+def _in_polygon(corners: Values, normal: Values, points: Values, slack: float) -> Flags:
+    """By the number of sides that a ray in the plane crosses, or by the distance to the nearest side."""
+    first = corners[1] - corners[0]
+    first = first / np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    x, start = points @ axes, corners @ axes
+    along = np.roll(start, -1, axis=0) - start
+    apart = x[:, None] - start
+    rises = (start[:, 1] > x[:, 1:]) != ((start + along)[:, 1] > x[:, 1:])
+    climb = np.where(along[:, 1] == 0, 1.0, along[:, 1])
+    odd = (rises & (apart[..., 1] / climb * along[:, 0] > apart[..., 0])).sum(axis=1) % 2 == 1
+    share = np.clip(np.einsum("nki,ki->nk", apart, along) / np.einsum("ki,ki->k", along, along), 0.0, 1.0)
+    beside = np.linalg.norm(apart - share[..., None] * along, axis=2).min(axis=1) <= slack
+    return np.asarray(odd | beside)

@@ -1,0 +1,160 @@
+"""[[crack]]: which edges are broken before the start, where they are cut, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from fracsim.errors import InputError
+from fracsim.mesh.cracks import plane, polygon, segment
+from fracsim.mesh.pieces import find_pieces
+from fracsim.run import Run
+from fracsim.scene import Scene, build_scene
+from fracsim.study.check import check_study
+from support.scenes import make_study
+from support.vtu import frames
+
+HELD = [{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": {"time": [0, 1], "value": [[0, 0], [0, 1e-3]]}}]
+
+
+def cracked(crack: list[dict[str, Any]], dim: int = 2, h: float = 0.1, **tables: Any) -> Scene:
+    given = {
+        "mesh": {"builder": "box", "size": [1.0] * dim, "h": h, "pattern": "unstructured"},
+        "fracture": {"strength": 1e9},
+        "crack": crack,
+    }
+    return build_scene(MPI.COMM_SELF, make_study(**(given | tables)))
+
+
+def cut_points(scene: Scene) -> np.ndarray:
+    """(n, d) places where edges were cut before the start."""
+    breaking = scene.fracture
+    assert breaking is not None and breaking.opened is not None
+    broken = np.flatnonzero(breaking.graph.broken)
+    ends = breaking.graph.edge_nodes[broken]
+    nodes, number = scene.domain.nodes, scene.domain.node_input[ends]
+    ends = np.where((number[:, 0] > number[:, 1])[:, None], ends[:, ::-1], ends)
+    share = breaking.opened[broken, None]
+    return np.asarray(nodes[ends[:, 0]] + share * (nodes[ends[:, 1]] - nodes[ends[:, 0]]))
+
+
+def test_a_segment_cuts_what_it_crosses() -> None:
+    """Every broken edge has its ends on two sides, and the crossing lies on the segment; all others have not."""
+    start, end = np.array([-0.1, 0.37]), np.array([0.52, 0.56])
+    scene = cracked([{"segment": [start.tolist(), end.tolist()]}])
+    graph, nodes = scene.fracture.graph, scene.domain.nodes
+
+    def side(a: Any, b: Any, c: Any) -> Any:
+        return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
+
+    a, b = nodes[graph.edge_nodes[:, 0]], nodes[graph.edge_nodes[:, 1]]
+    crosses = (side(start, end, a) * side(start, end, b) < 0) & (side(a, b, start) * side(a, b, end) < 0)
+    np.testing.assert_array_equal(graph.broken, crosses)
+    off = np.abs(side(start, end, cut_points(scene))) / np.linalg.norm(end - start)
+    assert np.median(off) < 1e-15 and off.max() < 0.02 * 0.15  # cuts keep 2 % of an edge from its ends
+    assert np.all(scene.balance.stress.chi.x.array[: scene.domain.cell_count] == ~graph.split)
+
+
+def test_a_polygon_in_space_is_a_hole_of_its_area() -> None:
+    """Cuts lie in the polygon's plane and within it, and no edge that crosses it is left whole."""
+    corners = [[0.2, 0.2, 0.41], [0.8, 0.2, 0.41], [0.8, 0.7, 0.41], [0.2, 0.7, 0.41]]
+    scene = cracked([{"polygon": corners}], dim=3, h=0.2)
+    places = cut_points(scene)
+    assert len(places) > 10
+    assert np.all((places[:, :2] > 0.2 - 0.02) & (places[:, :2] < [0.82, 0.72]))
+    assert np.median(np.abs(places[:, 2] - 0.41)) < 1e-15
+    nodes, graph = scene.domain.nodes, scene.fracture.graph
+    a, b = (nodes[graph.edge_nodes[:, k]] for k in range(2))
+    rise = b[:, 2] - a[:, 2]
+    share = np.where(rise == 0, -1.0, (0.41 - a[:, 2]) / np.where(rise == 0, 1.0, rise))
+    through = a + share[:, None] * (b - a)
+    inside = (share > 0) & (share < 1) & np.all((through[:, :2] > 0.2) & (through[:, :2] < [0.8, 0.7]), axis=1)
+    np.testing.assert_array_equal(graph.broken, inside)
+
+
+def test_a_plane_along_nodes_cuts_one_row_of_edges() -> None:
+    """A plane through a row of nodes leaves them all on one side: two pieces, and edges cut at 2 % of their length."""
+    scene = cracked(
+        [{"plane": {"point": [0.0, 0.5], "normal": [0.0, 2.0]}}], mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25}
+    )
+    assert find_pieces(scene.fracture.graph).count == 2
+    np.testing.assert_allclose(np.abs(cut_points(scene)[:, 1] - 0.5), 0.02 * 0.25, rtol=1e-9)
+
+
+def test_a_plate_with_a_crack_is_as_stiff_as_one_with_a_slit() -> None:
+    """The energy that a pulled square stores with an edge crack of half its width is that of one with a narrow slit cut
+    out of its mesh, to 4 % (h = 1/30; a crack ends somewhere in a cell), and less than that of a whole one."""
+    stored = []
+    slit = {"builder": "notched-plate", "length": 1.0, "height": 1.0, "notch_length": 0.5, "notch_width": 1e-3}
+    whole = {"builder": "box", "size": [1.0, 1.0], "pattern": "unstructured"}
+    for mesh, crack in ((slit | {"h_tip": 1 / 30}, []), (whole, [{"segment": [[0.0, 0.5], [0.5, 0.5]]}]), (whole, [])):
+        scene = cracked(
+            crack, mesh=mesh | {"h": 1 / 30}, boundary=HELD, time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}
+        )
+        stored.append(scene.stepper.advance(scene.start())[1].elastic)
+    assert stored[1] == pytest.approx(stored[0], rel=0.04)
+    assert stored[1] < 0.9 * stored[2]
+
+
+def test_the_surface_is_drawn_through_the_cuts(tmp_path: Path) -> None:
+    """The crack is there in the first frame, as old as the run, straight through its cuts."""
+    scene = cracked(
+        [{"segment": [[0.0, 0.5], [0.5, 0.5]]}], boundary=HELD, output={"picture": False},
+        time={"scheme": "quasi-static", "step": 0.5, "end": 0.5},
+    )  # fmt: skip
+    Run(scene, tmp_path / "out")()
+    first = frames(tmp_path / "out")[0]
+    used = first.points[np.unique(first.segments), :2]
+    inside = used[(used[:, 0] > 1e-9) & (used[:, 0] < 0.499) & (np.abs(used[:, 1] - 0.5) < 0.05)]
+    assert len(inside) > 6 and np.median(np.abs(inside[:, 1] - 0.5)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("crack", "tables", "message"),
+    [
+        ({"segment": [[2.0, 0.5], [3.0, 0.5]]}, {}, r"crack\.0 lies outside the body, which spans \(0, 0\) to"),
+        ({"segment": [[0.5, 0.5], [0.5, 0.50001]]}, {}, r"crack\.0 cuts no edge .* shorter than the cells there"),
+        ({"segment": [[0.5, 0.5], [0.5, 0.5]]}, {}, r"crack\.0\.segment: both ends are \[0\.5, 0\.5\]"),
+        ({"segment": [[0.0, 0.5, 0.0], [0.5, 0.5, 0.0]]}, {}, r"crack\.0\.segment = .*: this mesh needs 2 numbers"),
+        ({"polygon": [[0.0, 0.5, 0], [0.5, 0.5, 0], [1, 1, 0]]}, {}, r"crack\.0\.polygon is for 3D meshes"),
+        ({"plane": {"point": [0, 0.5], "normal": [0, 0]}}, {}, r"crack\.0\.plane: the normal must not be zero"),
+        (
+            {"segment": [[-1.0, 0.5], [2.0, 0.5]]},
+            {"time": {"scheme": "quasi-static", "step": 1.0, "end": 1.0}, "boundary": HELD},
+            r"crack\.0 cuts the body in two, and quasi-static loads have no answer.*scheme with inertia",
+        ),
+    ],
+)
+def test_refused(crack: dict[str, Any], tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        cracked([crack], **tables)
+
+
+def test_refused_in_the_study_file() -> None:
+    with pytest.raises(ValueError, match=r"\[\[crack\]\] needs a \[fracture\] table"):
+        make_study(crack=[{"segment": [[0, 0], [1, 1]]}])
+    with pytest.raises(ValueError, match="give exactly one of segment, polygon, plane; found none"):
+        make_study(crack=[{}], fracture={"strength": 1.0})
+
+
+def test_check_tells_of_cracks() -> None:
+    lines = check_study(make_study(crack=[{"segment": [[0, 0.3], [0.4, 0.3]]}], fracture={"strength": 1.0}))
+    assert "cracks      1, broken before the start" in lines
+
+
+def test_shapes_in_space() -> None:
+    """A polygon need not be convex; one that is bent has no plane."""
+    corners = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1], [1, 0.5, 1], [0, 2, 1]], float)
+    crack = polygon("it", corners)
+    points = np.array([[0.2, 0.5, 1], [1.0, 1.5, 1], [1.8, 0.5, 1], [2.1, 0.5, 1], [2.0, 1.0, 1]])
+    np.testing.assert_array_equal(crack.holds(points, 1e-9), [True, False, True, False, True])
+    assert crack.meets(np.zeros(3), np.full(3, 1.5)) and not crack.meets(np.zeros(3), np.full(3, 0.9))
+    corners[3, 2] = 1.5
+    with pytest.raises(InputError, match="do not span a plane"):
+        polygon("it", corners)
+    assert not plane("it", np.array([0.0, 3.0]), np.array([0.0, 1.0])).meets(np.zeros(2), np.ones(2))
+    assert segment("it", np.array([[-1.0, 0.5], [2.0, 0.6]])).meets(np.zeros(2), np.ones(2))
