@@ -325,9 +325,15 @@ class Balance:
             term.hold_back()
         return self.level.u
 
-    def go_on(self) -> bool:
-        """Whether terms were held back: they have gone on, and r = 0 is to be solved once more (collective)."""
-        return any([term.go_on() for term in self.terms])
+    def left(self) -> float:
+        """The share of their way that is left to terms that are held back: once they have gone on r = 0 is to be solved
+        once more; 0: none is."""
+        return max(term.left() for term in self.terms)
+
+    def go_on(self) -> None:
+        """Terms that are held back go on (collective)."""
+        for term in self.terms:
+            term.go_on()
 
     def potential(self) -> tuple[float, float]:
         """The incremental potential, whose derivative is r, at the current u, and the size of what it is the sum of,

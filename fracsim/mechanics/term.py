@@ -160,9 +160,12 @@ class Term:
     def hold_back(self) -> None:
         """Act for now only as far as the body at the step's start allows (collective)."""
 
-    def go_on(self) -> bool:
-        """Whether it was held back: it acts as far as the body where it is now allows (collective)."""
-        return False
+    def left(self) -> float:
+        """The share of its way that is left where it is held back, on all ranks alike; 0: it is not."""
+        return 0.0
+
+    def go_on(self) -> None:
+        """Where it is held back, act as far as the body where it is now allows (collective)."""
 
     def potential(self) -> float | None:
         """Energy whose derivative is its share of r at the current u, this rank's share, J (collective); None: there is

@@ -56,7 +56,7 @@ def plane(name: str, point: Values, normal: Values) -> Crack:
     """A crack over all of the body's section with a plane (2D: a line). InputError where the normal is zero."""
     if not (length := float(np.linalg.norm(normal))):
         raise InputError(f"{name}.plane: the normal must not be zero")
-    return Crack(name, point, normal / length)
+    return Crack(name, point, np.asarray(normal / length))
 
 
 def segment(name: str, corners: Values) -> Crack:

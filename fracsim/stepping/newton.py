@@ -43,7 +43,8 @@ FACTORISED = 100_000
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
-LEGS = 20  # solves of a step in which obstacles that are jammed come on
+LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
+ON_THE_WAY = 1e-2  # rtol of all but the last of them
 
 # A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
 # preconditioner is made anew anyhow, every dead cell goes.
@@ -83,7 +84,7 @@ class Solver:
                 self._descent = descent = Descent(balance, snes)
                 snes.setObjective(lambda _, x: descent(x))
                 snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
-        self._rtol = float(chosen["snes_rtol"])
+        self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
@@ -213,20 +214,26 @@ class Solver:
         if reason > 0 and self._single:  # Newton's method has evaluated them for its test
             self.balance.update_reactions()
         if held:
-            return SolveResult(False, newton, krylov + extended, f"Obstacles are jammed: not there after {LEGS} solves")
+            return SolveResult(False, newton, krylov + extended, f"Obstacles are jammed: not there in {LEGS} solves")
         return SolveResult(reason > 0, newton, krylov + extended, "" if reason > 0 else self._sentence())
 
     def _solve_in_legs(self) -> tuple[int, int, bool]:
         """Newton's method from x, once more each time that what was held back has gone on: all iterations, and whether
-        something is still held back."""
+        something is still held back: for good, as far as the last leg tells."""
         newton = krylov = 0
-        for _ in range(LEGS):
+        left = 1.0
+        for leg in range(LEGS):
+            before, left = left, self.balance.left()
+            if leg >= LEAST_LEGS and left > (LEGS - leg) * (before - left):
+                break
+            self._rtol = ON_THE_WAY if left else self._own_rtol
             if self._descent is not None:
                 self._descent.begin()
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
-            if self.snes.reason <= 0 or not self.balance.go_on():
+            if self.snes.reason <= 0 or not left:
                 return newton, krylov, False
+            self.balance.go_on()
         return newton, krylov, True
 
     # --- linear solves by themselves ---

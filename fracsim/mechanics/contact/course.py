@@ -53,9 +53,9 @@ class Course:
         self._gone = 0.0
 
     @property
-    def is_over(self) -> bool:
-        """Whether all have gone all of their way."""
-        return self._gone == 1
+    def left(self) -> float:
+        """The share of their way that is left; 0: all have gone all of it."""
+        return 1 - self._gone
 
     def whole(self) -> dict[int, Going]:
         """Where each whose way is known was as the step began, and its way (p,), by numbers."""

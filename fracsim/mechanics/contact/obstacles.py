@@ -137,13 +137,15 @@ class Obstacles(Touching, Term):
         self._course.back_to_start()
         self._go_on(self.skin.places(self._level.u))
 
-    def go_on(self) -> bool:
+    def left(self) -> float:
+        """The share of the obstacles' way that is left."""
+        return self._course.left
+
+    def go_on(self) -> None:
         """The rest of the way, or as far as the body where it is now lets them (collective)."""
-        if self._course.is_over:
-            return False
-        self.touching()
-        self._go_on(self.x)
-        return True
+        if self.left():
+            self.touching()
+            self._go_on(self.x)
 
     def _go_on(self, x: Values) -> None:
         self._course.go_on(x, self._course.known(self._facets), self.skin.safe)

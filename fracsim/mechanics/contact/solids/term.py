@@ -192,12 +192,14 @@ class Solids(SelfContact):
         self._put(0.0)
         self._advance(self._level.u)
 
-    def go_on(self) -> bool:
+    def left(self) -> float:
+        """The share of the solids' way that is left."""
+        return 1.0 - self._gone
+
+    def go_on(self) -> None:
         """The rest of the way, or as far as the body where it is now lets them (collective)."""
-        if self._gone == 1:
-            return False
-        self._advance(self._level.at_end(self._u.x.array[: self._owned]))
-        return True
+        if self.left():
+            self._advance(self._level.at_end(self._u.x.array[: self._owned]))
 
     def _advance(self, u: Values) -> None:
         """As far on their way as the body at the owned displacements u lets solids go (collective)."""
