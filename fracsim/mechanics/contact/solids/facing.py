@@ -157,6 +157,12 @@ class Facings:
             share = min(share, each.longest_step(*ways))
         return share
 
+    def look_along(self, x: Values, to: Values) -> None:
+        """Have candidates for all the way of the body from x to `to`."""
+        for each in self.each:
+            if not each.is_far(x):
+                each.look_along(each.with_solid(x), each.with_solid(to))
+
     def pressure(self, x: Values) -> Values:
         """(n,) the sum of the barriers' pressures on each point, Pa."""
         near = [each.pressure(each.with_solid(x))[: len(x)] for each in self.each if not each.is_far(x)]
