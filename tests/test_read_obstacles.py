@@ -20,6 +20,7 @@ from fracsim.mechanics.contact.solids.solid import Solid
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study
+from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene, make_study, march, positions
 from support.torn import RUNS
 
@@ -32,6 +33,10 @@ G = 10.0
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
                   [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+
+
+# its third step breaks a few edges, its fourth most around the axe
+TO_CRUMBS = {"time": {"scheme": "backward-euler", "step": 0.05, "end": 0.2}}
 
 
 def block(folder: Path, size: tuple[float, float, float] = (2.0, 2.0, 1.0), kind: str = "stl") -> dict[str, Any]:
@@ -196,7 +201,7 @@ def test_on_a_slope_it_sticks_or_slides_as_coulomb_says(mu: float, tmp_path: Pat
 
 def test_walls_that_come_to_light_are_outside(tmp_path: Path) -> None:
     """A body broken by an axe: no corner of its walls is in the axe, and none of its elements is cut, in any step."""
-    scene, state = make_scene(**RUNS["hewn"])
+    scene, state = make_scene(**RUNS["hewn"] | TO_CRUMBS)
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     broken, drawn_in = 0, 0
     for report in each_step(scene, state):
@@ -207,6 +212,27 @@ def test_walls_that_come_to_light_are_outside(tmp_path: Path) -> None:
         assert not is_inside(x[used], facing.solid.here[facing.solid.triangles]).any()
         drawn_in += int((term._surface.at.share < 1).sum())
     assert broken > 5 and drawn_in > 0
+
+
+@pytest.mark.slow
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """Stopped after edges broke, and resumed: the same cracks, energies and forces, walls drawn in as they were."""
+    time = {"scheme": "backward-euler", "step": 0.05, "end": 1.0}
+    tables = RUNS["hewn"] | {"time": time, "solver": FINE, "output": {"picture": False, "interval": 9.0}}
+    going, stopped, again = going_stopped_resumed(tables, tmp_path, 3, 1)
+    assert stopped.breaks.figures[0] > 5
+    assert_alike(again, going, 1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("itself", "time"), ((True, {}), ("pieces", TO_CRUMBS)))
+def test_beside_contact_of_the_body_with_itself(itself: bool | str, time: dict[str, Any]) -> None:
+    """Both hold in the same steps: nothing of the body cuts the axe, nor, where it feels itself, itself."""
+    scene, state = make_scene(**RUNS["hewn"] | time | {"contact": {"itself": itself}})
+    terms = {each.name: each for each in scene.balance.terms}
+    for _ in each_step(scene, state):
+        for name in ("solids", "contact"):
+            assert len(terms[name]._surface.pairs.overlaps(terms[name]._places())) == 0
 
 
 # --- what is written, and refused -----------------------------------------------------------------------------------
@@ -222,7 +248,10 @@ def test_it_is_drawn_and_told(tmp_path: Path) -> None:
     said = "\n".join(check_study(study))
     assert "block (driven mesh)" in said and "block: 12 triangles, 2 x 2 x 1 m, 4 m^3" in said
     scene = build_scene(MPI.COMM_SELF, study)
-    Run(scene, tmp_path / "out")()
+    run = Run(scene, tmp_path / "out")
+    run()
+    (note,) = run.meetings.notes(done=True)
+    assert note.startswith("the obstacle block never met the body: it came no nearer than 0.0")
     points = meshio.read(sorted(tmp_path.glob("out/surface/obstacle_block_*.vtu"))[-1]).points
     np.testing.assert_allclose(points[:, 2].min(), 1.6 - 0.5 - 0.05, atol=1e-6)
     head = (tmp_path / "out" / "history.csv").read_text().splitlines()[0]

@@ -191,6 +191,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         for i, each in enumerate(study.obstacle):
             if each.file is not None:
                 yield f"            {each.name}: {_solid(each.file, each.scale or 1.0, f'obstacle.{i}')}"
+        if any(each.free for each in study.obstacle) and any(each.shape == "mesh" for each in study.obstacle):
+            yield "            note: obstacles that move freely do not feel those from files"
     if study.contact is not None and study.contact.itself:
         of = "of pieces alone with one another" if study.contact.itself == "pieces" else "of the body with itself"
         yield f"contact     {of}, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
