@@ -90,13 +90,13 @@ class Facets:
         """Facets (k,) within `reach` m of an obstacle, of all or of points (n,), as far as their sizes tell;
         distances (k,) and normals (k, d) at their middles, and those (k, c) of their corners less `kept` were it flat:
         the distance to what is convex is more."""
-        near: Ints = np.empty(0, np.int64)
-        within: Values = np.empty(0)
-        if placed.beyond(x) < reach.max(initial=0.0) + self.kept:
-            wide = np.broadcast_to(reach, len(x))
-            within = np.max([wide[column] for column in self.corners.T], axis=0) + self.kept
-            near = np.flatnonzero(placed.distance(x)[self.corners[:, 0]] < within + self._longest(x))
-            within = within[near]
+        (_, c), d = self.corners.shape, x.shape[1]
+        if placed.beyond(x) >= reach.max(initial=0.0) + self.kept:
+            return np.empty(0, np.int64), np.empty(0), np.empty((0, c)), np.empty((0, d))
+        wide = np.broadcast_to(reach, len(x))
+        within = np.max([wide[column] for column in self.corners.T], axis=0) + self.kept
+        near = np.flatnonzero(placed.distance(x)[self.corners[:, 0]] < within + self._longest(x))
+        within = within[near]
         corners = x[self.corners[near]]
         middle = corners.mean(axis=1)
         around, distance = np.linalg.norm(corners - middle[:, None], axis=2), placed.distance(middle)

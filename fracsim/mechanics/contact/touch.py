@@ -127,6 +127,12 @@ def touch(
     return Touch(points, energy, -(share * slope)[:, None] * along, rubbed, potential + rubbing, parts)
 
 
+def nothing(d: int) -> Touch:
+    """What an obstacle does that is far away."""
+    none = np.empty((0, d))
+    return Touch(np.empty(0, np.int64), 0.0, none, none, 0.0, lambda: (np.empty((0, d, d)),) * 2)
+
+
 def positive(blocks: Values) -> Values:
     """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with."""
     values, vectors = np.linalg.eigh(np.nan_to_num(blocks, posinf=0.0, neginf=0.0))

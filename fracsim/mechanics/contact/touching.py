@@ -22,7 +22,7 @@ from .obstacle import Obstacle
 from .placed import Placed, least_distance
 from .reach import check_apart, refuse_overlap
 from .skin import Cuts, Skin
-from .touch import Grip, Touch, grip, touch
+from .touch import Grip, Touch, grip, nothing, touch
 
 Values = npt.NDArray[np.float64]
 
@@ -162,6 +162,8 @@ class Touching:
 
     def _feel(self, number: int, placed: Placed) -> Touch:
         """What an obstacle at `placed` does to the points where they are now."""
+        if self._is_far(number, placed):
+            return nothing(self._domain.dim)
         obstacle, held = self.obstacles[number], self._grips[number]
         rub = Friction(obstacle.friction, self.law.creep * self._dt) if held is not None else None
         under, start = self._under(number, placed), self._begun[number]
@@ -173,6 +175,15 @@ class Touching:
         then = None if start is None else (self._course.at_start[number], self._began)
         inner, stored = between(self.skin.facets, placed, self.x, self.law.barrier, then)
         return joined(found, inner, stored)
+
+    def _is_far(self, number: int, placed: Placed) -> bool:
+        """Whether an obstacle at `placed` is too far from all points to be felt, and was so as the step began."""
+        held, start, width = self._grips[number], self._begun[number], self.law.barrier.width
+        if (held is not None and len(held.points)) or (start is not None and len(start.known)):
+            return False
+        if placed.beyond(self.x) < width:
+            return False
+        return start is None or number not in self._sharp or self._course.at_start[number].beyond(self._began) >= width
 
     def _under(self, number: int, placed: Placed) -> Values:
         """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
