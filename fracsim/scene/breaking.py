@@ -20,7 +20,7 @@ Values = npt.NDArray[np.float64]
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
     from ..fracture.brittle.rules import SurfaceRules
-    from ..fracture.criterion import Criterion
+    from ..fracture.criterion import Average, Criterion
     from ..fracture.strength import Strength
     from ..mesh.edges import EdgeGraph
 
@@ -68,8 +68,12 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
 
     assert study.fracture is not None
     strength = _strength(study, stress.domain, graph)
-    average = None
-    if study.fracture.radius:
+    average: Average | None = None
+    if study.fracture.kernel == "neighbours":
+        from ..fracture.neighbour_average import NeighbourAverage
+
+        average = NeighbourAverage(stress.domain)
+    elif study.fracture.radius:
         from ..fracture.nonlocal_average import NonlocalAverage
 
         average = NonlocalAverage(stress.domain, study.fracture.radius, study.fracture.kernel)

@@ -36,7 +36,8 @@ class Fracture(Table):
     strength: Strength
     approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
-    kernel: Literal["linear", "constant", "gaussian"] = "linear"
+    # neighbours: no radius, one average over the cells that share a node
+    kernel: Literal["linear", "constant", "gaussian", "neighbours"] = "linear"
     tie_break: Annotated[Finite, Field(ge=0, lt=0.1)] = 1e-6  # relative perturbation of the strength of each edge
     unilateral: Flag = False  # a broken edge shorter than at rest carries pressure: cracks close
     # most times that a step is solved and broken; default: 1, in quasi-static studies until nothing changes
@@ -44,6 +45,15 @@ class Fracture(Table):
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None
+
+    @model_validator(mode="after")
+    def _neighbours_have_no_radius(self) -> Fracture:
+        if self.kernel == "neighbours" and self.radius:
+            raise ValueError(
+                f'kernel = "neighbours" averages over the cells that share a node, whatever their size, and radius = '
+                f"{self.radius:g} m does not matter to it: remove radius, or choose another kernel"
+            )
+        return self
 
 
 class CrackPlane(Table):

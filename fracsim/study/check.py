@@ -254,6 +254,7 @@ def _fracture(study: Study) -> str:
         return "off: no damage field, no graph, no average"
     fracture = study.fracture
     average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
+    average = "average over neighbouring cells" if fracture.kernel == "neighbours" else average
     approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
     closing = ", cracks close" if fracture.unilateral else ""
     return f"{approach}, strength {fracture.strength:g} Pa, {average}{closing}"
