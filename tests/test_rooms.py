@@ -15,7 +15,7 @@ import fracsim
 import fracsim.forms
 
 ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
-LAYERS = ("mesh", "mechanics", "fracture", "stepping", "output")  # each may use those before it
+LAYERS = ("mesh", "mechanics", "fracture", "stepping", "rigid", "output")  # each may use those before it
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}

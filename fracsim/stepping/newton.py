@@ -15,6 +15,7 @@ from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
+from .rigid_modes import rigid_modes
 from .stepper import SolveResult
 
 if TYPE_CHECKING:
@@ -366,8 +367,5 @@ def _may_change(balance: Balance, given: Options) -> bool:
 
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
-    """Translations and linearised rotations about the centre, orthonormal: 3 in 2D, 6 in 3D."""
-    d = domain.dim
-    X = domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2
-    coordinates = PETSc.Vec().createWithArray(X.reshape(-1), bsize=d, comm=domain.comm)
-    return PETSc.NullSpace().createRigidBody(coordinates)
+    """The rigid motions of the whole body, about its centre (stepping.rigid_modes)."""
+    return rigid_modes(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)

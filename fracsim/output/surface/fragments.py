@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from ...mesh.split.moments import cones
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -69,11 +71,7 @@ def volumes(points: Values, elements: Ints, piece: Ints, count: int) -> Values:
     V = 1/6 sum x_0 . (x_1 x x_2) over triangles; 2D: A = 1/2 sum x_0 x x_1 over segments.
     """
     x = (points - points.mean(axis=0))[elements]  # near the origin: less cancels
-    if points.shape[1] == 2:
-        each = (x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2
-    else:
-        each = np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2])) / 6
-    return sums(piece, each, count)
+    return sums(piece, cones(x), count)
 
 
 def sums(group: Ints, values: Values, count: int) -> Values:

@@ -1,0 +1,6 @@
+"""Stiff bodies that move rigidly, are strained by blows and break (METHOD section 10; Bao et al. 2007).
+
+relief       what a load accelerates a free body with is taken off it
+free_body    the quasi-static analysis of one body, or of one piece of a broken one
+pinned       B07's three pinned points, to compare with
+"""

@@ -1,0 +1,141 @@
+"""The quasi-static analysis of one free body under the loads of a moment (METHOD section 10).
+
+    K u = f - M a,   u orthogonal to the rigid modes
+
+in the configuration at rest, with the body's stress as it is assembled for deformable studies. A body is a set of
+cells of the mesh with the share of each that is its own: a cell that a crack runs through belongs to the pieces on both
+sides, to each with its share of stiffness and mass. What a piece solves with beyond its own nodes (B07's virtual nodes)
+are the other nodes of these cells, in a system of its own, so that no piece feels another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from petsc4py import PETSc
+
+from ..errors import NotConverged
+from ..forms.energies import cauchy_stress
+from ..forms.kinematics import deformation_gradient, symmetric_components
+from ..mechanics.kernels import CellExpression, CellForm, cells_measure
+from ..mechanics.stress import Stress
+from ..mechanics.tangent import Assembly
+from ..stepping.petsc_options import Options, OptionSet
+from ..stepping.preconditioner import MULTIGRID
+from ..stepping.rigid_modes import rigid_modes
+from .relief import Relief
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+DEFAULTS: Options = {
+    "ksp_type": "cg",
+    "ksp_rtol": 1e-8,
+    "ksp_max_it": 2000,
+    **MULTIGRID,
+    "pc_gamg_threshold": 0.0,  # no aggregates across cells of other pieces, which carry nothing
+    "mg_coarse_pc_type": "svd",  # the coarsest matrix has the rigid modes too: it is singular
+}
+
+
+class Stiffness:
+    """K of the cells of one mesh, for one body after the other (one rank).
+
+    Attributes:
+        stress: linear, with a field chi of its own: the share of each cell.    density: (cells,) kg/m^3.
+    """
+
+    def __init__(self, stress: Stress, density: Values) -> None:
+        domain = stress.domain
+        self.stress, self.density, self._space = stress, density, domain.space
+        v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
+        self._form = CellForm(stress.tangent(v, w, cells_measure(domain)))
+        sigma = cauchy_stress(stress.energy, deformation_gradient(stress.u))
+        self._tensor = CellExpression(domain.comm, domain.mesh, symmetric_components(sigma), domain.cell_count)
+
+    def tensor(self, u: Values, share: Values) -> Values:
+        """(cells, 3 or 6) stress of displacements u (nodes, d) in the cells with a share, 0 in all others, Pa."""
+        result = np.zeros((len(share), self._tensor.width))
+        if largest := float(np.abs(u).max()):
+            # F - 1 of a stiff body has few digits left: stress is linear in u, so take that of a large one
+            larger = self.stress.domain.size / largest
+            self.stress.u.x.array[:] = larger * u.reshape(-1)
+            cells = np.flatnonzero(share).astype(np.int32)
+            result[cells] = self._tensor(cells) / larger
+        return result
+
+    def matrix(self, share: Values, nodes: Ints) -> PETSc.Mat:
+        """Over the dofs of some nodes (n,): those of all cells with a share (cells,) above 0."""
+        assert self.stress.chi is not None
+        self.stress.chi.x.array[:] = share
+        self._form.leave_out(share == 0)
+        whole = Assembly(self._form)
+        whole([])
+        d = self.stress.domain.dim
+        rows = PETSc.IS().createBlock(d, nodes.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+        own = whole.matrix.createSubMatrix(rows, rows)
+        own.setBlockSize(d)
+        own.setOption(PETSc.Mat.Option.SPD, True)  # but for the modes, which CG never meets
+        rows.destroy()
+        whole.destroy()
+        return own
+
+
+class FreeBody:
+    """A body that nothing holds.
+
+    Attributes:
+        share: (cells,) of each cell of the mesh, 0 to 1.    nodes: (n,) of the mesh, those of its cells.
+        relief: takes the rigid acceleration off a load.    matrix: K.    iterations: of CG in the last solve.
+    """
+
+    def __init__(self, stiffness: Stiffness, share: Values, given: Options | None = None) -> None:
+        """`given`: PETSc options over DEFAULTS."""
+        domain = stiffness.stress.domain
+        assert domain.comm.size == 1
+        alive = np.flatnonzero(share)
+        corners = domain.cell_nodes[alive]
+        self.share, self.nodes = share, np.unique(corners).astype(np.int64)
+        self._shape, self.iterations = (len(domain.nodes), domain.dim), 0
+        self.matrix = stiffness.matrix(share, self.nodes)
+        places = domain.nodes[self.nodes]
+        self._null = rigid_modes(domain.comm, places - places.mean(axis=0))
+        modes = np.stack([mode.array_r.copy() for mode in self._null.getVecs()], axis=1)
+        each = (share * stiffness.density * domain.volumes)[alive] / corners.shape[1]
+        mass = np.bincount(corners.ravel(), np.repeat(each, corners.shape[1]), minlength=len(domain.nodes))
+        self.relief = Relief(mass[self.nodes].astype(float), modes)
+        self._solver(DEFAULTS | (given or {}))
+
+    def _solver(self, options: Options) -> None:
+        self.matrix.setNullSpace(self._null)
+        self.matrix.setNearNullSpace(self._null)
+        self._options = OptionSet(options)
+        ksp = self._ksp = PETSc.KSP().create(self.matrix.comm)
+        ksp.setOptionsPrefix(self._options.prefix)
+        ksp.setOperators(self.matrix)
+        ksp.setFromOptions()
+        self._u, self._f = self.matrix.createVecs()
+
+    def __call__(self, force: Values) -> Values:
+        """(nodes of the mesh, d) displacement under nodal forces (nodes of the mesh, d), N; 0 elsewhere, m.
+
+        Raises NotConverged.
+        """
+        self._f.array_w[:] = self.relief(force[self.nodes]).reshape(-1)
+        self._ksp.solve(self._f, self._u)
+        self.iterations = self._ksp.its
+        if self._ksp.reason < 0:
+            raise NotConverged(
+                f"the analysis of a struck body ({len(self.nodes)} nodes) failed after {self._ksp.its} iterations; "
+                "give solver.ksp_max_it more, or a better mesh"
+            )
+        u = np.zeros(self._shape)
+        u[self.nodes] = self._u.array_r.reshape(-1, self._shape[1])
+        return u
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+        self._options.remove()
+        for kept in (self._ksp, self._u, self._f, self.matrix, self._null):
+            kept.destroy()
