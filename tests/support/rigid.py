@@ -7,11 +7,20 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from fracsim.fracture.brittle.rules import SurfaceRules
+from fracsim.fracture.brittle.surfaces import BrittleSurfaces
+from fracsim.fracture.neighbour_average import NeighbourAverage
+from fracsim.fracture.strength import Strength
 from fracsim.mechanics.material import material_fields
 from fracsim.mechanics.stress import Stress, Weakening
 from fracsim.mechanics.vectors import Assembler
 from fracsim.mesh.domain import Domain, distribute
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.split.build import split
+from fracsim.mesh.split.moments import Moments, moments
+from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
+from fracsim.rigid.breakable import Breakable, Within
 from fracsim.rigid.free_body import FreeBody, Stiffness
 
 Values = npt.NDArray[np.float64]
@@ -39,3 +48,28 @@ def section_mean(domain: Domain, values: Values, axis: int, low: float, high: fl
     height = domain.nodes[domain.cell_nodes].mean(axis=1)[:, axis]
     inside = (height > low) & (height < high)
     return float(np.average(values[inside], weights=domain.volumes[inside]))
+
+
+def breakable(mesh: MeshData, strength: float, rules: SurfaceRules, poisson: float = 0.2) -> Breakable:
+    """A mesh that breaks along surfaces where its stress, averaged over neighbours, reaches a strength in Pa."""
+    stiffness = stiffness_of(mesh, poisson=poisson)
+    domain = stiffness.stress.domain
+    graph, within = EdgeGraph(domain), Within(NeighbourAverage(domain), domain.cell_count)
+    criterion = BrittleSurfaces(stiffness.stress, graph, Strength(graph, strength, tie_break=1e-6), within, rules)
+    return Breakable(stiffness, graph, criterion, within)
+
+
+def density_of(bodies: Moments) -> Values:
+    """(n,) the same everywhere."""
+    return np.full(len(bodies.volume), DENSITY)
+
+
+def moments_of(body: Breakable) -> Moments:
+    """Of the pieces, from the split surface of the mesh at rest."""
+    domain = body.graph.domain
+    assert domain.source is not None
+    skeleton = Skeleton(domain.source)
+    pattern = np.empty(domain.cell_count, np.uint8)
+    pattern[domain.cell_input] = body.graph.pattern
+    made = split(skeleton, pattern)
+    return moments(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)

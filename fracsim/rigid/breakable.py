@@ -1,0 +1,143 @@
+"""What breaks of rigid bodies: the cells, edges and pieces of the one mesh that all bodies of a study are in.
+
+A blow on a piece is analysed, surfaces open where the averaged principal stress reaches the strength, and the pieces
+that come of it are analysed in turn under what of the blow falls on them, until nothing breaks.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..fracture.criterion import Average, Criterion
+from ..mesh.edges import EdgeGraph
+from ..mesh.pieces import Pieces, find_pieces
+from ..stepping.petsc_options import Options
+from .free_body import FreeBody, Stiffness
+from .point_loads import PointLoads, point_loads
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+# Share of its stiffness that a cell keeps whose parts are of one piece still: a crack that ends in the body is open,
+# and the nodes between its sides stay in place.
+CRACKED = 1e-3
+
+
+class Within:
+    """An average over the cells of one piece: `cells` (cells,) flags say of which. It wraps another, or none."""
+
+    def __init__(self, average: Average | None, count: int) -> None:
+        self._average = average
+        self.cells: Flags = np.ones(count, bool)
+
+    def __call__(self, values: Values, active: Flags | None = None) -> Values:
+        """Averages (cells, n) of cell values (cells, n) over active cells of the piece; 0 outside of it."""
+        values = np.where(self.cells[:, None], values, 0.0)
+        return values if self._average is None else self._average(values, self._both(active))
+
+    def reaching(
+        self, values: Values, size: Values, bound: float, active: Flags | None = None
+    ) -> tuple[npt.NDArray[np.int64], Values]:
+        """Cells (m,) of the piece whose average may reach a bound, and those averages (m, n)."""
+        if self._average is None:
+            cells = np.flatnonzero((size >= bound) & self.cells)
+            return cells, values[cells]
+        cells, found = self._average.reaching(values, size, bound, self._both(active))
+        mine = self.cells[cells]
+        return cells[mine], found[mine]
+
+    def _both(self, active: Flags | None) -> Flags:
+        return self.cells if active is None else self.cells & active
+
+
+class Breakable:
+    """Bodies in one mesh, on one rank.
+
+    Attributes:
+        graph: their edges.    pieces: what holds together.    passes: analyses made so far.
+    """
+
+    def __init__(
+        self,
+        stiffness: Stiffness,
+        graph: EdgeGraph,
+        criterion: Criterion | None,
+        within: Within,
+        options: Options | None = None,
+    ) -> None:
+        """`criterion`: which edges fail, averaging by `within`; None: nothing does.    `options`: PETSc's."""
+        self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
+        self._domain, self.graph, self.passes = stiffness.stress.domain, graph, 0
+        self._kept: dict[int, FreeBody] = {}  # by the lowest node of the piece
+        self.pieces: Pieces = find_pieces(graph)
+
+    def loads(self, piece: int, points: Values, force: Values) -> PointLoads:
+        """Forces (k, d) at points (k, d) of a piece at rest."""
+        cells = self._domain.cell_nodes[self.shares(piece) > 0].astype(np.int64)
+        return point_loads(self._domain.nodes, cells, points, force)
+
+    def shares(self, piece: int) -> Values:
+        """(cells,) what of each cell belongs to a piece: as many parts as it has nodes of it; of a cell in which a
+        crack ends, hardly anything."""
+        share = (self.pieces.of_node == piece)[self._domain.cell_nodes].mean(axis=1)
+        share[self.graph.split & (share == 1)] = CRACKED
+        return share
+
+    def stress(self, piece: int, loads: PointLoads) -> Values:
+        """(cells, 3 or 6) stress of a piece under loads that fall on it, 0 in all other cells, Pa. Raises
+        NotConverged."""
+        key = int(np.flatnonzero(self.pieces.of_node == piece)[0])
+        if key not in self._kept:
+            self._kept[key] = FreeBody(self._stiffness, self.shares(piece), self._options)
+        body = self._kept[key]
+        self.passes += 1
+        return self._stiffness.tensor(body(loads.nodal(len(self._domain.nodes))), body.share)
+
+    def strike(self, piece: int, loads: PointLoads) -> int:
+        """Break a piece, and what it breaks into, until nothing more does; returns how many edges broke."""
+        if self._criterion is None:
+            return 0
+        broken, waiting = 0, [int(np.flatnonzero(self.pieces.of_node == piece)[0])]
+        while waiting:
+            node = waiting.pop()
+            piece = int(self.pieces.of_node[node])
+            mine = self.pieces.of_node == piece
+            on = loads.of(mine[loads.owner])
+            if not len(on.force) or not self._may_break(mine):
+                continue
+            count = self._pass(piece, mine, on)
+            broken += count
+            if count:
+                self._forget(node)
+                self.pieces = find_pieces(self.graph)
+                waiting += self._lowest(mine)
+        return broken
+
+    def _may_break(self, mine: Flags) -> bool:
+        """Whether a piece with these nodes (nodes,) has a whole cell left."""
+        return bool(mine[self._domain.cell_nodes[~self.graph.split]].all(axis=1).any())
+
+    def _pass(self, piece: int, mine: Flags, loads: PointLoads) -> int:
+        """One analysis of a piece, and the edges that break in it."""
+        assert self._criterion is not None
+        stress = self.stress(piece, loads)
+        self._within.cells = np.asarray(mine[self._domain.cell_nodes].all(axis=1))
+        edges, _ = self._criterion(stress)
+        flags = np.zeros(len(self.graph.broken), bool)
+        flags[edges] = True
+        ends = self.graph.edge_nodes.T
+        # the boundary of a grain may go on in other bodies
+        count = self.graph.break_edges(flags & mine[ends[0]] & mine[ends[1]])
+        return count + self.graph.break_idle() if count else 0
+
+    def _lowest(self, mine: Flags) -> list[int]:
+        """The lowest node of each piece that these nodes (nodes,) are in, the last first."""
+        nodes = np.flatnonzero(mine)
+        _, first = np.unique(self.pieces.of_node[nodes], return_index=True)
+        return [int(each) for each in nodes[first][::-1]]
+
+    def _forget(self, node: int) -> None:
+        if (body := self._kept.pop(node, None)) is not None:
+            body.destroy()
