@@ -1,9 +1,23 @@
 """Stiff bodies that move rigidly, are strained by blows and break (METHOD section 10; Bao et al. 2007).
 
+Strain and fracture, of the one mesh that all bodies of a study are in:
+
 relief       what a load accelerates a free body with is taken off it
 free_body    the quasi-static analysis of one body, or of one piece of a broken one
 pinned       B07's three pinned points, to compare with
 point_loads  forces at points of a surface, handed to the nodes of the cells behind
-breakable    the one mesh of all bodies: a struck piece breaks, and its pieces in turn
+breakable    a struck piece breaks, and its pieces in turn
+
+Motion:
+
 bodies       mass, place and motion of pieces, and of what they break into
+geometry     what pieces weigh and which shapes they have, from the split surface
+hulls        unions of convex parts
+primitives   shapes of obstacles
+engine       MuJoCo: contacts and friction; alone imports it
+tumbling     how bodies turn, by their angular momentum
+touches      what touched in a step
+blows        which contacts are blows, and which are loads
+hertz        how long a blow lasts
+stepper      a step: motion, blows, analyses, pieces
 """

@@ -9,9 +9,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..fracture.criterion import Average, Criterion
+from ..fracture.brittle.surfaces import BrittleSurfaces
+from ..fracture.criterion import Average
 from ..mesh.edges import EdgeGraph
 from ..mesh.pieces import Pieces, find_pieces
+from ..mesh.topology import MeshTopology
 from ..stepping.petsc_options import Options
 from .free_body import FreeBody, Stiffness
 from .point_loads import PointLoads, point_loads
@@ -63,15 +65,42 @@ class Breakable:
         self,
         stiffness: Stiffness,
         graph: EdgeGraph,
-        criterion: Criterion | None,
+        criterion: BrittleSurfaces | None,
         within: Within,
         options: Options | None = None,
     ) -> None:
-        """`criterion`: which edges fail, averaging by `within`; None: nothing does.    `options`: PETSc's."""
+        """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's."""
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
         self._domain, self.graph, self.passes = stiffness.stress.domain, graph, 0
         self._kept: dict[int, FreeBody] = {}  # by the lowest node of the piece
+        self._node = np.argsort(self._domain.node_input)  # of each node of the input mesh
         self.pieces: Pieces = find_pieces(graph)
+
+    def damage(self) -> tuple[npt.NDArray[np.uint8], Values]:
+        """Patterns (C,) of the cells and, of each edge (E,), where it is cut, in the order of the input mesh."""
+        domain, source = self._domain, self._domain.source
+        assert source is not None
+        pattern = np.empty(domain.cell_count, np.uint8)
+        pattern[domain.cell_input] = self.graph.pattern
+        edges = np.arange(len(self.graph.broken))
+        cut = np.full(len(edges), np.nan)
+        if self._criterion is not None:
+            cut[MeshTopology(source).find_edges(self.graph.edge_keys(edges))] = self._criterion.cut
+        return pattern, cut
+
+    def piece_of(self, name: int) -> int:
+        """The piece that a node of the input mesh is in."""
+        return int(self.pieces.of_node[self._node[name]])
+
+    def may_break(self, piece: int, force: float) -> bool:
+        """Whether forces of this sum (N) could break a piece: no beam of its length, an edge thick, has a higher
+        stress."""
+        if self._criterion is None:
+            return False
+        X = self._domain.nodes[self.pieces.of_node == piece]
+        length = float(np.linalg.norm(np.ptp(X, axis=0)))
+        h = self._domain.mean_edge
+        return 2 * force * max(length, h) / h**3 >= self._criterion.strength.weakest
 
     def loads(self, piece: int, points: Values, force: Values) -> PointLoads:
         """Forces (k, d) at points (k, d) of a piece at rest."""

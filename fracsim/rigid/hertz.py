@@ -1,0 +1,28 @@
+"""How long a blow lasts: Hertz's time of two elastic spheres (K. L. Johnson, Contact Mechanics, 1985, eq. 11.24).
+
+    tau = 2.87 (m^2 / (R E*^2 v))^(1/5),   1/m = 1/m_1 + 1/m_2,   1/R = 1/R_1 + 1/R_2,   E* = E / (1 - nu^2) / 2
+
+of two bodies of one stuff, that meet at a speed v; E* is twice that where one of them does not give way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Hertz:
+    """Of bodies with Young's modulus `young` (Pa) and Poisson's ratio `poisson`."""
+
+    young: float
+    poisson: float
+
+    def __call__(self, mass: float, radius: float, speed: float, *, both_give: bool) -> float:
+        """s, of a reduced mass in kg, a reduced radius in m and a speed in m/s."""
+        stiff = self.young / (1 - self.poisson**2) / (2 if both_give else 1)
+        return float(2.87 * (mass**2 / (radius * stiff**2 * speed)) ** 0.2)
+
+
+def reduced(first: float, second: float) -> float:
+    """1 / (1 / a + 1 / b), either of which may be infinite."""
+    return 1.0 / (1.0 / first + 1.0 / second)

@@ -1,0 +1,205 @@
+"""A step of rigid bodies: they move, what was struck is analysed, what breaks goes on as pieces."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mechanics.contact.obstacle import Obstacle
+from .blows import Blows, Strain
+from .bodies import Bodies
+from .breakable import Breakable
+from .engine import Engine, Part, Rules, Stand
+from .geometry import Geometry, Shapes
+from .hertz import Hertz, reduced
+from .primitives import primitive
+from .touches import Touches
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RigidState:
+    """Bodies at time t (s); `step` of the run, and what gravity and drivers have done since its start, J."""
+
+    t: float
+    step: int
+    bodies: Bodies
+    work: float = 0.0
+
+
+@dataclass(frozen=True)
+class RigidReport:
+    """What a step did.
+
+    Attributes:
+        broken: edges that broke.    blows, loads: analyses that were due.    kinetic: J, of the bodies.
+        pushed: (obstacles, 3) mean force of the bodies on each, N.    worked: (obstacles,) what each did on them, J.
+        seconds: it took.
+    """
+
+    broken: int
+    blows: int
+    loads: int
+    kinetic: float
+    pushed: Values
+    worked: Values
+    seconds: float
+
+
+@dataclass
+class Phases:
+    """Seconds in each part of the steps so far."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("motion", "analysis", "pieces"), 0.0))
+
+    def add(self, phase: str, began: float) -> float:
+        """To a phase, since a time; returns the time now."""
+        now = time.perf_counter()
+        self.seconds[phase] += now - began
+        return now
+
+
+class RigidStepper:
+    """Bodies of one mesh, on one rank; the bodies of a state are the pieces of its mesh as it is broken now.
+
+    Attributes:
+        shapes: of the pieces.    breakable: the mesh.    phases: seconds so far.
+    """
+
+    shapes: Shapes
+
+    def __init__(
+        self,
+        breakable: Breakable,
+        geometry: Geometry,
+        density: float,
+        obstacles: Sequence[Obstacle],
+        rules: Rules,
+        hertz: Hertz,
+        contact_time: float | None = None,
+    ) -> None:
+        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's."""
+        self.breakable, self._geometry, self._density = breakable, geometry, density
+        self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
+        self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
+        self._driven = any(each.moved is not None for each in obstacles)
+        self.blows = Blows(rules.step, float(np.linalg.norm(rules.gravity)), self._time)
+        self.phases, self.siblings = Phases(), set[tuple[int, int]]()  # by names
+        self._engine: Engine | None = None
+        self.look_again()
+
+    def look_again(self) -> None:
+        """The mesh has broken: shapes are those of its pieces."""
+        self.shapes, self._engine = self._geometry.shapes(*self.breakable.damage()), None
+
+    def start(self) -> RigidState:
+        """The bodies where the mesh has them, at rest."""
+        return RigidState(0.0, 0, Bodies.at_rest(self._densities(), self.shapes.moments))
+
+    def _densities(self) -> Values:
+        return np.full(len(self.shapes.names), self._density)
+
+    # --- a step ---
+
+    def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
+        """The state a step later. Raises NotConverged where an analysis fails."""
+        began = clock = time.perf_counter()
+        rules, engine = self._rules, self._engine or self._made(state)
+        ways = np.array([self._way(each, state.t + rules.step) for each in self._obstacles]) if self._driven else None
+        moved, touches = engine.advance(state.bodies, ways)
+        self.siblings = {(int(self.shapes.names[a]), int(self.shapes.names[b])) for a, b in engine.siblings}
+        pushed, worked = self._given_by(touches, state.t)
+        gained = float(moved.mass @ ((moved.place - state.bodies.place) @ rules.gravity))
+        due = self.blows.look(touches, state.bodies, self.shapes.names)
+        clock = self.phases.add("motion", clock)
+        names = self.shapes.names
+        struck = [(int(names[each.body]), self._strike(int(names[each.body]), each)) for each in due]
+        clock = self.phases.add("analysis", clock)
+        broken = sum(count for _, count in struck)
+        if broken:
+            moved = self._divided(moved, {name for name, count in struck if count})
+            self.phases.add("pieces", clock)
+        work = state.work + gained + float(worked.sum())
+        after = RigidState(state.t + rules.step, state.step + 1, moved, work)
+        blows = sum(each.speed > 0 for each in due)
+        seconds = time.perf_counter() - began
+        return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, seconds)
+
+    def _made(self, state: RigidState) -> Engine:
+        """The engine for the bodies as they are now."""
+        at = [self._way(each, state.t) for each in self._obstacles]
+        stands = [Stand(shape, where, each.friction, each.moved is not None)
+                  for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
+        number = {int(name): place for place, name in enumerate(self.shapes.names)}
+        siblings = {(number[a], number[b]) for a, b in self.siblings}
+        parts: list[list[Part]] = [[*each] for each in self.shapes.parts]
+        self._engine = Engine(state.bodies, parts, stands, self._rules, siblings)
+        return self._engine
+
+    def _way(self, obstacle: Obstacle, t: float) -> Values:
+        return np.asarray(obstacle.at + obstacle.displacement(t), float)
+
+    def _given_by(self, touches: Touches, t: float) -> tuple[Values, Values]:
+        """Mean force of the bodies on each obstacle (m, 3) in N, and what each did on the bodies (m,) in J."""
+        count, dt = len(self.shapes.names), self._rules.step
+        pushed = np.zeros((len(self._obstacles), 3))
+        for things, sign in ((touches.first, -1.0), (touches.second, 1.0)):
+            mine = things >= count
+            np.add.at(pushed, things[mine] - count, sign * touches.impulse[mine] / dt)
+        moved = [self._way(each, t + dt) - self._way(each, t) for each in self._obstacles]
+        return pushed, -np.einsum("mi,mi->m", pushed, np.array(moved).reshape(-1, 3))
+
+    def _strike(self, name: int, strain: Strain) -> int:
+        piece = self.breakable.piece_of(name)
+        if not self.breakable.may_break(piece, float(np.linalg.norm(strain.force, axis=1).sum())):
+            return 0
+        return self.breakable.strike(piece, self.breakable.loads(piece, strain.points, strain.force))
+
+    def _divided(self, bodies: Bodies, names: set[int]) -> Bodies:
+        """The pieces that bodies of these names broke into, among those that did not."""
+        before = self.shapes
+        self.look_again()
+        after = self.shapes
+        parent = np.searchsorted(before.names, before.names[before.piece_of_node[after.names]])
+        parts = bodies.divided(self._densities(), after.moments, parent)
+        self.blows.forget(names)
+        whole = ~np.isin(before.names[parent], list(names))  # not even by round-off are these other bodies now
+        kept = {key: np.array(values) for key, values in vars(parts).items()}
+        for key, values in kept.items():
+            values[whole] = getattr(bodies, key)[parent[whole]]
+        self.siblings = self._family(before.names[parent], after.names)
+        return replace(parts, **kept)
+
+    def _family(self, parents: Ints, names: Ints) -> set[tuple[int, int]]:
+        """Pairs of names of pieces of one body, and of pieces of two bodies that let one another pass."""
+        children: dict[int, list[int]] = {}
+        for parent, name in zip(parents, names, strict=True):
+            children.setdefault(int(parent), []).append(int(name))
+        pairs = {(a, b) for each in children.values() for a in each for b in each if a < b}
+        for first, second in self.siblings:
+            pairs |= {(min(a, b), max(a, b)) for a in children[first] for b in children[second]}
+        return pairs
+
+    # --- how long a blow lasts ---
+
+    def _time(self, first: int, second: int, speed: float) -> float:
+        """s, of two things that meet."""
+        if self._given is not None:
+            return self._given
+        mass, size = zip(self._weight(first), self._weight(second), strict=True)
+        both = max(first, second) < len(self.shapes.names)
+        return self._hertz(reduced(*mass), reduced(*size), speed, both_give=both)
+
+    def _weight(self, thing: int) -> tuple[float, float]:
+        """Mass in kg and half the size in m: half the side of a cube as large."""
+        count = len(self.shapes.names)
+        if thing >= count:
+            return np.inf, self._shapes[thing - count].extent
+        volume = float(self.shapes.moments.volume[thing])
+        return self._density * volume, volume ** (1 / 3) / 2

@@ -1,0 +1,39 @@
+"""What touched what in a step, and what it gave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Touches:
+    """k contact points at the start of a step.
+
+    Attributes:
+        first, second: (k,) the two things: bodies by their numbers, then what stands in their way.
+        point: (k, 3) m.    normal: (k, 3) from the first to the second.
+        impulse: (k, 3) that the second received from the first in the step, N s.
+        closing: (k,) how fast the two came together there at the start of the step, along the normal, m/s.
+    """
+
+    first: Ints
+    second: Ints
+    point: Values
+    normal: Values
+    impulse: Values
+    closing: Values
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def on(self, thing: int) -> tuple[Values, Values]:
+        """(m, 3) points and (m, 3) impulses that one thing received."""
+        first, second = self.first == thing, self.second == thing
+        points = np.concatenate([self.point[first], self.point[second]])
+        return points, np.concatenate([-self.impulse[first], self.impulse[second]])

@@ -1,0 +1,226 @@
+"""Bodies that move, are struck and break: what of contact is a blow and what a load, and what it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.mechanics.contact.obstacle import Obstacle
+from fracsim.mechanics.contact.shapes import Sphere
+from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.meshes.data import MeshData
+from fracsim.rigid.blows import Blows, Strain
+from fracsim.rigid.engine import Engine, Rules
+from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.hertz import Hertz
+from fracsim.rigid.hulls import Cells, convex_parts
+from fracsim.rigid.stepper import RigidState, RigidStepper
+from support.falling import CUBE, DOWN, MASS, G, cubes, floor, stepper_of
+from support.rigid import DENSITY, section_mean
+from support.solids import copies, lattice, patterns, separated
+
+Values = npt.NDArray[np.float64]
+TAU = 2e-3
+
+
+def bar(above: float = 0.05) -> MeshData:
+    """3 x 1 x 1 m over the floor."""
+    mesh = lattice(12, 4, 4, size=0.25)
+    mesh.points[:, 2] += above
+    return mesh
+
+
+def moving(stepper: RigidStepper, velocity: Values, spin: Values | None = None) -> RigidState:
+    """The start of a run with all bodies moving."""
+    state = stepper.start()
+    bodies = state.bodies
+    turning = bodies.spin if spin is None else bodies.spin + spin
+    return replace(state, bodies=replace(bodies, velocity=bodies.velocity + velocity, spin=turning))
+
+
+def go(stepper: RigidStepper, state: RigidState, end: float) -> RigidState:
+    """On to a time."""
+    while state.t < end * (1 - 1e-9):
+        state, _ = stepper.advance(state)
+    return state
+
+
+# --- blows and loads ---
+
+
+def strains(step: float, height: float) -> list[Strain]:
+    """Of a cube that is dropped on another one on the floor, in half a second."""
+    bodies = cubes([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5 + height]])
+    engine, names = Engine(bodies, [[CUBE]] * 2, [floor()], Rules(step, DOWN, 0.5)), np.arange(2)
+    blows, found = Blows(step, G, lambda first, second, speed: TAU), []
+    for _ in range(round(0.5 / step)):
+        after, touches = engine.advance(bodies)
+        found += blows.look(touches, bodies, names)
+        bodies = after
+    return found
+
+
+@pytest.mark.parametrize("step", [4e-3, 1e-3])
+def test_a_blow_has_its_whole_impulse_and_is_passed_on(step: float) -> None:
+    """m v of the falling cube acts for tau on both cubes, and through the lower one on the floor, whatever the step;
+    later both bear their weights, 1 and 2 m g."""
+    found = strains(step, 0.2)
+    speed = np.sqrt(2 * G * 0.2)
+    first = {each.body: each for each in found[::-1] if each.speed > 0.5}
+    assert first[1].speed == pytest.approx(speed, rel=0.02)
+    assert np.linalg.norm(first[1].force.sum(axis=0)) * TAU == pytest.approx(MASS * speed, rel=0.07)
+    down = first[0].force[:, 2].clip(max=0).sum() * TAU
+    up = first[0].force[:, 2].clip(min=0).sum() * TAU
+    assert -down == pytest.approx(MASS * speed, rel=0.15) and up == pytest.approx(MASS * speed, rel=0.15)
+    loads = {each.body: each for each in found if not each.speed}
+    assert loads[1].force[:, 2].sum() == pytest.approx(MASS * G, rel=0.1)
+    assert np.abs(loads[0].force[:, 2]).sum() == pytest.approx(3 * MASS * G, rel=0.1)
+
+
+def test_what_rests_is_not_struck() -> None:
+    """A cube on the floor: one load, no blow."""
+    bodies = cubes([[0.0, 0.0, 0.5]])
+    engine, blows, found = Engine(bodies, [[CUBE]], [floor()], Rules(2e-3, DOWN)), Blows(2e-3, G, lambda *_: TAU), []
+    for _ in range(200):
+        after, touches = engine.advance(bodies)
+        found += blows.look(touches, bodies, np.arange(1))
+        bodies = after
+    assert found and not any(each.speed for each in found)
+    assert found[-1].force[:, 2].sum() == pytest.approx(MASS * G, rel=0.1)
+
+
+def test_hertz_time_of_two_equal_balls() -> None:
+    """tau = 2.87 (m*^2 / (R* E*^2 v))^(1/5): two glass balls of 10 mm at 1 m/s touch for 57 microseconds, by the
+    integral of the equation of motion m* x'' = -4/3 E* sqrt(R*) x^(3/2)."""
+    young, poisson, radius, speed = 7e10, 0.22, 0.01, 1.0
+    mass = 2500 * 4 / 3 * np.pi * radius**3 / 2
+    stiff = 4 / 3 * young / (1 - poisson**2) / 2 * np.sqrt(radius / 2)
+    x, v, t, dt = 0.0, speed, 0.0, 1e-8
+    while x >= 0:
+        v -= dt * stiff * max(x, 0.0) ** 1.5 / mass
+        x, t = x + dt * v, t + dt
+    assert Hertz(young, poisson)(mass, radius / 2, speed, both_give=True) == pytest.approx(t, rel=5e-3)
+
+
+def test_a_block_that_rests_carries_its_weight() -> None:
+    """From the contact forces of the engine: rho g (H - z) in every layer but those that touch."""
+    mesh = lattice(4, 4, 8, size=0.25)
+    stepper = stepper_of(mesh, 1e12, 1e-3)
+    state, body = go(stepper, stepper.start(), 0.1), stepper.breakable
+    assert stepper._engine is not None
+    _, touches = stepper._engine.advance(state.bodies)
+    points, impulse = touches.on(0)
+    sigma = body.stress(0, body.loads(0, state.bodies.to_rest(points, 0), impulse / 1e-3))[:, 2]
+    for low in (0.5, 0.75, 1.0, 1.25, 1.5, 1.75):
+        expected = -DENSITY * G * (2.0 - low - 0.125)
+        assert section_mean(body.graph.domain, sigma, 2, low, low + 0.25) == pytest.approx(expected, rel=0.02)
+
+
+# --- breaking ---
+
+
+def test_the_crack_of_a_blow_does_not_depend_on_the_step() -> None:
+    """A bar that comes down askew, at dt, dt/2 and dt/4: the same edges, some 400 of them."""
+    found = []
+    for step in (1e-3, 5e-4, 2.5e-4):
+        stepper = stepper_of(bar(0.02), 2e5, step, contact_time=TAU)
+        state = moving(stepper, np.array([0.0, 0.0, -3.0]), np.array([0.0, 1.0, 0.0]))
+        broken = 0
+        while not broken:
+            state, report = stepper.advance(state)
+            broken = report.broken
+        found.append(stepper.breakable.graph.broken.copy())
+    assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
+
+
+def test_momentum_is_kept_through_a_fracture() -> None:
+    """Two bars in free space collide and break: m v and m x x v + I w of all pieces stay."""
+    mesh = copies(lattice(6, 2, 2, size=0.25), 2)
+    mesh.points[len(mesh.points) // 2 :] += [0.0, 0.3, 0.7]
+    stepper = stepper_of(mesh, 2e5, 1e-3, gravity=0 * DOWN, obstacles=[], contact_time=TAU)
+    state = stepper.start()
+    velocity = np.array([[0.0, 0.0, 6.0], [0.0, 0.0, -4.0]])
+    state = replace(state, bodies=replace(state.bodies, velocity=velocity))
+    after = go(stepper, state, 0.1)
+    assert len(after.bodies) > 3
+    size = float(state.bodies.mass.sum()) * 6
+    assert np.allclose(after.bodies.momentum, state.bodies.momentum, atol=1e-9 * size)
+    assert np.allclose(after.bodies.angular_momentum, state.bodies.angular_momentum, atol=1e-9 * size)
+    assert after.bodies.mass.sum() == pytest.approx(state.bodies.mass.sum(), rel=1e-13)
+
+
+def test_a_body_broken_at_rest_stays_where_it_is() -> None:
+    """Without gravity: hulls that overlap along the crack do not push the pieces apart."""
+    stepper = stepper_of(bar(), 1e3, 1e-3, gravity=0 * DOWN, obstacles=[])
+    body, state = stepper.breakable, stepper.start()
+    points, force = np.array([[1.5, 0.5, 1.05], [0.1, 0.5, 0.05], [2.9, 0.5, 0.05]]), np.diag([1e5, 1e5, 1e5])
+    body.strike(0, body.loads(0, points, force))
+    broken = stepper._divided(state.bodies, {0})
+    assert len(broken) > 3
+    after = go(stepper, RigidState(0.0, 0, broken), 0.02)
+    assert np.array_equal(after.bodies.place, broken.place) and after.bodies.kinetic == 0
+
+
+def test_an_obstacle_strikes_what_it_is_driven_into() -> None:
+    """A ball driven sideways into a bar that floats: the bar breaks where it is hit, and the ball has done work."""
+    ball = Obstacle("ball", Sphere(0.2, 3), np.array([1.5, -0.3, 0.5]), lambda t: np.array([0.0, 8.0 * t, 0.0]))
+    stepper = stepper_of(lattice(12, 4, 4, size=0.25), 2e5, 1e-3, gravity=0 * DOWN, obstacles=[ball])
+    state, broken, worked = stepper.start(), 0, 0.0
+    for _ in range(40):
+        state, report = stepper.advance(state)
+        broken, worked = broken + report.broken, worked + float(report.worked[0])
+    assert broken and len(state.bodies) > 1
+    assert state.bodies.momentum[1] > 1000 and worked == pytest.approx(state.work) and worked > state.bodies.kinetic
+
+
+def test_bodies_that_were_not_struck_are_not_analysed() -> None:
+    """Of two bars the one that flies alone costs nothing but its motion."""
+    mesh = copies(bar(), 2)
+    mesh.points[len(mesh.points) // 2 :, 2] += 50.0
+    stepper = stepper_of(mesh, 1e12, 2e-3)
+    go(stepper, moving(stepper, np.array([0.0, 0.0, -3.0])), 0.05)
+    assert stepper.breakable.passes == 0, "too strong to break under this blow: no analysis at all"
+    weak = stepper_of(mesh, 1e6, 2e-3)
+    go(weak, moving(weak, np.array([0.0, 0.0, -3.0])), 0.05)
+    assert weak.breakable.passes > 0
+    assert set(weak.breakable._kept) <= set(np.flatnonzero(weak.breakable.graph.domain.nodes[:, 2] < 10))
+
+
+# --- shapes ---
+
+
+def test_hulls_cover_their_body_and_little_else() -> None:
+    """An L of ten cubes: two or three boxes; of one box, one hull, its eight corners."""
+    mesh = lattice(6, 2, 6)
+    kept = np.flatnonzero((mesh.points[mesh.cells].mean(axis=1)[:, ::2] < 2).any(axis=1))
+    for cells, most in ((mesh.cells, 1), (mesh.cells[kept], 3)):
+        volume = np.full(len(cells), 1 / 6)
+        body = Cells(mesh.points, np.repeat(np.arange(len(cells)), 4), cells.reshape(-1), volume)
+        parts = convex_parts(body)
+        assert len(parts) <= most
+        assert min(len(part) for part in parts) == 8
+        inside = mesh.points[cells].mean(axis=1)
+        assert np.any([(part.min(axis=0) <= inside).all(axis=1) & (part.max(axis=0) >= inside).all(axis=1)
+                       for part in parts], axis=0).all()  # fmt: skip
+
+
+def test_shapes_of_pieces_lie_where_the_split_surface_is() -> None:
+    """A block cut across: hulls of each piece end at the cut; what has not changed is not made again."""
+    mesh = lattice(4, 2, 2)
+    skeleton = Skeleton(mesh)
+    broken = separated(skeleton, (mesh.points[:, 0] > 2.5).astype(int))
+    geometry = Geometry(mesh)
+    whole = geometry.shapes(patterns(skeleton, 0 * broken > 0))
+    cut = np.where(broken, np.abs(2.5 - mesh.points[skeleton.edges][:, 0, 0]), np.nan)
+    halves = geometry.shapes(patterns(skeleton, broken), cut)
+    assert len(whole.parts) == 1 and len(halves.parts) == 2
+    for number, (low, high) in enumerate(((0.0, 2.5), (2.5, 4.0))):
+        corners = np.concatenate(halves.parts[number]) + halves.moments.centre[number]
+        assert corners[:, 0].min() == pytest.approx(low) and corners[:, 0].max() == pytest.approx(high)
+    again = geometry.shapes(patterns(skeleton, broken), cut)
+    assert all(a is b for a, b in zip(again.parts, halves.parts, strict=True))
