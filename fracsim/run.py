@@ -310,6 +310,9 @@ def run_study(
     file, which must not be written over.
     """
     began = time.perf_counter()
+    if study.time.scheme == "rigid":
+        how = {"restart": restart, "overwrite": overwrite}
+        return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
     with Interrupt(comm, wall_limit) as interrupt:
         # at once, not after a mesh of minutes
         on_root(comm, lambda: _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite))
@@ -320,6 +323,36 @@ def run_study(
             return Run(scene, folder, restart=restart, overwrite=overwrite, interrupt=interrupt, began=began)()
         finally:
             scene.destroy()
+
+
+def _run_rigid(
+    comm: MPI.Comm,
+    study: Study,
+    folder: Path,
+    *,
+    restart: bool,
+    overwrite: bool,
+    wall_limit: float | None,
+    source: Path | None,
+) -> dict[str, Any]:
+    """Rigid bodies move on rank 0, and are the same on any number of ranks (collective)."""
+
+    def work() -> dict[str, Any]:
+        _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
+        from .rigid_run import RigidRun, notes_of
+        from .scene.rigid import build_rigid_scene
+
+        scene = build_rigid_scene(study)
+        notes_of(scene)
+        text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
+        frames = study.output.interval or study.time.end / FRAMES
+        summary = RigidRun(scene, folder, text, interrupt, frames=frames, restart=restart)()
+        if study.output.picture:
+            _draw(folder)
+        return summary
+
+    with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt:
+        return from_root(comm, work)
 
 
 def _check(

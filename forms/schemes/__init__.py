@@ -7,6 +7,7 @@ from .central_difference import CentralDifference
 from .generalized_alpha import GeneralizedAlpha
 from .newmark import Newmark
 from .quasi_static import QuasiStatic
+from .rigid import Rigid
 from .scheme import Scheme
 
 SCHEMES: dict[str, type[Scheme]] = {
@@ -15,6 +16,9 @@ SCHEMES: dict[str, type[Scheme]] = {
     "generalized-alpha": GeneralizedAlpha,
     "explicit": CentralDifference,
     "quasi-static": QuasiStatic,
+    "rigid": Rigid,
 }
 
-__all__ = ["SCHEMES", "BackwardEuler", "CentralDifference", "GeneralizedAlpha", "Newmark", "QuasiStatic", "Scheme"]
+__all__ = [
+    "SCHEMES", "BackwardEuler", "CentralDifference", "GeneralizedAlpha", "Newmark", "QuasiStatic", "Rigid", "Scheme",
+]  # fmt: skip

@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,18 +93,23 @@ def write_checkpoint(
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)
-    written(domain.comm, path, lambda: _write(path, arrays, state, domain, notes))
+    clock = {name: getattr(state, name) for name in _CLOCK}
+    written(domain.comm, path, lambda: write_arrays(path, arrays, clock, domain.source, notes))
     return path
 
 
-def _write(path: Path, arrays: dict[str, Any], state: State, domain: Domain, notes: Notes) -> None:
+def write_arrays(
+    path: Path, arrays: dict[str, Any], clock: dict[str, float], mesh: MeshData | None, notes: Notes
+) -> None:
+    """A checkpoint of arrays and numbers by name, of a state on a mesh, the old one in place until it is whole
+    (rank 0). Raises OSError."""
     path.parent.mkdir(exist_ok=True)  # not its parents: a folder that is gone is to be told of
     with replacing(path) as new, hdf5_file(new, _size(arrays, notes), begin=True) as file:
         for name, values in arrays.items():
             file[name] = values
-        for name in _CLOCK:
-            file.attrs[name] = getattr(state, name)
-        file.attrs["mesh"] = fingerprint(domain.source)
+        for name, value in clock.items():
+            file.attrs[name] = value
+        file.attrs["mesh"] = fingerprint(mesh)
         file["notes/study"], file["notes/monitors"] = notes.study, json.dumps(notes.monitors)
 
 
@@ -171,16 +176,25 @@ def _opened(folder: Path) -> Iterator[Any]:
 def _read(folder: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -> dict[str, Any]:
     """The arrays and the clock; the study can go on with broken edges (`torn_too`), plastic strain (`bent_too`)."""
     path = checkpoint_path(folder)
-    with _opened(folder) as file:
-        arrays = {name: data[()] for name, data in file.items() if name != "notes"}
-        clock, name = {key: file.attrs[key].item() for key in _CLOCK}, file.attrs["mesh"]
-    if name != fingerprint(mesh):
-        raise InputError(f"--restart: {path} belongs to another mesh; run without --restart in another folder")
+    arrays, clock = read_arrays(folder, mesh, _CLOCK)
     if len(arrays.get("weakened", ())) and not torn_too:
         raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
     if "plastic" in arrays and arrays["plastic"][:, -1].any() and not bent_too:
         raise InputError(f"--restart: the body in {path} has flowed; the study needs its [plasticity] table")
     return arrays | {"clock": clock}
+
+
+def read_arrays(
+    folder: Path, mesh: MeshData | None, names: Sequence[str]
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """The arrays of a checkpoint and the numbers of these names (rank 0). InputError where there is none that fits."""
+    with _opened(folder) as file:
+        arrays = {name: data[()] for name, data in file.items() if name != "notes"}
+        clock, name = {key: file.attrs[key].item() for key in names}, file.attrs["mesh"]
+    if name != fingerprint(mesh):
+        path = checkpoint_path(folder)
+        raise InputError(f"--restart: {path} belongs to another mesh; run without --restart in another folder")
+    return arrays, clock
 
 
 def fingerprint(mesh: MeshData | None) -> str:

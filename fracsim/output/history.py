@@ -121,13 +121,17 @@ class History:
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
             report.solve.newton, report.solve.krylov, report.seconds, *probes,
         ]  # fmt: skip
+        self.append_row(values)
+
+    def append_row(self, values: Sequence[int | float]) -> None:
+        """One row of values in the order of `columns`, the step first. Raises CannotWrite (collective)."""
         row = dict(zip(self.columns, values, strict=True))
         self.peaks = {name: max(peak, abs(float(row[name]))) for name, peak in self.peaks.items()}
         self.worked = {name: done + float(row[name]) for name, done in self.worked.items()}
         row |= self.worked
         line = _line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in row.values()])
         written(self.comm, self._path, lambda: self._write(line.encode()))
-        self.step = state.step
+        self.step = int(values[0])
 
     def _write(self, line: bytes) -> None:
         assert self._file is not None

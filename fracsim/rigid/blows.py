@@ -93,6 +93,27 @@ class Blows:
         self._last = touches, bodies, names
         return due
 
+    @property
+    def under_way(self) -> bool:
+        """Whether a body is under a blow now."""
+        return bool(self._struck)
+
+    def saved(self) -> dict[str, npt.NDArray[Any]]:
+        """What a checkpoint keeps, where no blow is under way: loads that were borne, and what pairs give."""
+        pairs = np.array([*self._pushed], np.int64).reshape(-1, 2)
+        names = np.array([*self._quiet], np.int64)
+        quiet, borne = [*self._quiet.values()], [self._borne.get(int(name), 0.0) for name in names]
+        return {"pairs": pairs, "pushed": np.array([*self._pushed.values()], float), "rested": names,
+                "quiet": np.array(quiet, np.int64), "borne": np.array(borne, float)}  # fmt: skip
+
+    def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
+        """Be as `saved` said."""
+        each = zip(saved["pairs"], saved["pushed"], strict=True)
+        self._pushed = {(int(a), int(b)): float(push) for (a, b), push in each}
+        names = [int(name) for name in saved["rested"]]
+        self._quiet = dict(zip(names, map(int, saved["quiet"]), strict=True))
+        self._borne = dict(zip(names, map(float, saved["borne"]), strict=True))
+
     def forget(self, names: set[int]) -> None:
         """Bodies of these names are no more."""
         kept: tuple[dict[int, Any], ...] = (self._struck, self._quiet, self._borne)

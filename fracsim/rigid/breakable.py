@@ -6,6 +6,8 @@ that come of it are analysed in turn under what of the blow falls on them, until
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -59,6 +61,7 @@ class Breakable:
 
     Attributes:
         graph: their edges.    pieces: what holds together.    passes: analyses made so far.
+        iterations: of CG in them.
     """
 
     def __init__(
@@ -71,7 +74,7 @@ class Breakable:
     ) -> None:
         """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's."""
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
-        self._domain, self.graph, self.passes = stiffness.stress.domain, graph, 0
+        self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
         self._kept: dict[int, FreeBody] = {}  # by the lowest node of the piece
         self._node = np.argsort(self._domain.node_input)  # of each node of the input mesh
         self.pieces: Pieces = find_pieces(graph)
@@ -88,14 +91,30 @@ class Breakable:
             cut[MeshTopology(source).find_edges(self.graph.edge_keys(edges))] = self._criterion.cut
         return pattern, cut
 
+    def saved(self) -> dict[str, npt.NDArray[Any]]:
+        """What a checkpoint keeps: keys (n, 2) of broken edges, where they are cut, and where surfaces started."""
+        if self._criterion is None:
+            return {}
+        keys, cut = self.graph.gather_broken(self._criterion.cut[:, None])  # type: ignore[misc]
+        return {"broken": keys, "cut": cut, "starts": self._criterion.starts}
+
+    def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
+        """Be as `saved` said."""
+        if self._criterion is None:
+            return
+        self.graph.break_edges(self.graph.flags_of_keys(saved["broken"]))
+        local, place = self.graph.find_keys(saved["broken"])
+        self._criterion.cut[local], self._criterion.starts = saved["cut"][place, 0], saved["starts"]
+        self.pieces = find_pieces(self.graph)
+
     def piece_of(self, name: int) -> int:
         """The piece that a node of the input mesh is in."""
         return int(self.pieces.of_node[self._node[name]])
 
     def may_break(self, piece: int, force: float) -> bool:
         """Whether forces of this sum (N) could break a piece: no beam of its length, an edge thick, has a higher
-        stress."""
-        if self._criterion is None:
+        stress; and there are surfaces left to open."""
+        if self._criterion is None or not self._criterion.left:
             return False
         X = self._domain.nodes[self.pieces.of_node == piece]
         length = float(np.linalg.norm(np.ptp(X, axis=0)))
@@ -122,7 +141,9 @@ class Breakable:
             self._kept[key] = FreeBody(self._stiffness, self.shares(piece), self._options)
         body = self._kept[key]
         self.passes += 1
-        return self._stiffness.tensor(body(loads.nodal(len(self._domain.nodes))), body.share)
+        u = body(loads.nodal(len(self._domain.nodes)))
+        self.iterations += body.iterations
+        return self._stiffness.tensor(u, body.share)
 
     def strike(self, piece: int, loads: PointLoads) -> int:
         """Break a piece, and what it breaks into, until nothing more does; returns how many edges broke."""

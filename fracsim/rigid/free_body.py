@@ -21,7 +21,7 @@ from ..forms.kinematics import deformation_gradient, symmetric_components
 from ..mechanics.kernels import CellExpression, CellForm, cells_measure
 from ..mechanics.stress import Stress
 from ..mechanics.tangent import Assembly
-from ..stepping.petsc_options import Options, OptionSet
+from ..stepping.petsc_options import Options, OptionSet, refusing
 from ..stepping.preconditioner import MULTIGRID
 from ..stepping.rigid_modes import rigid_modes
 from .relief import Relief
@@ -114,7 +114,7 @@ class FreeBody:
         ksp = self._ksp = PETSc.KSP().create(self.matrix.comm)
         ksp.setOptionsPrefix(self._options.prefix)
         ksp.setOperators(self.matrix)
-        ksp.setFromOptions()
+        refusing(ksp.setFromOptions)
         self._u, self._f = self.matrix.createVecs()
 
     def __call__(self, force: Values) -> Values:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +41,7 @@ class RigidReport:
     Attributes:
         broken: edges that broke.    blows, loads: analyses that were due.    kinetic: J, of the bodies.
         pushed: (obstacles, 3) mean force of the bodies on each, N.    worked: (obstacles,) what each did on them, J.
-        seconds: it took.
+        krylov: iterations of CG in all analyses.    seconds: it took.
     """
 
     broken: int
@@ -49,6 +50,7 @@ class RigidReport:
     kinetic: float
     pushed: Values
     worked: Values
+    krylov: int
     seconds: float
 
 
@@ -105,11 +107,29 @@ class RigidStepper:
     def _densities(self) -> Values:
         return np.full(len(self.shapes.names), self._density)
 
+    # --- a checkpoint ---
+
+    def saved(self, state: RigidState) -> dict[str, npt.NDArray[Any]]:
+        """Arrays that `restore` goes on from, where no blow is under way."""
+        bodies = {f"body.{name}": values for name, values in vars(state.bodies).items()}
+        siblings = np.array(sorted(self.siblings), np.int64).reshape(-1, 2)
+        return {**bodies, "siblings": siblings, **self.breakable.saved(), **self.blows.saved()}
+
+    def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
+        """The state that `saved` was of, with the mesh as broken as then."""
+        self.breakable.restore(saved)
+        self.look_again()
+        self.siblings = {(int(a), int(b)) for a, b in saved["siblings"]}
+        self.blows.restore(saved)
+        bodies = {name.removeprefix("body."): values for name, values in saved.items() if name.startswith("body.")}
+        return RigidState(t, step, Bodies(**bodies), work)
+
     # --- a step ---
 
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
         """The state a step later. Raises NotConverged where an analysis fails."""
         began = clock = time.perf_counter()
+        iterations = self.breakable.iterations
         rules, engine = self._rules, self._engine or self._made(state)
         ways = np.array([self._way(each, state.t + rules.step) for each in self._obstacles]) if self._driven else None
         moved, touches = engine.advance(state.bodies, ways)
@@ -128,8 +148,8 @@ class RigidStepper:
         work = state.work + gained + float(worked.sum())
         after = RigidState(state.t + rules.step, state.step + 1, moved, work)
         blows = sum(each.speed > 0 for each in due)
-        seconds = time.perf_counter() - began
-        return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, seconds)
+        krylov, seconds = self.breakable.iterations - iterations, time.perf_counter() - began
+        return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, krylov, seconds)
 
     def _made(self, state: RigidState) -> Engine:
         """The engine for the bodies as they are now."""
@@ -141,6 +161,10 @@ class RigidStepper:
         parts: list[list[Part]] = [[*each] for each in self.shapes.parts]
         self._engine = Engine(state.bodies, parts, stands, self._rules, siblings)
         return self._engine
+
+    def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
+        """(thing, thing, depth in m) of what is in one another."""
+        return (self._engine or self._made(state)).depth(state.bodies)
 
     def _way(self, obstacle: Obstacle, t: float) -> Values:
         return np.asarray(obstacle.at + obstacle.displacement(t), float)

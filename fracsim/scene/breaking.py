@@ -67,16 +67,7 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     from ..fracture.criterion import OverloadedEdges
 
     assert study.fracture is not None
-    strength = _strength(study, stress.domain, graph)
-    average: Average | None = None
-    if study.fracture.kernel == "neighbours":
-        from ..fracture.neighbour_average import NeighbourAverage
-
-        average = NeighbourAverage(stress.domain)
-    elif study.fracture.radius:
-        from ..fracture.nonlocal_average import NonlocalAverage
-
-        average = NonlocalAverage(stress.domain, study.fracture.radius, study.fracture.kernel)
+    strength, average = strength_of(study, stress.domain, graph), average_of(study, stress.domain)
     if study.brittle is None:
         return OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
     from ..fracture.brittle.surfaces import BrittleSurfaces
@@ -84,7 +75,23 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
 
 
-def _strength(study: Study, domain: Domain, graph: EdgeGraph) -> Strength:
+def average_of(study: Study, domain: Domain) -> Average | None:
+    """The average that a study takes of its stress; None: it takes the stress as it is."""
+    table = study.fracture
+    if table is None:
+        return None
+    if table.kernel == "neighbours":
+        from ..fracture.neighbour_average import NeighbourAverage
+
+        return NeighbourAverage(domain)
+    if not table.radius:
+        return None
+    from ..fracture.nonlocal_average import NonlocalAverage
+
+    return NonlocalAverage(domain, table.radius, table.kernel)
+
+
+def strength_of(study: Study, domain: Domain, graph: EdgeGraph) -> Strength:
     """Strength of edges by region, with scatter and a fibre."""
     from ..fracture.strength import Fibre, Scatter, Strength
 

@@ -47,15 +47,9 @@ CREEP = 1e-3  # of the body's size, a second
 OF_SPEED = 0.05
 
 
-def _by_distance(study: Study, dim: int) -> list[Obstacle]:
-    """Obstacles that are felt by their distance: all but those from files."""
-    every = enumerate(obstacles(study, dim))
-    return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
-
-
 def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
-    entries = _by_distance(study, domain.dim)
+    entries = obstacle_entries(study, domain.dim)
     law = _law(study.contact or Contact(), domain, material)
     if not any(each.free for each in study.obstacle):
         return Obstacles(domain, u, entries, law)
@@ -72,7 +66,7 @@ def explicit_obstacles_of(
     from ..mechanics.contact.penalty import Penalty
     from ..stepping.frequencies import cell_frequencies
 
-    entries = _by_distance(study, domain.dim)
+    entries = obstacle_entries(study, domain.dim)
     contact = study.contact or Contact()
     law = _law(contact, domain, stress.material, Penalty)
     most = np.inf
@@ -134,6 +128,13 @@ def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material:
             f"give at most {0.5 * gap:.2g}, or leave it out"
         )
     return itself.SelfContact(domain, u, replace(law, distance=0.5 * gap))
+
+
+def obstacle_entries(study: Study, dim: int) -> list[Obstacle]:
+    """Obstacles that are felt by their distance: all but those from files. InputError where one does not fit the
+    dimension, or is no shape."""
+    every = enumerate(obstacles(study, dim))
+    return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
 
 
 def _obstacle(entry: Placing, number: int) -> Obstacle:

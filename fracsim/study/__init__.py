@@ -4,6 +4,7 @@ body            [mesh], [material], [damping]
 breaking        [fracture], [plasticity], [brittle]
 loading         [[boundary]], [load], [initial]
 touching        [[obstacle]], [contact]
+moving          [[body]], and what rigid studies may say
 running         [time], [[probe]], [output]
 solver_options  [solver]
 whole           a study, and what its tables ask of one another
@@ -18,13 +19,15 @@ catalogue       `fracsim list`
 from .body import Damping, Elastic, Material, Mesh, Region
 from .breaking import Brittle, Crack, Fibre, Fracture, Grains, Heterogeneity, Plasticity
 from .loading import CONDITIONS, MOTIONS, Boundary, Box, Initial, Load, Plane
+from .moving import Body
 from .running import FIELDS, Output, Probe, Time
 from .touching import Contact, Hinge, Obstacle
 from .values import Table, TimeTable
 from .whole import Study
 
 __all__ = [
-    "CONDITIONS", "FIELDS", "MOTIONS", "Boundary", "Box", "Brittle", "Contact", "Crack", "Damping", "Elastic", "Fibre",
+    "CONDITIONS", "FIELDS", "MOTIONS", "Body", "Boundary", "Box", "Brittle", "Contact", "Crack", "Damping", "Elastic",
+    "Fibre",
     "Fracture", "Grains", "Heterogeneity", "Hinge", "Initial", "Load", "Material", "Mesh", "Obstacle", "Output",
     "Plane", "Plasticity", "Probe", "Region", "Study", "Table", "Time", "TimeTable",
 ]  # fmt: skip

@@ -21,7 +21,7 @@ from ..mesh.places import Group, Place
 from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, signed_measures
 from ..meshes.words import AXES, format_point
-from . import Brittle, Obstacle, Study
+from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 
@@ -139,6 +139,8 @@ def _check_place(key: str, place: Place, anatomy: Anatomy) -> None:
 
 def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     dim = anatomy.dim
+    if study.time.scheme == "rigid" and dim != 3:
+        raise InputError(f'time.scheme = "rigid" is for bodies in space; this mesh has {dim} dimensions')
     conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)
@@ -166,6 +168,9 @@ def _extent(anatomy: Anatomy) -> str:
 
 
 def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
+    if study.time.scheme == "rigid":
+        yield from _rigid_description(study, anatomy)
+        return
     source = study.mesh.builder or study.mesh.file or study.mesh.surface
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
     yield f"size        {_size(anatomy)}"
@@ -206,6 +211,26 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
+    """What there is of a study of rigid bodies."""
+    source = study.mesh.builder or study.mesh.file or study.mesh.surface
+    yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}"
+    yield f"size        {_size(anatomy)}"
+    copies = sum(int(np.prod(each.copies)) for each in study.body) or 1
+    yield f"bodies      {copies} times the mesh; motion on one rank, no fields.xdmf"
+    if study.brittle is not None and study.fracture is not None:
+        yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
+        yield f"brittle     {_brittle(study.brittle)}"
+    else:
+        yield "fracture    off: nothing is analysed"
+    yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle) or 'none'}"
+    contact = study.contact or Contact()
+    lasting = "Hertz's time" if contact.contact_time is None else f"{contact.contact_time:g} s"
+    restitution = contact.restitution or 0.0
+    yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, a blow lasts {lasting}"
+    yield f"time        rigid, {study.time.end / study.time.step:.0f} steps of {study.time.step:g} s"
 
 
 # Measured of boxes of 25,000 and 207,000 tetrahedra, of which nothing touched anything: two obstacles and a body alone.
@@ -253,11 +278,15 @@ def _fracture(study: Study) -> str:
     if study.fracture is None:
         return "off: no damage field, no graph, no average"
     fracture = study.fracture
-    average = f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
-    average = "average over neighbouring cells" if fracture.kernel == "neighbours" else average
     approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
     closing = ", cracks close" if fracture.unilateral else ""
-    return f"{approach}, strength {fracture.strength:g} Pa, {average}{closing}"
+    return f"{approach}, strength {fracture.strength:g} Pa, {_average(fracture)}{closing}"
+
+
+def _average(fracture: Fracture) -> str:
+    if fracture.kernel == "neighbours":
+        return "average over neighbouring cells"
+    return f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
 
 
 def _plasticity(study: Study) -> str:

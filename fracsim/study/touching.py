@@ -116,4 +116,6 @@ class Contact(Table):
     friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
     distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
     stiffness: Positive | None = None  # Pa; default 0.3 of Young's modulus, obstacles a tenth
+    restitution: Annotated[Finite, Field(ge=0, lt=1)] | None = None  # of rigid bodies; default 0
+    contact_time: Positive | None = None  # s that a blow on a rigid body lasts; default: Hertz's, from its speed
     creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the size, 0.05 of the speed

@@ -7,6 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from .body import Damping, Material, Mesh
 from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
+from .moving import Body, check_rigid
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
 from .touching import Contact, Obstacle
@@ -37,6 +38,7 @@ class Study(Table):
     initial: Initial | None = None
     solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
     obstacle: list[Obstacle] = Field(default_factory=list)
+    body: list[Body] = Field(default_factory=list)
     contact: Contact | None = None
     probe: list[Probe] = Field(default_factory=list)
     output: Output = Output()
@@ -178,6 +180,11 @@ class Study(Table):
                 f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
                 'choose time.scheme = "backward-euler", or drive it by displacement'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _rigid_or_not(self) -> Study:
+        check_rigid(self)
         return self
 
     @property

@@ -24,10 +24,11 @@ class SurfaceFiles:
         times: s of the frames that are there.
     """
 
-    def __init__(self, folder: Path, dim: int, resume_at: float | None = None) -> None:
-        """`resume_at`: keep the frames up to this time (s)."""
+    def __init__(self, folder: Path, dim: int, resume_at: float | None = None, *, turning: bool = False) -> None:
+        """`resume_at`: keep the frames up to this time (s); `turning`: pieces are rigid, and how they are turned is
+        told."""
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
-        self._columns = columns(dim)
+        self._columns = columns(dim, turning=turning)
         self._entries = self._kept(resume_at) if resume_at is not None and self._pvd.exists() else []
         self._last: dict[str, tuple[Drawn, str]] = {}  # what was drawn beside the body, and its file
         rows = self._kept_rows() if self._entries else []
@@ -86,16 +87,18 @@ def _csv_text(rows: list[list[str]]) -> str:
     return text.getvalue()
 
 
-def columns(dim: int) -> list[str]:
-    """Columns of pieces.csv."""
+def columns(dim: int, *, turning: bool = False) -> list[str]:
+    """Columns of pieces.csv; `turning`: with the orientation of rigid pieces."""
     axes = "xyz"[:dim]
     vectors = [f"{what}_{axis}" for what in ("centre", "velocity") for axis in axes]
     spin = [f"spin_{axis}" for axis in ("xyz" if dim == 3 else "z")]
-    return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin]
+    turn = [f"turn_{axis}" for axis in "xyz"] if turning else []
+    return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn]
 
 
 def _rows(t: float, pieces: Fragments) -> list[list[str]]:
-    values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin])
+    turn = [] if pieces.turn is None else [pieces.turn]
+    values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin, *turn])
     return [
         [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
         for piece in np.argsort(pieces.name)

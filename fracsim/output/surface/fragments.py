@@ -26,6 +26,7 @@ class Fragments:
         centre, velocity: (p, d) of mass, m and m/s.
         spin: (p, 3) rad/s; 2D: (p, 1). The least-squares solution of (tensor of inertia) spin = angular momentum, so 0
             about axes that a piece of one node, or of nodes in line, has no inertia about.
+        turn: (p, 3) rotation vector since the start, rad, of rigid pieces; None of others.
     """
 
     name: Ints
@@ -35,6 +36,7 @@ class Fragments:
     centre: Values
     velocity: Values
     spin: Values
+    turn: Values | None = None
 
 
 def fragments(name: Ints, piece_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values) -> Fragments:

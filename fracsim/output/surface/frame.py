@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +54,7 @@ class Surface:
     Attributes:
         skeleton: edges, facets and boundary of the mesh.
         split: the surface in the reference configuration.
-        names: (pieces,) numbers that stay with the pieces.
+        names: (pieces,) numbers that stay with the pieces.    volume: (pieces,) m^3 (2D: m^2).
         builds: how often it was built.
     """
 
@@ -95,7 +95,7 @@ class Surface:
         self.split = made
         self.names = self._names.update(made.pieces, made.piece_of_node, self.mass)
         piece = made.piece_of_point
-        self._volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.pieces)
+        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.pieces)
         self._rotations = Rotations(self.skeleton, self._pattern, made.follow.turning)
         self._piece = self.names[piece]
         self._linear: Places | None = None
@@ -127,9 +127,21 @@ class Surface:
         triangles, segments, cell, at_elements = self._elements()
         at_elements["age"] = self._ages(t, broken_at)
         at_elements |= {field.name: field.values[cell] for field in fields if field.centre == "Cell"}
-        figures = fragments(self.names, made.piece_of_node, self.mass, self._volume, self.skeleton.points + u, v)
+        figures = fragments(self.names, made.piece_of_node, self.mass, self.volume, self.skeleton.points + u, v)
         points, origins = made.points + moved, self.skeleton.origins
         return Frame(t, points, triangles, segments, at_points, at_elements, origins, figures)
+
+    def placed(
+        self, t: float, points: Values, velocity: Values, pieces: Fragments, broken_at: Values | None = None
+    ) -> Frame:
+        """The surface at time t (s) with its points (n, d) at given places, m, moving at `velocity` (n, d), m/s; pieces
+        by the numbers of `split`."""
+        triangles, segments, _, at_elements = self._elements()
+        at_elements["age"] = self._ages(t, broken_at)
+        at_points: Arrays = {"displacement": points - self.split.points, "velocity": velocity}
+        at_points["piece"] = self._piece.astype(np.int32)
+        named = replace(pieces, name=self.names)
+        return Frame(t, points, triangles, segments, at_points, at_elements, self.skeleton.origins, named)
 
     def _moved(self, t: float, u: Values, apart: Sequence[Apart]) -> Values:
         """(n, d) displacements of the points, m."""

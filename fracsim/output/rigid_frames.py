@@ -1,0 +1,75 @@
+"""Frames of rigid bodies: surface.pvd with the poses of the pieces applied, and pieces.csv with how they are turned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from ..mechanics.contact.drawing import Drawings
+from ..mechanics.contact.obstacle import Obstacle
+from ..meshes.data import MeshData
+from ..rigid.bodies import Bodies
+from .surface.files import SurfaceFiles
+from .surface.fragments import Fragments
+from .surface.frame import Surface
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+NEVER = np.inf  # when an intact edge breaks
+
+
+class RigidFrames:
+    """Writes frames, and knows when edges broke (one rank).
+
+    Attributes:
+        surface: of the mesh as it was broken at the last frame.    broken_at: (E,) s when each edge broke.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        mesh: MeshData,
+        density: float,
+        obstacles: Sequence[Obstacle],
+        resume_at: float | None = None,
+    ) -> None:
+        """`resume_at`: keep the frames up to this time, s. Raises OSError."""
+        self.files = SurfaceFiles(folder, 3, resume_at, turning=True)
+        self.surface = Surface(mesh, density)
+        self.broken_at: Values = np.full(len(self.surface.skeleton.edges), NEVER)
+        self._obstacles = obstacles
+        self._drawings = Drawings(obstacles, mesh.points.min(axis=0), mesh.points.max(axis=0))
+
+    def resume(self, broken_at: Values) -> None:
+        """Edges broke at these times (E,), s: pieces have the names that they had."""
+        self.broken_at = broken_at
+        self.surface.replay(broken_at, self.files.times)
+
+    def note(self, pattern: npt.NDArray[np.uint8], t: float) -> None:
+        """Edges may have broken in the step that ended at t (s), as the patterns (C,) say."""
+        broken = self.surface.skeleton.broken_edges(pattern)
+        self.broken_at[broken & (self.broken_at == NEVER)] = t
+
+    def write(self, t: float, bodies: Bodies, pattern: npt.NDArray[np.uint8], cut: Values) -> None:
+        """A frame at time t (s), where there is none yet; `cut`: (E,) where edges are cut. Raises OSError."""
+        if t in self.files.times:
+            return
+        surface = self.surface
+        surface.update(pattern, cut)
+        made = surface.split
+        of = made.piece_of_point
+        points = bodies.to_space(made.points, of)
+        velocity = bodies.velocity_at(points, of)
+        nodes = np.bincount(made.piece_of_node, minlength=made.pieces)
+        turn = np.asarray(Rotation.from_matrix(bodies.turn).as_rotvec())
+        volume = surface.volume
+        pieces = Fragments(
+            surface.names, nodes, bodies.mass, volume, bodies.place, bodies.velocity, bodies.spin, turn
+        )  # fmt: skip
+        age = np.where(self.broken_at == NEVER, np.nan, self.broken_at)
+        frame = surface.placed(t, points, velocity, pieces, age)
+        self.files.write(frame, self._drawings([each.placed(t) for each in self._obstacles]))

@@ -1,0 +1,172 @@
+"""A run of rigid bodies: on rank 0, into the same output folder as any other; no fields.xdmf, for nothing deforms."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from .errors import CannotWrite, NotConverged, Stopped
+from .output.checkpoint import Notes, checkpoint_path, read_arrays, read_notes, write_arrays
+from .output.folder import OutputClock, make_folder, versions
+from .output.history import History, history_columns, read_rows
+from .output.interrupt import Interrupt
+from .output.rigid_frames import RigidFrames
+from .output.summary import say, write_summary
+from .output.writing import written
+from .rigid.stepper import RigidReport
+from .scene.rigid import RigidScene
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ALONE = MPI.COMM_SELF
+CLOCK = ("t", "step", "work", "start")
+LONGEST = 2000  # steps to go on after a signal, until no blow is under way: a checkpoint has none
+
+
+class RigidRun:
+    """A scene and its output folder; calling it runs to the end.
+
+    Attributes:
+        state: where it has come to.    broken, blows, loads: edges and analyses so far.
+    """
+
+    def __init__(
+        self, scene: RigidScene, folder: Path, text: str, interrupt: Interrupt, *, frames: float, restart: bool = False
+    ) -> None:
+        """`text`: study.toml, without its head; `frames`: s between them, if not `output.every`."""
+        self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
+        self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
+        self.broken = self.blows = self.loads = 0
+        self._start = scene.first.bodies.kinetic
+        arrays = self._resume() if restart else None
+        step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
+        names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
+        names += [f"work_{each.name}" for each in scene.obstacles]
+        if step is not None:
+            read_rows(folder / "history.csv", history_columns(names), step)
+        interrupt.writing = True
+        make_folder(folder, text, restart=restart)
+        self.history = History(ALONE, folder / "history.csv", names, step)
+        density = float(scene.study.material.density)
+        where = folder / "surface.pvd"
+        self.frames = self._writing(where, lambda: RigidFrames(folder, scene.mesh, density, scene.obstacles, t))
+        if arrays is not None:
+            self.frames.resume(arrays["broken_at"])
+            self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))
+            self.history.worked |= dict(zip(self.history.worked, map(float, arrays["worked"]), strict=True))
+        self._clock = OutputClock(scene.study.output.every, frames)
+        self._clock.wrote(self.state)  # type: ignore[arg-type]
+        written(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
+
+    def _writing[T](self, path: Path, work: Callable[[], T]) -> T:
+        result = written(ALONE, path, work)
+        assert result is not None
+        return result
+
+    def _resume(self) -> dict[str, npt.NDArray[Any]]:
+        """Be where the checkpoint is."""
+        arrays, clock = read_arrays(self.folder, self.scene.mesh, CLOCK)
+        self._start = float(clock["start"])
+        self.state = self.scene.stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
+        self._earlier = read_notes(self.folder).monitors
+        self.blows, self.loads = self._earlier["blows"], self._earlier["loads"]
+        return arrays
+
+    # --- a step, a frame, a checkpoint ---
+
+    def step(self) -> RigidReport:
+        """Take a step and write its row. Raises NotConverged, CannotWrite."""
+        stepper = self.scene.stepper
+        self.state, report = stepper.advance(self.state)
+        if report.broken:
+            self.frames.note(stepper.breakable.damage()[0], self.state.t)
+        self.broken, self.blows, self.loads = (
+            self.broken + report.broken, self.blows + report.blows, self.loads + report.loads
+        )  # fmt: skip
+        state, split = self.state, int(np.count_nonzero(stepper.breakable.graph.split))
+        lost = self._start + state.work - report.kinetic
+        self.history.append_row([
+            state.step, state.t, self.scene.study.time.step, report.kinetic, 0.0, lost, state.work, self.broken, split,
+            len(state.bodies), report.blows + report.loads, report.krylov, report.seconds,
+            *map(float, report.pushed.flat), *map(float, report.worked),
+        ])  # fmt: skip
+        return report
+
+    def write_frame(self) -> None:
+        """The bodies as they are now. Raises CannotWrite."""
+        state, (pattern, cut) = self.state, self.scene.stepper.breakable.damage()
+        written(ALONE, self.folder / "surface.pvd", lambda: self.frames.write(state.t, state.bodies, pattern, cut))
+        self._clock.wrote(state)  # type: ignore[arg-type]
+
+    def checkpoint(self) -> Path:
+        """Go on until no blow is under way, and write a checkpoint; returns its path. Raises CannotWrite."""
+        stepper, path = self.scene.stepper, checkpoint_path(self.folder)
+        for _ in range(LONGEST):
+            if not stepper.blows.under_way:
+                break
+            self.step()
+        state = self.state
+        arrays = stepper.saved(state) | {"broken_at": self.frames.broken_at}
+        arrays["worked"] = np.array([*self.history.worked.values()])
+        clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
+        notes = Notes(self.text, {"blows": self.blows, "loads": self.loads})
+        written(ALONE, path, lambda: write_arrays(path, arrays, clock, self.scene.mesh, notes))
+        return path
+
+    # --- to the end ---
+
+    def __call__(self) -> dict[str, Any]:
+        """Run to the end; returns what summary.json says. Raises NotConverged, Stopped, CannotWrite."""
+        try:
+            if self.state.step == 0:
+                self.write_frame()
+            self._loop()
+        except (NotConverged, Stopped) as error:
+            path = self.checkpoint()
+            self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
+            raise type(error)(f"{error}. Checkpoint: {path}; go on with --restart") from None
+        except CannotWrite as error:
+            raise CannotWrite(f"{error}. The run ended at t = {self.state.t:g} s") from None
+        finally:
+            self.history.close()
+        return self._finish("done")
+
+    def _loop(self) -> None:
+        last, every = time.monotonic(), self.scene.study.output.checkpoint
+        while not self.scene.ended(self.state):
+            self.step()
+            done = self.scene.ended(self.state)
+            if done or self._clock.due(self.state):  # type: ignore[arg-type]
+                self.write_frame()
+            if every is not None and time.monotonic() - last > every:
+                self.checkpoint()
+                last = time.monotonic()
+            if not done and (reason := self._interrupt.reason()):
+                raise Stopped(f"stopped by {reason} at t = {self.state.t:g} s after {self.state.step} steps")
+
+    def _finish(self, outcome: str) -> dict[str, Any]:
+        state, scene = self.state, self.scene
+        kinetic = state.bodies.kinetic
+        summary = {
+            "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
+            "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
+            "split_cells": int(np.count_nonzero(scene.stepper.breakable.graph.split)), "pieces": len(state.bodies),
+            "external_work": state.work, "dissipated": self._start + state.work - kinetic,
+            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.breakable.passes,
+            "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
+            "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
+            "ranks": MPI.COMM_WORLD.size, "versions": versions(MPI.COMM_WORLD),
+        }  # fmt: skip
+        write_summary(ALONE, self.folder, summary)
+        return summary
+
+
+def notes_of(scene: RigidScene) -> None:
+    """Tell what was mended of the mesh while it was read."""
+    say(ALONE, list(scene.mesh.notes))

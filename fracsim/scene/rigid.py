@@ -1,0 +1,142 @@
+"""A study of rigid bodies bound to its mesh; on one rank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..mechanics.contact.obstacle import Obstacle
+from ..mechanics.stress import Stress, Weakening
+from ..mechanics.vectors import Assembler
+from ..mesh.domain import Domain, distribute
+from ..mesh.edges import EdgeGraph
+from ..meshes.data import MeshData
+from ..meshes.words import format_point
+from ..rigid.breakable import Breakable, Within
+from ..rigid.free_body import Stiffness
+from ..rigid.geometry import Geometry
+from ..rigid.hertz import Hertz
+from ..rigid.placing import Place, motion, placed
+from ..study import Contact, Study
+from ..study.check import checked_mesh
+from ..study.conditions import volume_loads
+from .breaking import average_of, strength_of, surface_rules
+from .contact import obstacle_entries
+from .material import material_of
+
+try:
+    from ..rigid.engine import Rules
+    from ..rigid.stepper import RigidState, RigidStepper
+except ImportError:
+    raise InputError(
+        'time.scheme = "rigid" needs mujoco, which this environment lacks: pip install fracsim[contact]'
+    ) from None
+
+Values = npt.NDArray[np.float64]
+
+DEEP = 0.02  # of the mean edge: bodies that lie in one another by more at the start are refused
+
+
+@dataclass
+class RigidScene:
+    """What a run of rigid bodies moves.
+
+    Attributes:
+        domain: the mesh of all bodies.    obstacles: what stands in their way.    first: the state at t = 0.
+    """
+
+    study: Study
+    domain: Domain
+    stepper: RigidStepper
+    obstacles: list[Obstacle]
+    first: RigidState
+
+    @property
+    def mesh(self) -> MeshData:
+        """As it was built."""
+        assert self.domain.source is not None
+        return self.domain.source
+
+    def ended(self, state: RigidState) -> bool:
+        """Whether the state is at the end of the study."""
+        return state.t >= self.study.time.end * (1 - 1e-12)
+
+
+def build_rigid_scene(study: Study) -> RigidScene:
+    """Mesh, bodies, obstacles and engine. InputError where they do not fit."""
+    single = checked_mesh(study)
+    places = _places(study)
+    domain = distribute(MPI.COMM_SELF, placed(single, places))
+    breakable, density = _breakable(study, domain), float(study.material.density)
+    load = volume_loads(study, 3)
+    gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
+    contact, obstacles = study.contact or Contact(), obstacle_entries(study, 3)
+    rules = Rules(study.time.step, gravity, contact.friction, contact.restitution or 0.0)
+    assert domain.source is not None
+    geometry = Geometry(domain.source)
+    hertz = Hertz(study.material.young, study.material.poisson)
+    stepper = RigidStepper(breakable, geometry, density, obstacles, rules, hertz, contact.contact_time)
+    first = stepper.start()
+    _check_masses(first)
+    at_rest = first.bodies
+    velocity, spin = motion(stepper.shapes.names, len(single.points), at_rest.centre, at_rest.mass, places)
+    first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin))
+    _check_room(stepper, first, obstacles, domain)
+    return RigidScene(study, domain, stepper, obstacles, first)
+
+
+def _places(study: Study) -> list[Place]:
+    """Of all copies of all entries of [[body]]; one body where the mesh has it without any."""
+    if not study.body:
+        return [Place(*np.zeros((4, 3)))]
+    places = []
+    for entry in study.body:
+        grid = np.indices(entry.copies).reshape(3, -1).T * np.array(entry.spacing or [0.0, 0.0, 0.0])
+        rest = [np.array(each) for each in (entry.rotation, entry.velocity, entry.spin)]
+        places += [Place(np.array(entry.position) + shift, *rest) for shift in grid]
+    return places
+
+
+def _breakable(study: Study, domain: Domain) -> Breakable:
+    """The mesh, with what breaks of it."""
+    material = material_of(study, domain)
+    stress = Stress(Assembler(domain), fem.Function(domain.space), material, Weakening("chi"))
+    stiffness = Stiffness(stress, np.full(domain.cell_count, float(study.material.density)))
+    graph, within = EdgeGraph(domain), Within(average_of(study, domain), domain.cell_count)
+    criterion = None
+    if study.brittle is not None:
+        from ..fracture.brittle.surfaces import BrittleSurfaces
+
+        strength = strength_of(study, domain, graph)
+        criterion = BrittleSurfaces(stress, graph, strength, within, surface_rules(study.brittle))
+    return Breakable(stiffness, graph, criterion, within, study.solver)
+
+
+def _check_masses(state: RigidState) -> None:
+    bad = np.flatnonzero(state.bodies.mass <= 0)
+    if len(bad):
+        where = format_point(state.bodies.place[bad[0]])
+        raise InputError(f"body {bad[0]} around {where} has no mass ({state.bodies.mass[bad[0]]:g} kg): its cells are "
+                         "inside out or flat; mend the mesh")  # fmt: skip
+
+
+def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[Obstacle], domain: Domain) -> None:
+    """InputError where bodies lie in one another, or in an obstacle, at the start."""
+    found = [each for each in stepper.depths(state) if each[2] > DEEP * domain.mean_edge]
+    if not found:
+        return
+    first, second, depth = max(found, key=lambda each: each[2])
+    what, other = (
+        f"body {thing} around {format_point(state.bodies.place[thing])}" if thing < len(state.bodies)
+        else f"obstacle {obstacles[thing - len(state.bodies)].name}" for thing in (first, second)
+    )  # fmt: skip
+    more = f" (one of {len(found)} such pairs)" if len(found) > 1 else ""
+    raise InputError(
+        f"{what} lies in {other} at the start, by {depth:.3g} m as convex parts of them go{more}: move them apart "
+        "(body.N.position, spacing, or `at` of the obstacle)"
+    )

@@ -1,0 +1,84 @@
+"""[[body]]: where rigid bodies are at the start; and what else a study with time.scheme = "rigid" may say."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from annotated_types import Ge, Len
+from pydantic import Field, Strict, model_validator
+
+from .values import Finite, Positive, Table
+
+if TYPE_CHECKING:
+    from .whole import Study
+
+InSpace = Annotated[list[Finite], Len(3, 3)]
+Counts = Annotated[list[Annotated[int, Strict(), Ge(1)]], Len(3, 3)]
+Gaps = Annotated[list[Positive], Len(3, 3)]
+NOUGHT, ONCE = (0.0, 0.0, 0.0), (1, 1, 1)
+
+
+class Body(Table):
+    """[[body]]: the mesh once, or on a grid, at x = position + R X of its points X."""
+
+    position: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m
+    rotation: InSpace = Field(default_factory=lambda: [*NOUGHT])  # rotation vector of R, rad
+    velocity: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m/s
+    spin: InSpace = Field(default_factory=lambda: [*NOUGHT])  # rad/s, about the centre of the mesh
+    copies: Counts = Field(default_factory=lambda: [*ONCE])  # along x, y, z
+    spacing: Gaps | None = None  # m, between copies
+
+    @model_validator(mode="after")
+    def _copies_have_room(self) -> Body:
+        if max(self.copies) > 1 and self.spacing is None:
+            raise ValueError(f"copies = {self.copies} lie in one another: give spacing = [x, y, z] in m")
+        return self
+
+
+def check_rigid(study: Study) -> None:
+    """ValueError where a rigid study asks for what there is none of, or another study for what only rigid ones have."""
+    contact = study.contact
+    if study.time.scheme != "rigid":
+        own = ["[[body]]"] if study.body else []
+        if contact is not None:
+            own += [f"contact.{key}" for key in ("restitution", "contact_time") if getattr(contact, key) is not None]
+        if own:
+            raise ValueError(f'{own[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
+        return
+    tables = {"plasticity": study.plasticity, "damping": study.damping, "boundary": study.boundary,
+              "probe": study.probe, "initial": study.initial, "crack": study.crack}  # fmt: skip
+    hints = {"boundary": "hold or drive bodies by obstacles", "initial": "give velocity and spin in [[body]]"}
+    for name, table in tables.items():
+        if table:
+            raise ValueError(f'[{name}] is not for time.scheme = "rigid": {hints.get(name, "remove it")}')
+    if study.material.energy != "linear":
+        raise ValueError(f'time.scheme = "rigid" solves linear analyses: material.energy = "linear", not '
+                         f'"{study.material.energy}"')  # fmt: skip
+    if any(each.density is not None for each in study.material.regions.values()):
+        raise ValueError('with time.scheme = "rigid" a body has one density: remove density from regions of [material]')
+    if study.fracture is not None and study.brittle is None:
+        raise ValueError('[fracture] with time.scheme = "rigid" needs [brittle]: stiff bodies break along surfaces')
+    if study.load is not None and study.load.body_force is not None:
+        raise ValueError('load.body_force is not for time.scheme = "rigid": give gravity')
+    if contact is not None:
+        if contact.itself is not True:
+            raise ValueError('contact.itself: with time.scheme = "rigid" bodies always meet one another; remove it')
+        soft = [key for key in ("distance", "stiffness", "creep") if getattr(contact, key) is not None]
+        if soft:
+            raise ValueError(f'contact.{soft[0]} is not for time.scheme = "rigid", whose contacts are hard; remove it')
+    beyond = [key for key in study.solver if not key.startswith(("ksp_", "pc_", "mg_"))]
+    if beyond:
+        raise ValueError(
+            f'solver.{beyond[0]} is not for time.scheme = "rigid": give options of ksp_, pc_ and mg_ alone'
+        )
+    solids = [each.name for each in study.obstacle if each.shape == "mesh"]
+    if solids:
+        raise ValueError(
+            f'obstacle {solids[0]} is a mesh, which time.scheme = "rigid" does not have: build it of other shapes'
+        )
+    loose = [each.name for each in study.obstacle if each.free]
+    if loose:
+        raise ValueError(
+            f'obstacle {loose[0]} has a mass: with time.scheme = "rigid" what moves freely is a body, and an obstacle '
+            "is held or driven"
+        )

@@ -1,0 +1,237 @@
+"""Studies with time.scheme = "rigid": what they write, what they refuse, restarts, and any number of ranks."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from mpi4py import MPI
+
+from cases import fracsim_here
+from fracsim.errors import Exit, InputError, Stopped
+from fracsim.run import run_study
+from fracsim.study import Study
+from fracsim.study.check import check_study
+from fracsim.study.file import study_text
+from support.vtu import frames
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+Values = npt.NDArray[np.float64]
+FLOOR = {"name": "floor", "shape": "plane", "at": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": 0.5}
+
+
+def tables(**changed: Any) -> dict[str, Any]:
+    """A bar of 0.6 m that falls askew on a floor and breaks."""
+    plain: dict[str, Any] = {
+        "title": "dropped",
+        "mesh": {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1},
+        "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
+        "fracture": {"strength": 1e6, "kernel": "neighbours"},
+        "brittle": {"surfaces": 4},
+        "body": [{"position": [0.0, 0.0, 0.05], "rotation": [0.0, -0.1, 0.0], "velocity": [0.0, 0.0, -4.0]}],
+        "obstacle": [FLOOR],
+        "contact": {"friction": 0.4},
+        "load": {"gravity": [0.0, 0.0, -9.81]},
+        "time": {"scheme": "rigid", "step": 2e-3, "end": 0.06},
+        "output": {"every": 10, "picture": False},
+    }
+    return {key: value for key, value in (plain | changed).items() if value is not None}
+
+
+def study(**changed: Any) -> Study:
+    """The same, as the program has it."""
+    return Study.model_validate(tables(**changed))
+
+
+def rows(path: Path) -> dict[str, Values]:
+    """Columns of a CSV file by name, without what depends on the machine."""
+    with path.open(newline="") as file:
+        head, *lines = [*csv.reader(file)]
+    values = np.array(lines, float).T
+    return {name: column for name, column in zip(head, values, strict=True) if name != "wall_step"}
+
+
+def assert_same(found: dict[str, Values], expected: dict[str, Values]) -> None:
+    """The same pieces and edges, and the rest but for the tolerance of the engine, as far as bodies carry it on."""
+    for key, values in expected.items():
+        if key in ("piece", "pieces", "broken_edges", "step"):
+            assert np.array_equal(found[key], values), key
+        elif not key.endswith("_its"):
+            kin = [np.abs(other).max() for name, other in expected.items() if name.split("_")[0] == key.split("_")[0]]
+            assert np.allclose(found[key], values, atol=1e-5 * max([*kin, 1e-3])), key
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run."""
+    folder = tmp_path_factory.mktemp("rigid") / "out"
+    run_study(MPI.COMM_SELF, study(), folder)
+    return folder
+
+
+def test_a_run_writes_what_every_run_writes(done: Path) -> None:
+    """history.csv, surface.pvd, pieces.csv and summary.json agree with one another; there is no fields.xdmf."""
+    history, pieces = rows(done / "history.csv"), rows(done / "pieces.csv")
+    summary = json.loads((done / "summary.json").read_text())
+    assert summary["outcome"] == "done" and summary["steps"] == 30 == len(history["step"])
+    assert summary["pieces"] > 1 and summary["broken_edges"] > 0 and summary["blows"] > 0
+    assert history["pieces"][-1] == summary["pieces"] and history["broken_edges"][-1] == summary["broken_edges"]
+    assert not (done / "fields.xdmf").exists()
+    last = pieces["time"] == pieces["time"][-1]
+    assert last.sum() == summary["pieces"] == frames(done)[-1].pieces
+    assert pieces["mass"][last].sum() == pytest.approx(0.6 * 0.2 * 0.2 * 2000.0, rel=1e-12)
+    assert np.abs([pieces[f"turn_{axis}"][last] for axis in "xyz"]).max() > 0.01
+    energy = 0.5 * pieces["mass"] * sum(pieces[f"velocity_{axis}"] ** 2 for axis in "xyz")
+    assert energy[0] == pytest.approx(history["kinetic"][0], rel=0.02)
+    assert history["dissipated"][-1] > 0 and history["contact_floor_z"].min() < -1000
+
+
+def test_drawn_pieces_are_rigid_and_stay_above_the_floor(done: Path) -> None:
+    """Distances between points of the one body of the first frame are those at rest, and nothing is in the floor by
+    more than a contact of that speed is for a moment."""
+    drawn = frames(done)
+    sides = np.ptp(drawn[0].points, axis=0)
+    cos, sin = np.cos(0.1), np.sin(0.1)
+    assert np.allclose(sides, [0.6 * cos + 0.2 * sin, 0.2, 0.6 * sin + 0.2 * cos], atol=1e-6)
+    assert min(frame.points[:, 2].min() for frame in drawn) > -0.01
+    assert np.isfinite(drawn[-1].points).all() and drawn[-1].pieces > drawn[0].pieces == 1
+
+
+def test_momentum_of_a_run_is_what_acted(done: Path) -> None:
+    """m v at the end = m v at the start + weight times t - what the floor was pushed by."""
+    history, pieces = rows(done / "history.csv"), rows(done / "pieces.csv")
+    last = pieces["time"] == pieces["time"][-1]
+    mass = pieces["mass"][last].sum()
+    given = -2e-3 * history["contact_floor_z"].sum()
+    expected = mass * (-4.0 - 9.81 * 0.06) + given
+    assert pieces["mass"][last] @ pieces["velocity_z"][last] == pytest.approx(expected, abs=1e-6 * mass)
+
+
+def test_a_restart_goes_on_as_if_nothing_had_been(done: Path, tmp_path: Path) -> None:
+    """Stopped at once at the wall-time limit, and resumed: the same rows and pieces."""
+    with pytest.raises(Stopped, match="Checkpoint"):
+        run_study(MPI.COMM_SELF, study(), tmp_path / "out", wall_limit=0.0)
+    assert 0 < len(rows(tmp_path / "out" / "history.csv")["step"]) < 30
+    run_study(MPI.COMM_SELF, study(), tmp_path / "out", restart=True)
+    for name in ("history.csv", "pieces.csv"):
+        assert_same(rows(tmp_path / "out" / name), rows(done / name))
+
+
+def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) -> None:
+    """To 0.05 s, and on to 0.06 s."""
+    often = {"every": 10, "picture": False, "checkpoint": 1e-9}
+    short = study(time={"scheme": "rigid", "step": 2e-3, "end": 0.05}, output=often)
+    run_study(MPI.COMM_SELF, short, tmp_path / "out")
+    run_study(MPI.COMM_SELF, study(), tmp_path / "out", restart=True)
+    found, expected = (rows(folder / "history.csv") for folder in (tmp_path / "out", done))
+    assert expected["pieces"][24] > 1
+    assert_same(found, expected)
+    drawn = [frames(folder)[-1] for folder in (tmp_path / "out", done)]
+    assert np.allclose(drawn[0].points, drawn[1].points, atol=1e-6)
+
+
+def test_copies_stand_on_a_grid_and_move_as_they_were_told(tmp_path: Path) -> None:
+    """Twelve bodies, of which the second entry turns about its middle."""
+    six = {"copies": [2, 3, 1], "spacing": [1.0, 0.5, 1.0], "velocity": [0.0, 0.0, 1.0]}
+    tower = {"position": [0.0, 0.0, 2.0], "copies": [1, 1, 6], "spacing": [1.0, 1.0, 0.4], "spin": [0.0, 0.0, 3.0]}
+    summary = run_study(
+        MPI.COMM_SELF,
+        study(body=[six, tower], obstacle=None, load=None, time={"scheme": "rigid", "step": 1e-3, "end": 5e-3}),
+        tmp_path / "out",
+    )
+    pieces = rows(tmp_path / "out" / "pieces.csv")
+    last = pieces["time"] == pieces["time"][-1]
+    assert summary["pieces"] == 12 and summary["analyses"] == 0
+    places = np.stack([pieces[f"centre_{axis}"][last] for axis in "xyz"], axis=1)
+    assert np.allclose(places[1], [0.3, 0.6, 0.105]) and np.allclose(places[-1], [0.3, 0.1, 4.1])
+    assert np.allclose(pieces["spin_z"][last], [0.0] * 6 + [3.0] * 6)
+    assert np.allclose(pieces["turn_z"][last], [0.0] * 6 + [0.015] * 6)
+
+
+def test_a_study_survives_being_written() -> None:
+    """study.toml has all defaults, and says the same."""
+    text = study_text(study())
+    assert study_text(Study.model_validate(tomllib.loads(text))) == text
+
+
+# --- what is refused ---
+
+FLAT = {"mesh": {"builder": "box", "size": [0.6, 0.2], "h": 0.1}, "obstacle": None, "load": None}
+SOFT = {"energy": "corotated", "young": 1.0, "poisson": 0.2, "density": 1.0}
+BALL = {"name": "ball", "shape": "sphere", "radius": 2.0, "at": [0.0, 0.0, 9.0]}
+NEWMARK = {"scheme": "newmark", "step": 1e-3, "end": 0.1}
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "two dimensions": (FLAT, "2 dimensions"),
+    "overlap": ({"body": [{}, {"position": [0.5, 0.0, 0.0]}], "obstacle": None}, "lies in body 1 around .* by 0.1 m"),
+    "in the floor": ({"body": [{"position": [0.0, 0.0, -0.05]}]}, "lies in obstacle floor at the start, by 0.05 m"),
+    "contact time": ({"contact": {"contact_time": 0.0}}, "contact_time"),
+    "restitution": ({"contact": {"restitution": 1.5}}, "restitution"),
+    "no surfaces": ({"brittle": None}, r"needs \[brittle\]"),
+    "energy": ({"material": SOFT}, 'energy = "linear"'),
+    "boundary": ({"boundary": [{"on": "left", "fix": "x"}]}, "by obstacles"),
+    "initial": ({"initial": {"velocity": [0.0, 0.0, 1.0]}}, r"in \[\[body\]\]"),
+    "free obstacle": ({"obstacle": [BALL | {"mass": 1.0}]}, "has a mass"),
+    "hollow": ({"obstacle": [BALL | {"hollow": True}]}, "hollow"),
+    "soft contact": ({"contact": {"stiffness": 1e5}}, "contacts are hard"),
+    "without itself": ({"contact": {"itself": False}}, "always meet"),
+    "newton": ({"solver": {"snes_max_it": 5}}, "ksp_"),
+    "density": ({"material": SOFT | {"energy": "linear", "density": 0.0}}, "density"),
+    "spacing": ({"body": [{"copies": [2, 1, 1]}]}, "spacing"),
+    "body elsewhere": ({"time": NEWMARK}, r"\[\[body\]\] is for"),
+    "time elsewhere": ({"time": NEWMARK, "body": None, "contact": {"contact_time": 1.0}}, "contact_time is for"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_sense_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+    """By the study, by `check`, or where the bodies are placed; nothing is written."""
+    changed, said = REFUSED[name]
+    with pytest.raises((InputError, ValueError), match=said):
+        whole = study(**changed)
+        check_study(whole)
+        run_study(MPI.COMM_SELF, whole, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input_ends_the_program_with_exit_code_2(tmp_path: Path) -> None:
+    """One message, no traceback."""
+    path = tmp_path / "lies.toml"
+    path.write_text(study_text(study(body=[{"position": [0.0, 0.0, -0.05]}])))
+    ended = fracsim_here("run", str(path), "-o", str(tmp_path / "out"))
+    assert ended.returncode == Exit.BAD_INPUT and "obstacle floor" in ended.stderr
+    assert "Traceback" not in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
+
+
+def test_other_schemes_do_not_import_the_engine() -> None:
+    """Nothing of it, nor the room."""
+    code = """
+import sys
+from mpi4py import MPI
+from fracsim.scene import build_scene
+from support.scenes import make_study
+build_scene(MPI.COMM_SELF, make_study(fracture={"strength": 1.0}))
+print([name for name in sys.modules if name.startswith(("mujoco", "fracsim.rigid", "fracsim.scene.rigid"))])
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parent)
+    assert ended.stdout.strip() == "[]", ended.stderr
+
+
+@pytest.mark.ranks
+def test_two_ranks_give_the_same_run(done: Path, tmp_path: Path) -> None:
+    """Bodies move on the first of them."""
+    path = tmp_path / "study.toml"
+    path.write_text(study_text(study()))
+    command = ["timeout", "120", "mpirun", "--oversubscribe", "-n", "2", "fracsim", "run", str(path), "-o"]
+    ended = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    for name in ("history.csv", "pieces.csv"):
+        assert_same(rows(tmp_path / "out" / name), rows(done / name))
