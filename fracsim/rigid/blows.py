@@ -6,7 +6,8 @@ a struck body then pushes harder than it did, it strikes. What a struck body was
 
     force = (sum over the blow of dt f_k - T f) / tau + f,   T = sum over the blow of dt,
 
-so that the step does not matter. A load: any other contact, with the force that it has.
+so that the step does not matter. It is over where the two that met no longer come together and hardly push one another
+any more. A load: any other contact, with the force that it has.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ Pair = tuple[int, int]  # of things, the lower first
 
 SLOW = 1e-3  # m/s: what comes together slower than this strikes nothing, whatever the step
 HARDER = 2.0  # times the push before, that a struck body gives on as a blow
-LONGEST = 1000  # steps of a blow, at most
+SPENT = 0.1  # of its hardest push in a step: what the two that met still give one another where a blow is over
+LONGEST = 100  # steps of a blow, at most
 SETTLED = 5  # steps after a blow from which on contact is a load again
 GROWN = 1.1  # times the greatest load so far: it is looked at again
 
@@ -36,12 +38,27 @@ Time = Callable[[int, int, float], float]  # of two things that meet at a speed 
 
 
 @dataclass
-class _Struck:
-    """A body under a blow: how long the blow lasts, the fastest approach, what pushed the body before, and impulses
-    since, at points of the body at rest."""
+class _Meeting:
+    """Two things that came together fast: who they are, how long the blow lasts, s, how fast they were, m/s, the
+    hardest push in a step so far, N s, and whether it is over."""
 
+    pair: tuple[int, int]
     time: float
     speed: float
+    hardest: float = 0.0
+    over: bool = False
+
+    def look(self, closing: float, push: float, fast: float) -> None:
+        """After a step in which the two had this approach and push; `fast`: what is."""
+        self.hardest = max(self.hardest, push)
+        self.over = closing <= fast and push <= SPENT * self.hardest
+
+
+@dataclass
+class _Struck:
+    """A body under a blow: what struck it, what pushed it before, and impulses since, at points of the body at rest."""
+
+    meeting: _Meeting
     before: tuple[Values, Values]
     points: list[Values] = field(default_factory=list)
     impulses: list[Values] = field(default_factory=list)
@@ -84,8 +101,12 @@ class Blows:
         light = mass[np.minimum(np.array(pairs, np.int64).reshape(-1, 2), n)].min(axis=1)
         before = np.array([self._pushed.get(self._key(pair, names), 0.0) for pair in pairs])
         fast, hard = closing > self._fast, push > HARDER * before + light * self._fast
-        self._strike(pairs, closing, fast, hard, bodies, names)
-        due = self._go_on(pairs, fast | hard, touches, bodies, names)
+        self._strike(pairs, closing, fast, hard, names)
+        seen = {self._key(pair, names): each for pair, *each in zip(pairs, closing, push, strict=True)}
+        for blow in self._struck.values():
+            found = seen.get(blow.meeting.pair, [-np.inf, 0.0])
+            blow.meeting.look(float(found[0]), float(found[1]), self._fast)
+        due = self._go_on(touches, bodies, names)
         due += self._loads(touches, bodies, names)
         for pair, much in zip(pairs, push, strict=True):
             if not any(self._name(thing, names) in self._struck for thing in pair):
@@ -130,36 +151,33 @@ class Blows:
         first, second = (self._name(thing, names) for thing in pair)
         return min(first, second), max(first, second)
 
-    def _strike(
-        self, pairs: list[Pair], closing: Values, fast: Flags, hard: Flags, bodies: Bodies, names: Ints
-    ) -> None:
+    def _strike(self, pairs: list[Pair], closing: Values, fast: Flags, hard: Flags, names: Ints) -> None:
         """Bodies that meet something fast are struck, and so is what they push harder than before."""
         for row in np.flatnonzero(fast):
             speed, pair = float(closing[row]), pairs[row]
-            time = self._time(pair[0], pair[1], speed)
+            meeting = _Meeting(self._key(pair, names), self._time(pair[0], pair[1], speed), speed)
             for thing in pair:
-                self._hit(thing, time, speed, bodies, names)
+                self._hit(thing, meeting, names)
         changed = bool(self._struck)
         while changed:
-            changed = any([self._pass_on(pairs[row], bodies, names) for row in np.flatnonzero(hard)])
+            changed = any([self._pass_on(pairs[row], names) for row in np.flatnonzero(hard)])
 
-    def _pass_on(self, pair: Pair, bodies: Bodies, names: Ints) -> bool:
+    def _pass_on(self, pair: Pair, names: Ints) -> bool:
         """Where one of a pair is struck the other is, too; whether that is news."""
         struck = [self._struck.get(self._name(thing, names)) for thing in pair]
         for blow, other in ((struck[0], 1), (struck[1], 0)):
             if blow is not None and struck[other] is None and pair[other] < len(names):
-                self._hit(pair[other], blow.time, blow.speed, bodies, names)
+                self._hit(pair[other], blow.meeting, names)
                 return True
         return False
 
-    def _hit(self, thing: int, time: float, speed: float, bodies: Bodies, names: Ints) -> None:
+    def _hit(self, thing: int, meeting: _Meeting, names: Ints) -> None:
+        """A body is under a blow, or under a harder one."""
         if thing >= len(names):
             return
-        name = int(names[thing])
-        if name not in self._struck:
-            self._struck[name] = _Struck(time, speed, self._pushing(name))
-        elif speed > self._struck[name].speed:
-            self._struck[name].time, self._struck[name].speed = time, speed
+        blow = self._struck.setdefault(int(names[thing]), _Struck(meeting, self._pushing(int(names[thing]))))
+        if meeting.speed > blow.meeting.speed:
+            blow.meeting = meeting
 
     def _pushing(self, name: int) -> tuple[Values, Values]:
         """(k, 3) points at rest and (k, 3) impulses of the last step of a body."""
@@ -170,11 +188,10 @@ class Blows:
         at = np.flatnonzero(names == name)
         return _at_rest(touches, bodies, int(at[0])) if len(at) else none
 
-    def _go_on(self, pairs: list[Pair], active: Flags, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
+    def _go_on(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
         """Sum up what struck bodies received; those whose blow is over are due."""
         if not self._struck:
             return []
-        busy = {self._name(thing, names) for row in np.flatnonzero(active) for thing in pairs[row]}
         number = {int(name): at for at, name in enumerate(names)}
         due = []
         for name in sorted(self._struck):
@@ -184,17 +201,17 @@ class Blows:
             blow.impulses.append(impulses)
             blow.steps += 1
             self._quiet[name] = 0
-            if name not in busy or blow.steps >= LONGEST:
+            if blow.meeting.over or blow.steps >= LONGEST:
                 due.append(self._strain(blow, number[name]))
                 del self._struck[name]
         return due
 
     def _strain(self, blow: _Struck, body: int) -> Strain:
-        points, before = blow.before
-        force = np.concatenate([*blow.impulses]) / blow.time
-        still = before * (1 / self._step - blow.steps / blow.time)
+        (points, before), time = blow.before, blow.meeting.time
+        force = np.concatenate([*blow.impulses]) / time
+        still = before * (1 / self._step - blow.steps / time)
         where = np.concatenate([*blow.points, points])
-        return Strain(body, where, np.concatenate([force, still]), blow.speed, blow.time)
+        return Strain(body, where, np.concatenate([force, still]), blow.meeting.speed, time)
 
     def _loads(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
         """Bodies that have settled and bear more than they ever did."""
