@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.topology import boundary_facets
-from fracsim.run import Run
+from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import folder
 from fracsim.study.check import check_study
@@ -35,6 +35,9 @@ COARSE = {
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "platens": ["mesh.h=0.01"],
     "punched-slab": ["mesh.h=0.01"],
+    "rigid-figure": ["mesh.h=0.015"],
+    "rigid-vase": ["mesh.h=0.015"],
+    "rigid-wall": ["mesh.h=0.15"],
     "struck-figure": ["mesh.h=0.015"],
     "struck-vase": ["mesh.h=0.012"],
     "table-loaf": ["mesh.h=0.02"],
@@ -53,13 +56,13 @@ def steps(path: Path, overrides: list[str], count: int, out: Path) -> dict[str, 
     """The summary of a run of so many steps."""
     timing = load_study(path, overrides).time
     short = [*overrides, *QUIET, f"time.end={count * timing.step!r}"]
-    return Run(build_scene(MPI.COMM_SELF, load_study(path, short)), out)()
+    return run_study(MPI.COMM_SELF, load_study(path, short), out / "out")
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_a_coarse_version_runs(path: Path, tmp_path: Path) -> None:
     summary = steps(path, COARSE[path.stem], 3, tmp_path)
-    assert summary["outcome"] == "done" and summary["steps"] == 3 and summary["steps_failed"] == 0
+    assert summary["outcome"] == "done" and summary["steps"] == 3 and not summary.get("steps_failed")
     assert np.isfinite(summary["external_work"])
 
 
