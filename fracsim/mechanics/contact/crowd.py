@@ -37,8 +37,8 @@ LONGEST_PAUSE = 16  # steps
 NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
 ROUND_OFF = 1e-6  # of a pressure
 # of the barrier's distance: steps below it are taken with the exact tangent. Without its negative eigenvalues Newton's
-# method gains a digit in two iterations to the end
-NEAR_END = 1.0
+# method gains a digit in two iterations to the end; with them CG may find none. In a first attempt, and in others
+NEAR_END = 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -195,9 +195,10 @@ class Surface:
         if len(self._crowded(u, load)):
             self.at = self.at.drawn_in(before)
 
-    def is_near(self, x: Values, other: Values | None) -> bool:
-        """Whether x (n, d) is so near to the place of the last tangent that Newton's method is at its end."""
-        return other is not None and longest(x - other) < NEAR_END * self._how["distance"]
+    def is_near(self, x: Values, other: Values | None, *, again: bool) -> bool:
+        """Whether x (n, d) is so near to the place of the last tangent that Newton's method is at its end; `again`: it
+        has failed before."""
+        return other is not None and longest(x - other) < NEAR_END[again] * self._how["distance"]
 
     # --- from nodes to points and back ---
 

@@ -33,6 +33,7 @@ class SelfContact(Term):
 
     name = "contact"
     keeps_apart = beside = True
+    _attempts = 0  # of the step
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
         """InputError where the surface at rest cuts itself (collective)."""
@@ -105,7 +106,7 @@ class SelfContact(Term):
 
     def begin(self, level: Level) -> None:
         """A step begins: friction is that of its start."""
-        self._level, self._moved, self._rubbing, self._tangent_at = level, True, None, None
+        self._level, self._moved, self._rubbing, self._attempts = level, True, None, 0
         if not level.dt:
             return
         nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
@@ -165,7 +166,7 @@ class SelfContact(Term):
 
         def found() -> tuple[csr_matrix, tuple[Values, Values] | None]:
             assert self._surface is not None and x is not None
-            exact, self._tangent_at = self._surface.is_near(x, self._tangent_at), x
+            exact, self._tangent_at = self._surface.is_near(x, self._tangent_at, again=self._attempts > 1), x
             H = self._surface.pairs.hessian(x, exact=exact)
             if self._rubbing is not None:
                 H = (H + self._rubbing.hessian(x, exact=exact)).tocsr()
@@ -220,9 +221,14 @@ class SelfContact(Term):
         assert self._surface is not None and x is not None and way is not None
         return self._surface.pairs.longest_step(x, x + self._surface.at.weights @ way)
 
+    def _set_out(self) -> None:
+        """An attempt at the step begins."""
+        self._tangent_at, self._attempts = None, self._attempts + 1
+
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u as far on the way from the start as nothing meets (collective)."""
         level = self._level
+        self._set_out()
         if not level.dt:
             return u
         x, way = self._start, self._gathered(self._level.at_end(u) - level.u)

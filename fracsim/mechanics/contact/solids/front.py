@@ -58,9 +58,9 @@ class Front(Surface):
             kept = np.delete(np.arange(len(self.made.elements)), self._out)
             self._leave_out(np.union1d(self._out, kept[cut]))
 
-    def is_near(self, x: Values, other: Values | None) -> bool:
+    def is_near(self, x: Values, other: Values | None, *, again: bool) -> bool:
         """As for Surface."""
-        return other is not None and longest(x - other) < NEAR_END * self._acts["distance"]
+        return other is not None and longest(x - other) < NEAR_END[again] * self._acts["distance"]
 
 
 def _check_apart(pairs: Facings, made: Split) -> None:

@@ -106,7 +106,7 @@ class Solids(SelfContact):
 
     def begin(self, level: Level) -> None:
         """Solids go to where they are at the end of the step; friction holds what is in touch at its start."""
-        self._level, self._moved = level, True
+        self._level, self._moved, self._attempts = level, True, 0
         end = level.t + (1 - level.share) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: friction and places are still those of the step
@@ -157,6 +157,7 @@ class Solids(SelfContact):
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
+        self._set_out()
         if not level.dt:
             return u
         start, end = self._gathered(level.u), self._gathered(level.at_end(u))
