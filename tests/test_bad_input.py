@@ -57,7 +57,7 @@ def held_2d(**tables: Any) -> Data:
 REFUSED: list[tuple[Data, str]] = [
     # unknown keys at every level, the nearest known one named
     (changed(BAR, tittle="x"), "tittle is not a known key; did you mean title?"),
-    (changed(BAR, zzz=1), "zzz is not a known key; known here: boundary, brittle, contact, damping,"),
+    (changed(BAR, zzz=1), "zzz is not a known key; known here: body, boundary, brittle, contact, crack, damping,"),
     (changed(BAR, mesh={"sise": [1, 1, 1]}), "mesh.sise is not a known key; did you mean size?"),
     (changed(BAR, material={"yung": 1.0}), "material.yung is not a known key; did you mean young?"),
     (changed(BAR, material={"crust": {"yung": 1.0}}), "material.crust.yung is not a known key; did you mean young?"),

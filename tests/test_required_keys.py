@@ -34,6 +34,7 @@ FULL: Data = changed(
     load={"gravity": [0.0, -9.81]},
     initial={"velocity": [1.0, 0.0]},
     contact={"friction": 0.2},
+    crack=[{"segment": [[0.0, 0.0], [0.1, 0.1]]}, {"plane": {"point": [0.0, 0.1], "normal": [0.0, 1.0]}}],
     obstacle=[
         {"name": "floor", "shape": "plane", "at": [0.0, -1.0], "normal": [0.0, 1.0]},
         {
