@@ -132,7 +132,7 @@ for scheme in {schemes}:
     assert scene.balance.stress.chi is None and scene.fracture is None
 parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mechanics.plasticity")
 parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
-parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage")
+parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage", "rigid", "scene.rigid")
 print([name for name in parts if "fracsim." + name in sys.modules], [name for name in sys.modules if "contact" in name])
 scene = build_scene(MPI.COMM_WORLD, load_study(folder / "local.toml"))
 Run(scene, folder / "local")()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -209,20 +208,6 @@ def test_bad_input_ends_the_program_with_exit_code_2(tmp_path: Path) -> None:
     ended = fracsim_here("run", str(path), "-o", str(tmp_path / "out"))
     assert ended.returncode == Exit.BAD_INPUT and "obstacle floor" in ended.stderr
     assert "Traceback" not in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
-
-
-def test_other_schemes_do_not_import_the_engine() -> None:
-    """Nothing of it, nor the room."""
-    code = """
-import sys
-from mpi4py import MPI
-from fracsim.scene import build_scene
-from support.scenes import make_study
-build_scene(MPI.COMM_SELF, make_study(fracture={"strength": 1.0}))
-print([name for name in sys.modules if name.startswith(("mujoco", "fracsim.rigid", "fracsim.scene.rigid"))])
-"""
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parent)
-    assert ended.stdout.strip() == "[]", ended.stderr
 
 
 @pytest.mark.ranks

@@ -169,9 +169,9 @@ def test_a_body_broken_at_rest_stays_where_it_is() -> None:
 def test_an_obstacle_strikes_what_it_is_driven_into() -> None:
     """A ball driven sideways into a bar that floats: the bar breaks where it is hit, and the ball has done work."""
     ball = Obstacle("ball", Sphere(0.2, 3), np.array([1.5, -0.3, 0.5]), lambda t: np.array([0.0, 8.0 * t, 0.0]))
-    stepper = stepper_of(lattice(12, 4, 4, size=0.25), 2e5, 1e-3, gravity=0 * DOWN, obstacles=[ball])
+    stepper = stepper_of(bar(0.0), 2e5, 1e-3, gravity=0 * DOWN, obstacles=[ball])
     state, broken, worked = stepper.start(), 0, 0.0
-    for _ in range(40):
+    for _ in range(25):
         state, report = stepper.advance(state)
         broken, worked = broken + report.broken, worked + float(report.worked[0])
     assert broken and len(state.bodies) > 1
@@ -207,6 +207,17 @@ def test_hulls_cover_their_body_and_little_else() -> None:
         inside = mesh.points[cells].mean(axis=1)
         assert np.any([(part.min(axis=0) <= inside).all(axis=1) & (part.max(axis=0) >= inside).all(axis=1)
                        for part in parts], axis=0).all()  # fmt: skip
+
+
+def test_flat_parts_are_made_a_little_thick() -> None:
+    """Four points in a plane, and four in line: a hundredth of their length, so that they collide."""
+    for points in ([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]):
+        flat = np.array(points)
+        (part,) = convex_parts(Cells(flat, np.zeros(4, int), np.arange(4), np.array([0.0])))
+        widths = np.linalg.svd(part - part.mean(axis=0))[1]
+        assert widths.min() > 5e-3 and part.min(axis=0) == pytest.approx(flat.min(axis=0), abs=0.02)
+        bodies = cubes([[0.0, 0.0, 0.0]])
+        assert Engine(bodies, [[part]], [], Rules(1e-3, DOWN)).advance(bodies)
 
 
 def test_shapes_of_pieces_lie_where_the_split_surface_is() -> None:

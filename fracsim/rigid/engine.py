@@ -36,6 +36,7 @@ DEAD, LEAST = 2.0, 2.0  # damping ratio of what does not bounce, and its 1 / (z 
 IMPEDANCE = (0.95, 0.99, 1e-3, 0.5, 2.0)  # of contacts: near 1, they are hard
 STICKS = 10.0  # how much harder contacts are along the surface than across it: what sticks creeps the less
 HELD = 1e6  # mass of what is driven, in masses of all bodies
+LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
 SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
 
 
@@ -89,9 +90,11 @@ class Engine:
     ) -> None:
         """`parts`: convex parts of each body."""
         self._rules, self._count, self.siblings = rules, len(bodies), set(siblings or ())
+        self._mass = np.maximum(bodies.mass, LEAST_MASS)
+        self._inertia: Values = bodies.inertia + LEAST_MASS * np.eye(3)
         spec, things = _spec(rules), []
         for number, each in enumerate(parts):
-            body = _free(spec, float(bodies.mass[number]), bodies.inertia[number])
+            body = _free(spec, float(self._mass[number]), self._inertia[number])
             things += [number] * _add_parts(spec, body, each, rules.friction)
         heavy = HELD * max(float(bodies.mass.sum()), 1e-9)
         self._driven = [number for number, stand in enumerate(stands) if stand.driven]
@@ -124,9 +127,9 @@ class Engine:
         mujoco.mj_step2(self._model, data)
         touches = self._touches(bodies, rates)
         force = data.qfrc_constraint.reshape(-1, 6)[:n]
-        velocity = bodies.velocity + rules.step * (rules.gravity + force[:, :3] / bodies.mass[:, None])
+        velocity = bodies.velocity + rules.step * (rules.gravity + force[:, :3] / self._mass[:, None])
         moment = np.einsum("nij,nj->ni", bodies.turn, force[:, 3:])
-        turn, spin = tumbled(bodies.turn, bodies.inertia, bodies.spin, moment, rules.step)
+        turn, spin = tumbled(bodies.turn, self._inertia, bodies.spin, moment, rules.step)
         place = bodies.place + rules.step * velocity
         if ways is not None:
             self._way = ways.copy()

@@ -18,6 +18,7 @@ Values = npt.NDArray[np.float64]
 
 SPARE = 0.02  # of the body's volume: what hulls may have beyond it
 PARTS = 32  # of a body, at most
+THIN = 0.01  # of its length: no part is flatter, or it would have no hull
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,18 @@ def convex_parts(body: Cells, most: int = PARTS) -> list[Values]:
         for cut, half in halves:
             heapq.heappush(heap, (-half.spare, made, cut, half))
             made += 1
-    return [hull.corners for *_, hull in heap]
+    return [thickened(hull.corners) for *_, hull in heap]
+
+
+def thickened(corners: Values) -> Values:
+    """Corners (n, 3), doubled across each principal axis along which they are flatter than THIN of their length."""
+    middle = corners.mean(axis=0)
+    axes = np.linalg.svd(corners - middle)[2]
+    widths = np.ptp((corners - middle) @ axes.T, axis=0)
+    for axis in axes[widths < THIN * widths.max()]:
+        half = THIN * float(widths.max()) / 2 * axis
+        corners = np.concatenate([corners - half, corners + half])
+    return corners
 
 
 def _halves(body: Cells, middles: Values, part: Ints) -> list[tuple[Ints, Hull]]:
