@@ -128,14 +128,24 @@ class RigidRun:
                 self.write_frame()
             self._loop()
         except (NotConverged, Stopped) as error:
-            path = self.checkpoint()
-            self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
-            raise type(error)(f"{error}. Checkpoint: {path}; go on with --restart") from None
+            failed = isinstance(error, NotConverged)
+            saved = self._saved(failed=failed)
+            self._finish("not converged" if failed else "stopped")
+            raise type(error)(f"{error}. {saved}") from None
         except CannotWrite as error:
             raise CannotWrite(f"{error}. The run ended at t = {self.state.t:g} s") from None
         finally:
             self.history.close()
         return self._finish("done")
+
+    def _saved(self, *, failed: bool) -> str:
+        """Write a checkpoint on the way out, and say where; none where an analysis `failed`: its blow would be lost."""
+        try:
+            if not failed:
+                return f"Checkpoint: {self.checkpoint()}; go on with --restart"
+        except NotConverged:
+            pass
+        return "No checkpoint was written: the blow that could not be analysed would be lost"
 
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint

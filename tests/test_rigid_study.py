@@ -15,7 +15,7 @@ import pytest
 from mpi4py import MPI
 
 from cases import fracsim_here
-from fracsim.errors import Exit, InputError, Stopped
+from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.run import run_study
 from fracsim.study import Study
 from fracsim.study.check import check_study
@@ -136,6 +136,13 @@ def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) ->
     assert_same(found, expected)
     drawn = [frames(folder)[-1] for folder in (tmp_path / "out", done)]
     assert np.allclose(drawn[0].points, drawn[1].points, atol=1e-6)
+
+
+def test_an_analysis_that_fails_ends_the_run_with_its_reason(tmp_path: Path) -> None:
+    """CG in one iteration: what failed, what to do, and a summary that says so."""
+    with pytest.raises(NotConverged, match=r"struck body .*solver\.ksp_max_it.* No checkpoint"):
+        run_study(MPI.COMM_SELF, study(solver={"ksp_max_it": 1}), tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["outcome"] == "not converged"
 
 
 def test_copies_stand_on_a_grid_and_move_as_they_were_told(tmp_path: Path) -> None:
