@@ -293,7 +293,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.1, "radius": 0.2},
         "obstacle": [{"name": "axe", "shape": "mesh", "file": str(Path(__file__).parent / "axe.obj"), "scale": 0.1,
                       "at": [0.8, 0.25, 0.52], "velocity": [0.05, 0.0, -0.8], "friction": 0.3}],
-        "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.15}, "probe": [{"name": "grip", "on": "left"}],
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.2}, "probe": [{"name": "grip", "on": "left"}],
     },
 }  # fmt: skip
 SURFACES = ("plate", "block")  # whose split surface is written

@@ -12,18 +12,21 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from petsc4py import PETSc
 
 from ....mesh.domain import Domain
 from ....mesh.ranks import from_root, on_root
 from ....mesh.split.places import Places
 from ....meshes.words import AXES
 from ...drawn import Drawn
+from ...stiff import Stiff
 from ...term import Level
 from ..crowd import Law
 from ..drawing import Drawings
 from ..itself import SelfContact
 from ..obstacle import Obstacle
 from ..placed import Placed
+from .beside import Beside
 from .facing import Rubbing, Standing
 from .front import Front
 from .led import led_past
@@ -52,6 +55,9 @@ class Solids(SelfContact):
         self._solids = on_root(domain.comm, lambda: [_standing(*each, edge) for each in obstacles.items()]) or []
         self._from = self._to = [each.displacement(0.0) for each in self.obstacles]
         self._gone, self._end, self._dt = 1.0, -np.inf, 0.0
+        self._beside = Beside(domain, self.obstacles, law.distance)
+        self._began_near = True
+        self._far: bool | None = None  # of the current u; None: not known yet
         self._worked, self._lost = [0.0] * len(obstacles), 0.0
         self._read: list[Values] | None = None  # forces on each, N; None: not yet
         super().__init__(domain, u, law)
@@ -102,18 +108,60 @@ class Solids(SelfContact):
         for each, start, end in zip(self._solids, self._from, self._to, strict=False):  # they are on rank 0 alone
             each.put(start + gone * (end - start))
 
+    @property
+    def _ways(self) -> list[tuple[Values, Values]]:
+        """(3,) shifts of each solid at both ends of the step, m."""
+        return list(zip(self._from, self._to, strict=True))
+
+    def _is_far(self) -> bool:
+        """Whether nothing can touch at the current u, nor could as the step began: nothing rubs then (collective)."""
+        if self._far is None:
+            at_end = self._level.at_end(self._u.x.array[: self._owned])
+            self._far = not self._began_near and self._beside.is_far([self._level.u, at_end], self._ways)
+        return self._far
+
+    def displaced(self) -> None:
+        """What touches has to be found anew."""
+        super().displaced()
+        self._far = None
+
+    # --- what it adds to the balance: nothing, and nothing is gathered, where it is far ---
+
+    def struck(self) -> Values | None:  # type: ignore[override]
+        """(owned dofs,) forces at the end of the step, N (collective)."""
+        return None if self._is_far() else super().struck()
+
+    def scale(self) -> Values | None:  # type: ignore[override]
+        """(owned dofs,) the same as they enter r, N (collective)."""
+        return None if self._is_far() else super().scale()
+
+    def coupling(self) -> PETSc.Mat | Stiff | None:
+        """Minus the derivative of the forces, where anything is in touch; as of SelfContact (collective)."""
+        return None if self._is_far() else super().coupling()
+
+    def stored(self) -> float:
+        """Energy of the barrier at the current u, on rank 0, J (collective)."""
+        return 0.0 if self._is_far() else super().stored()
+
+    def potential(self) -> float:
+        """Barrier and friction as they enter that of r, on rank 0, J (collective)."""
+        return 0.0 if self._is_far() else super().potential()
+
     # --- a step ---
 
     def begin(self, level: Level) -> None:
         """Solids go to where they are at the end of the step; friction holds what is in touch at its start."""
-        self._level, self._moved, self._attempts = level, True, 0
+        self._level, self._moved, self._far, self._attempts = level, True, None, 0
         end = level.t + (1 - level.share) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: friction and places are still those of the step
-        self._end, self._dt, self._rubbing, self._began_with = end, level.dt, None, level.v
+        self._end, self._dt, self._began_with = end, level.dt, level.v
+        self._rubbing = self._tangent_at = None
         self._from = [each.displacement(end - level.dt) for each in self.obstacles]
         self._to = [each.displacement(end) for each in self.obstacles]
-        if level.dt:
+        self._began_near, self._start = not self._beside.is_far([level.u], self._ways), None
+        self._pushed = [np.zeros(3) for _ in self.obstacles]
+        if level.dt and self._began_near:
             nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
             if self._surface is not None and nodal is not None:
                 self._put(0.0)
@@ -130,20 +178,24 @@ class Solids(SelfContact):
 
     def arrive(self) -> None:
         """What contact has done in the step is booked (collective)."""
-        x, self._lost = self._places(), 0.0
-        if x is None or self._surface is None or self._start is None:
-            self._read = [np.zeros(3) for _ in self.obstacles]
-            return
-        self._read, end = [], self._level.blow.end
-        for k, each in enumerate(self._surface.pairs.each):
-            way = self._to[k] - self._from[k]
-            normal, friction = -each.pushed(x), np.zeros_like(x)
-            if self._rubbing is not None:
+        self._lost, self._worked = 0.0, [0.0] * len(self.obstacles)
+        read: list[Values] = [np.zeros(3) for _ in self.obstacles]
+        self._read = read
+        if not self._is_far() and (x := self._places()) is not None and self._surface is not None:
+            self._book(x, self._surface, read)
+
+    def _book(self, x: Values, front: Front, read: list[Values]) -> None:
+        """The same on rank 0, with the body's points at x (n, 3), m; forces on each solid go into `read`, N."""
+        end, pushed = self._level.blow.end, self._pushed
+        for k, (each, (start, to)) in enumerate(zip(front.pairs.each, self._ways, strict=True)):
+            normal, under = -each.pushed(x).sum(axis=0), 0.0
+            read[k] -= normal
+            if self._rubbing is not None and self._start is not None:
                 friction = -self._rubbing.of(each, x)
-            under = float(friction.sum(axis=0) @ way)
-            self._worked[k] = float((end * normal.sum(axis=0) + (1 - end) * self._pushed[k]) @ way) + under
-            self._lost += under - float(np.vdot(friction, x - self._start))
-            self._read.append(-(normal + friction).sum(axis=0))
+                under = float(friction.sum(axis=0) @ (to - start))
+                self._lost += under - float(np.vdot(friction, x - self._start))
+                read[k] -= friction.sum(axis=0)
+            self._worked[k] = float((end * normal + (1 - end) * pushed[k]) @ (to - start)) + under
 
     def driven(self) -> tuple[float, float]:
         """Work of the solids' own motion in the step, and what friction takes, on rank 0, J."""
@@ -154,11 +206,17 @@ class Solids(SelfContact):
 
     # --- how far Newton's method may go ---
 
+    def longest_step(self, change: Values) -> float:
+        """Share of a change of u on the way of which nothing meets (collective)."""
+        u, level = self._u.x.array[: self._owned], self._level
+        ends = [level.at_end(u), level.at_end(u + change)]
+        return 1.0 if self._beside.is_far(ends, self._ways) else super().longest_step(change)
+
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
         self._set_out()
-        if not level.dt:
+        if not level.dt or self._beside.is_far([level.u, level.at_end(u)], self._ways):
             return u
         start, end = self._gathered(level.u), self._gathered(level.at_end(u))
 
@@ -179,6 +237,8 @@ class Solids(SelfContact):
 
     def clear(self, u: Values) -> bool:
         """Whether nothing is passed on the straight way from the start to u (collective)."""
+        if self._beside.is_far([self._level.u, self._level.at_end(u)], self._ways):
+            return True
         start, end = self._gathered(self._level.u), self._gathered(self._level.at_end(u))
 
         def found() -> bool:
@@ -243,11 +303,16 @@ class Solids(SelfContact):
 
     def works(self) -> dict[str, Callable[[], float]]:
         """work_NAME: what each solid has done on the body in the step that has ended, J."""
-        return {f"work_{each.name}": partial(self._worked.__getitem__, k) for k, each in enumerate(self.obstacles)}
+        return {f"work_{each.name}": partial(self._work, k) for k, each in enumerate(self.obstacles)}
+
+    def _work(self, number: int) -> float:
+        return self._worked[number]
 
     def closings(self) -> list[float]:
         """How far each solid and the points that it pushes would have come closer in the step, had nothing stopped
         them, m, on rank 0 (collective)."""
+        if self._is_far():
+            return [0.0] * len(self.obstacles)
         x, v = self._places(), self._gathered(self._began_with)
         if x is None or v is None or self._surface is None:
             return [0.0] * len(self.obstacles)
