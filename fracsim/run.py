@@ -84,7 +84,7 @@ class Run:
         """Take up the state of the checkpoint, and what it says beside it."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
-        breaks.count()
+        breaks.restored()
         self.state = scene.stepper.resume(state)
         if notes.values()["time"]["step"] != scene.study.time.step:  # else the size of the last step goes on
             self.state = replace(self.state, dt=scene.study.time.step)

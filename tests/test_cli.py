@@ -136,7 +136,7 @@ parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage", "rigid",
 print([name for name in parts if "fracsim." + name in sys.modules], [name for name in sys.modules if "contact" in name])
 scene = build_scene(MPI.COMM_WORLD, load_study(folder / "local.toml"))
 Run(scene, folder / "local")()
-parts = ("fracture.brittle", "fracture.nonlocal_average")
+parts = ("fracture.brittle", "fracture.nonlocal_average", "fracture.energy", "fracture.cracks")
 parts = tuple("fracsim." + name for name in parts)
 print(hasattr(scene.fracture.criterion, "starts"), [name for name in sys.modules if name.startswith(parts)])
 """

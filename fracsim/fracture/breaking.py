@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,11 +72,14 @@ class Breaking:
         *,
         passes: int | None = 1,
         opened: Values | None = None,
+        degradation: Degradation | None = None,
+        pace: float | None = None,
     ) -> None:
+        """`pace`: most passes a second, in place of `passes` (collective)."""
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
-        self.degradation: Degradation = make_degradation(stress, graph)
-        self.not_finite, self.opened = 0, opened
+        self.degradation: Degradation = degradation or make_degradation(stress, graph)
+        self.not_finite, self.opened, self._pace = 0, opened, pace
         if opened is not None:
             self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
@@ -97,10 +101,20 @@ class Breaking:
             np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         return values[:, :-1], values[:, -1]
 
+    def begin(self, t: float, dt: float) -> None:
+        """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""
+        self.degradation.begin(t, dt)
+        if self._pace is not None:
+            self.passes = max(1, math.ceil(self._pace * dt))
+
+    def moving(self, v: Values, a: Values) -> None:
+        """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
+        self.criterion.moving(v, a)
+
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
         stress, psi = self.evaluate()
-        broken, weakened = self._weaken(*self.criterion(stress))
+        broken, weakened = self._weaken(*self.criterion(stress, psi))
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
         before = [each.x.array.copy() for each in self.stress.fields] if broken else []

@@ -21,11 +21,15 @@ Edges = npt.NDArray[np.integer]
 class Criterion(Protocol):
     """Finds the edges that fail."""
 
-    def __call__(self, stress: Values) -> tuple[Edges, Values]:
-        """(n,) local edges and their load over strength, 1 or more, from the undamaged stress (cells, 3 or 6) in Pa.
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
+        """(n,) local edges and their load over strength, 1 or more.
 
-        The same edges on all ranks once what each has found is joined (collective).
+        `stress` (cells, 3 or 6) in Pa and `psi` (cells,) in J/m^3 are those of the undamaged material. The same edges
+        on all ranks once what each has found is joined (collective).
         """
+
+    def moving(self, v: Values, a: Values) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2."""
 
     def memory(self) -> object:
         """What it remembers of earlier passes, never to be written to again."""
@@ -101,7 +105,7 @@ class OverloadedEdges:
         self._carried = CarriedStress(stress, graph, average, whole_tensor=False)
         self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
 
-    def __call__(self, stress: Values) -> tuple[Edges, Values]:
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """(n,) local edges over their strength and their loads, at most `cap` of all edges in one pass (collective)."""
         carried, active = self._carried(stress)
         edges, load = self.overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
@@ -124,6 +128,9 @@ class OverloadedEdges:
         chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)
         wanted = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
         return edges[wanted[edges]], load[wanted[edges]]
+
+    def moving(self, v: Values, a: Values) -> None:
+        """Stress is all that counts."""
 
     def memory(self) -> object:
         """Nothing."""

@@ -55,6 +55,9 @@ class Degradation(Protocol):
     def opened(self) -> None:
         """Take up the damage of a graph with cracks, before anything is loaded."""
 
+    def begin(self, t: float, dt: float) -> None:
+        """A step of dt (s) from t on is solved, for the first time or once more."""
+
 
 class Chi:
     """chi of the damaged cells, from the normal stress along their edges."""
@@ -96,6 +99,9 @@ class Chi:
     def opened(self) -> None:
         """Cells that have come apart carry nothing; what others lose is seen once they are loaded."""
         self._chi[np.flatnonzero(self._graph.split)] = 0.0
+
+    def begin(self, t: float, dt: float) -> None:
+        """What goes goes at once."""
 
 
 class _Edges:
@@ -142,6 +148,9 @@ class Projection:
     def opened(self) -> None:
         """Integrity follows from that of the edges."""
         self._edges.update()
+
+    def begin(self, t: float, dt: float) -> None:
+        """What goes goes at once."""
 
 
 class ClosingChi(Chi):

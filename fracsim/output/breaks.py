@@ -37,12 +37,14 @@ class Breaks:
         self.surfaces: BrittleSurfaces | None = None
         self.pieces: Pieces | None = None
         self.figures = (0, 0, _bodies(self._domain))
+        self._cut_by: npt.NDArray[np.float64] | None = None
         if breaking is not None:
             from ..fracture.record import EdgeRecord
 
             self.record = EdgeRecord(breaking.graph)
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
+            self._cut_by = getattr(breaking.criterion, "cut", None)
             if breaking.opened is not None:
                 self.record.note(0.0, breaking.opened)
             self.count()
@@ -51,10 +53,16 @@ class Breaks:
         """Edges that broke since the last call did so at t (s), and pieces are those of now (collective)."""
         if self.record is None:
             return
-        if self.surfaces is not None:  # a surface knows where it cuts
-            self.record.note(t, self.surfaces.cut)
+        if self._cut_by is not None:  # a surface knows where it cuts, and so does a crack
+            self.record.note(t, self._cut_by)
         else:
             self.record.note(t, self._cuts() if self._by_forces else None)
+        self.count()
+
+    def restored(self) -> None:
+        """The record was read from a checkpoint: so were the places of cuts (collective)."""
+        if self.record is not None and self._cut_by is not None:
+            self._cut_by[:] = self.record.cut
         self.count()
 
     def count(self) -> None:

@@ -46,11 +46,30 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     if passes is None and balance.scheme.inertia:
         passes = 1
     opened = _opened(study, balance, graph)
-    breaking = Breaking(balance.stress, graph, _criterion(study, balance.stress, graph), passes=passes, opened=opened)
+    if study.fracture.energy is not None:
+        breaking = _tearing(study, balance, graph, passes, opened)
+    else:
+        criterion = _criterion(study, balance.stress, graph)
+        breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened)
     if opened is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()
     return breaking
+
+
+def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+    """What breaks where cracks take an energy."""
+    from ..fracture.breaking import Breaking
+    from ..fracture.energy.splitting import Splitting
+    from ..fracture.energy.tips import CrackTips
+
+    assert study.fracture is not None and study.fracture.energy is not None
+    stress, strength = balance.stress, _strength(study, balance.domain, graph)
+    tips = CrackTips(stress, graph, strength, study.fracture.energy, opened)
+    given, moves = study.fracture.passes is not None, balance.scheme.inertia
+    pace = tips.pace() if moves and balance.scheme.implicit and not given else None
+    splitting = Splitting(stress, graph, tips.release_rate() if moves else None)
+    return Breaking(stress, graph, tips, passes=passes, opened=opened, degradation=splitting, pace=pace)
 
 
 def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:

@@ -49,6 +49,12 @@ class Breaking(Remembers, Protocol):
     def pattern(self) -> npt.NDArray[np.uint8] | None:
         """(cells,) broken edges of each cell (mesh.edges); None where nothing can break."""
 
+    def begin(self, t: float, dt: float) -> None:
+        """A step of dt (s) from t on is solved, for the first time or once more: its passes are of that time."""
+
+    def moving(self, v: Values, a: Values) -> None:
+        """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
+
     def __call__(self) -> PassResult:
         """A pass on the current displacement (collective)."""
 
@@ -115,6 +121,12 @@ class Unbreakable:
 
     def __init__(self, balance: Balance, flow: Flow | None = None) -> None:
         self._balance, self._flow = balance, flow or NoFlow()
+
+    def begin(self, t: float, dt: float) -> None:
+        """Nothing."""
+
+    def moving(self, v: Values, a: Values) -> None:
+        """Nothing."""
 
     def __call__(self) -> PassResult:
         """The elastic energy is all there is to tell."""

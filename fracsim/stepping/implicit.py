@@ -54,8 +54,9 @@ class ImplicitStepper(BalanceStepper):
         broken, released = 0, 0.0
         for _ in range((self.breaking.passes or UNLIMITED) - 1):
             solved = self.balance.u.x.array[: self.balance.owned].copy()
-            self._arrive(state, dt)
+            _, v, a = self._arrive(state, dt)
             self._let_flow()
+            self.breaking.moving(v, a)
             result = self.breaking()
             if not result.broken:
                 self._return_to(solved, state, dt)

@@ -182,6 +182,7 @@ class BalanceStepper:
         if terms := state.memory.get("terms"):
             self.balance.recall(terms)
         self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
+        self.breaking.begin(state.t, dt)
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end, and no sliver left over before it."""
@@ -283,6 +284,7 @@ class BalanceStepper:
         `solved`: (owned dofs,) displacement at which the step's forces balance.
         """
         began = time.perf_counter()
+        self.breaking.moving(end.v, end.a)
         result = self.breaking()
         if result.broken:
             end = self._released(end, solved, result)

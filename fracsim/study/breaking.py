@@ -34,6 +34,7 @@ class Fracture(Table):
     """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
 
     strength: Strength
+    energy: Positive | None = None  # G_c, J/m^2: cracks advance where they release it; None: edges break one by one
     approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     # neighbours: no radius, one average over the cells that share a node

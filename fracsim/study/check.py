@@ -152,6 +152,10 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, anatomy, f"probe.{i}.point")
+    if dim == 3 and study.fracture is not None and study.fracture.energy is not None:
+        raise InputError(
+            "fracture.energy is for 2D meshes so far; this one has 3 dimensions: remove it, and edges break by strength"
+        )
     if dim == 3 and study.material.plane == "stress":
         raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
 
@@ -281,6 +285,8 @@ def _fracture(study: Study) -> str:
     fracture = study.fracture
     approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
     closing = ", cracks close" if fracture.unilateral else ""
+    if fracture.energy is not None:
+        return _tearing(study, fracture.energy)
     return f"{approach}, strength {fracture.strength:g} Pa, {_average(fracture)}{closing}"
 
 
@@ -288,6 +294,19 @@ def _average(fracture: Fracture) -> str:
     if fracture.kernel == "neighbours":
         return "average over neighbouring cells"
     return f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
+
+
+def _tearing(study: Study, energy: float) -> str:
+    """Irwin's length l_ch = E' G_c / f_t^2 says how large cells may be, and that of a body how small it may not be."""
+    table, material = study.fracture, study.material
+    assert table is not None
+    stiff = material.young / (1 - material.poisson**2 if material.plane == "strain" else 1.0)
+    length = stiff * energy / table.strength**2
+    return (
+        f"cracks that take {energy:g} J/m^2, and begin at {table.strength:g} Pa; "
+        f"l_ch = E' G_c / f_t^2 = {length:.3g} m "
+        "(less than h: cracks begin late; more than a fifth of the body: loads are too high)"
+    )
 
 
 def _plasticity(study: Study) -> str:

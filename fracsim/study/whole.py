@@ -127,6 +127,24 @@ class Study(Table):
         return self
 
     @model_validator(mode="after")
+    def _energy_stands_alone(self) -> Study:
+        table = self.fracture
+        if table is None or table.energy is None:
+            return self
+        others = {
+            "fracture.approach": (table.approach != "chi", 'cells that a crack cuts fade: choose approach = "chi"'),
+            "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
+            "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
+            "fracture.unilateral": (table.unilateral, "cracks that take an energy do not close yet: remove unilateral"),
+            "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
+            "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
+        }
+        for key, (given, why) in others.items():
+            if given:
+                raise ValueError(f"fracture.energy does not go with {key}: {why}")
+        return self
+
+    @model_validator(mode="after")
     def _cracks_need_fracture(self) -> Study:
         if self.crack and self.fracture is None:
             raise ValueError("[[crack]] needs a [fracture] table: without it no edge can be broken (strength = inf)")

@@ -61,13 +61,15 @@ def run(name: str) -> Found:
 
 def surfaces_of(name: str, scene: Scene) -> Found:
     """Where surfaces started and where edges are cut, by sorted keys."""
+    return {f"{name}-starts": scene.fracture.criterion.starts} | cuts_of(name, scene)
+
+
+def cuts_of(name: str, scene: Scene) -> Found:
+    """Where edges are cut, by sorted keys."""
     record = EdgeRecord(scene.fracture.graph)
     record.note(0.0, scene.fracture.criterion.cut)
     gathered = record.gathered()
-    found: Found = {f"{name}-starts": scene.fracture.criterion.starts}
-    if gathered is not None:
-        found[f"{name}-cut"] = gathered[1][:, 1]
-    return found
+    return {} if gathered is None else {f"{name}-cut": gathered[1][:, 1]}
 
 
 def compared() -> Found:

@@ -48,7 +48,7 @@ class BrittleSurfaces:
         """Surfaces that may still start."""
         return self._rules.surfaces - len(self.starts)
 
-    def __call__(self, stress: Values) -> tuple[Edges, Values]:
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""
         none = np.empty(0, np.int64), np.empty(0)
         if not self.left:
@@ -64,6 +64,9 @@ class BrittleSurfaces:
         self.starts = np.concatenate([self.starts, opened.starts])
         edges = self._cut_edges(opened)
         return edges, np.ones(len(edges))
+
+    def moving(self, v: Values, a: Values) -> None:
+        """Stress is all that counts."""
 
     def memory(self) -> tuple[Values, Values]:
         """Where surfaces have started, and where they cut."""

@@ -1,0 +1,12 @@
+"""Cracks that take an energy: their tips advance where the configurational force reaches the fracture energy (2D).
+
+    g = - sum_j V_j Sigma_j grad q(x_j),   Sigma = chi psi I - H^T (chi P),   H = grad u
+
+force      g, the energy that a tip's advance releases for each area of crack
+around     what lies around a place, on any rank
+cutting    the line that cuts a cell, and where it leaves it
+tips       which tips advance, and where cracks begin: the criterion
+splitting  what is left of a cell that has come apart
+
+METHOD section 12 says what was tried. A tip cell is whole and has a broken edge; a split cell has come apart.
+"""

@@ -1,0 +1,83 @@
+"""What lies around a place: sums over the cells within a distance, the same at any number of ranks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import la
+from scipy.spatial import cKDTree
+
+from ...mesh.domain import Domain
+from ...mesh.halo import Halo
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+def local_size(domain: Domain) -> Values:
+    """(cells,) h = sqrt(2 A) in m, A the mean area of the cells around the nodes of each cell (collective)."""
+    volumes, nodes = domain.volumes, domain.cell_nodes
+    sums = la.vector(domain.space.dofmap.index_map, 2, np.float64)
+    rows = sums.array.reshape(-1, 2)
+    np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
+    sums.scatter_reverse(la.InsertMode.add)
+    sums.scatter_forward()
+    return np.asarray(np.sqrt(2 * (rows[:, 0] / rows[:, 1])[nodes].mean(axis=1)))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Cells near places: pair k is of place `place[k]` and cell `cell[k]` of the rows that `Around.exchange` gives.
+
+    Attributes:
+        apart: (pairs, d) from the place to the cell's centre, m.    distance: (pairs,) its length, m.
+        count: number of places.
+    """
+
+    place: Ints
+    cell: Ints
+    apart: Values
+    distance: Values
+    count: int
+
+    def sum(self, values: Values) -> Values:
+        """(places, ...) sums of (pairs, ...) values, in the order of the input mesh."""
+        result = np.zeros((self.count, *values.shape[1:]))
+        np.add.at(result, self.place, values)
+        return result
+
+    def any(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """(places,) whether any pair (pairs,) is flagged."""
+        return np.bincount(self.place[flags], minlength=self.count) > 0
+
+
+class Around:
+    """The cells of this rank and those of others that are near them.
+
+    Attributes:
+        volumes: (near,) m^d.    centres: (near, d) m.
+    """
+
+    def __init__(self, domain: Domain, reach: float) -> None:
+        """`reach`: farthest that anybody will look, m (collective)."""
+        own = domain.nodes[domain.cell_nodes].mean(axis=1)
+        self._halo = Halo(domain.comm, own, reach)
+        number = self._halo(domain.cell_input[:, None].astype(float))[:, 0]
+        self._order = np.argsort(number, kind="stable")
+        self.centres = self._halo(own)[self._order]
+        self.volumes = self._halo(domain.volumes[:, None])[self._order, 0]
+        self._tree = cKDTree(self.centres)
+
+    def exchange(self, values: Values) -> Values:
+        """(near, n) rows of owned and near cells from those of owned ones (cells, n) (collective)."""
+        return self._halo(values)[self._order]
+
+    def pairs(self, places: Values, radius: Values) -> Pairs:
+        """Cells whose centres lie within `radius` (n,) of places (n, d)."""
+        found = self._tree.query_ball_point(places, radius, return_sorted=True) if len(places) else []
+        place = np.repeat(np.arange(len(places)), [len(each) for each in found])
+        cell = np.concatenate([np.empty(0, np.int64), *map(np.asarray, found)]).astype(np.int64)
+        apart = self.centres[cell] - places[place]
+        return Pairs(place, cell, apart, np.linalg.norm(apart, axis=1), len(places))

@@ -1,0 +1,37 @@
+"""The configurational force on a crack tip: what its advance releases for each area of crack, J/m^2."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Values = npt.NDArray[np.float64]
+
+
+def eshelby(psi: Values, H: Values, P: Values) -> Values:
+    """(n, d, d) psi I - H^T P in Pa, of energy densities (n,) in J/m^3, gradients H = grad u and P (n, d, d) in Pa.
+
+    Eshelby (1951); psi and P as the cell has them, chi included.
+    """
+    return np.asarray(psi[:, None, None] * np.eye(H.shape[1]) - np.einsum("nik,nil->nkl", H, P))
+
+
+def plateau(distance: Values, radius: Values) -> Values:
+    """(n,) q at distances (n,) from a tip: 1 up to R / 2, falling linearly to 0 at R (n,)."""
+    return np.clip(2 * (1 - distance / radius), 0.0, 1.0)
+
+
+def plateau_gradient(apart: Values, radius: Values) -> Values:
+    """(n, d) grad q in 1/m at places (n, d) from a tip: q is 1 up to R / 2 and falls linearly to 0 at R (n,)."""
+    r = np.linalg.norm(apart, axis=1)
+    ring = (r > radius / 2) & (r < radius)
+    slope = np.where(ring, -2 / (radius * np.where(ring, r, 1.0)), 0.0)
+    return slope[:, None] * apart
+
+
+def first_piola(cauchy: Values, H: Values, *, linear: bool) -> Values:
+    """(n, d, d) P = J sigma F^-T in Pa, F = I + H; sigma itself where strains are taken for small."""
+    if linear:
+        return cauchy
+    F = H + np.eye(H.shape[1])
+    return np.asarray(np.linalg.det(F)[:, None, None] * (cauchy @ np.linalg.inv(F).transpose(0, 2, 1)))

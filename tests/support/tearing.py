@@ -1,0 +1,48 @@
+"""Runs of cracks that take an energy, compared between ranks: arrays in the order of the input mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .scenes import make_scene, march
+from .shattered import cuts_of
+from .torn import TIGHT, Found, result_of
+
+_SOFT = {"young": 1e4, "poisson": 0.3, "density": 1.0}
+_PLATE = {"builder": "box", "size": [1.0, 1.0], "h": 1 / 16, "pattern": "unstructured"}
+
+RUNS: dict[str, dict[str, Any]] = {
+    "notched": {
+        "mesh": _PLATE, "material": _SOFT | {"energy": "linear"}, "fracture": {"strength": 1e5, "energy": 1.0},
+        "crack": [{"segment": [[0.0, 0.52], [0.5, 0.52]]}],
+        "boundary": [
+            {"on": "bottom", "fix": "xy"},
+            {"on": "top", "displacement": {"time": [0, 1, 11], "value": [[0, 0], [0, 0.013], [0, 0.018]]}},
+        ],
+        "time": {"scheme": "quasi-static", "step": 1.0, "end": 8.0},
+    },
+    "begun": {
+        "mesh": _PLATE | {"size": [2.0, 0.8]}, "material": _SOFT | {"energy": "neo-hookean"},
+        "fracture": {"strength": 400.0, "energy": 0.01, "heterogeneity": {"modulus": 20.0, "seed": 2}},
+        "boundary": [{"on": "left", "velocity": [-4.0, 0.0]}, {"on": "right", "velocity": [4.0, 0.0]}],
+        "time": {"scheme": "explicit", "step": 1e-3, "end": 0.0022},
+    },
+    "shaken": {
+        "mesh": _PLATE, "material": _SOFT | {"energy": "corotated"}, "fracture": {"strength": 1e5, "energy": 0.05},
+        "crack": [{"segment": [[0.0, 0.52], [0.5, 0.52]]}],
+        "boundary": [{"on": "bottom", "velocity": [0.0, -0.4]}, {"on": "top", "velocity": [0.0, 0.4]}],
+        "time": {"scheme": "newmark", "step": 5e-4, "end": 0.02},
+    },
+}  # fmt: skip
+
+
+def run(name: str) -> Found:
+    """A study to its end."""
+    scene, state = make_scene(**RUNS[name], solver=TIGHT)
+    rows = [[float(report.broken), report.kinetic, report.elastic] for report in march(scene, state)]
+    return result_of(name, scene, state, rows) | cuts_of(name, scene)
+
+
+def compared() -> Found:
+    """All runs, each array under the name of its run, with "tearing-" before it."""
+    return {f"tearing-{key}": values for name in RUNS for key, values in run(name).items()}
