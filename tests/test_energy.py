@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from fracsim.errors import InputError
 from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
 from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient
+from fracsim.fracture.energy.seen import Seen
 from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
@@ -146,7 +147,7 @@ def test_the_force_of_a_known_field(kind: str) -> None:
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.displace(u.ravel())
         stress, psi = scene.fracture.evaluate()
-        force = criterion.forces(criterion._look(stress, psi, point), point, DISC * criterion._h[tips])[0] * STIFF
+        force = criterion.sight.look(stress, psi, point).forces(point, DISC * criterion._h[tips])[0] * STIFF
         expected = np.array([first**2 + second**2, -2 * first * second])
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
 
@@ -200,20 +201,20 @@ def test_a_notched_plate_breaks_at_griffiths_load(kind: str, n: int) -> None:
 
 
 @pytest.mark.parametrize(("kind", "n"), MESHES)
-def test_event_by_event_the_crack_takes_its_energy(kind: str, n: int) -> None:
+def test_event_by_event_the_crack_takes_its_energy(kind: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cell cut at the load at which its tip reaches G_c, with snap-back: the sum of what the plate lets go, over
     the length of the crack, is G_c to 5 % (to 10 % on the coarsest mesh, where the path has 6 h). A linear plate at
     unit load tells all: load^2 = G_c / |g|."""
     scene = notched(kind, n)
     criterion, state, rows = scene.fracture.criterion, scene.start(), []
-    criterion.toughness, scene.fracture.passes, forces = 1e-30, 1, criterion.forces
+    criterion.toughness, scene.fracture.passes, forces = 1e-30, 1, Seen.forces
 
-    def watched(seen: Any, points: Values, radius: Values) -> Values:
+    def watched(seen: Seen, points: Values, radius: Values) -> Values:
         found = forces(seen, points, radius)
         rows.append([scene.balance.stress.stored(), *points[0], np.linalg.norm(found[0])])
         return np.asarray(found)
 
-    criterion.forces = watched
+    monkeypatch.setattr(Seen, "forces", watched)
     state, _ = scene.stepper.advance(state)
     scene.balance.motion.at = lambda t, held=scene.balance.motion.at: held(1.0)
     while rows[-1][1] < 0.75e-3:
@@ -335,6 +336,7 @@ def test_a_state_is_advanced_twice_alike() -> None:
         ({"fracture": {"strength": 1.0, "energy": 1.0, "radius": 0.1}}, r"not go with fracture\.radius.*3 h"),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "approach": "edge"}}, 'choose approach = "chi"'),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "unilateral": True}}, "do not close yet: remove unilateral"),
+        ({"fracture": {"strength": 1.0, "energy": 1.0}, "output": {"cut": "forces"}}, "say where they cut"),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "cap": 0.1}}, "one cell a pass: remove cap"),
         (
             {"fracture": {"strength": 1.0, "energy": 1.0}, "brittle": {"surfaces": 1}},

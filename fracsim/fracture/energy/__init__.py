@@ -4,6 +4,7 @@
 
 force      g, the energy that a tip's advance releases for each area of crack
 around     what lies around a place, on any rank
+seen       the body as tips see it
 cutting    the line that cuts a cell, and where it leaves it
 tips       which tips advance, and where cracks begin: the criterion
 splitting  what is left of a cell that has come apart

@@ -28,8 +28,9 @@ class Splitting:
     def __init__(self, stress: Stress, graph: EdgeGraph, rate: Values | None = None) -> None:
         assert stress.chi is not None
         self._graph, self._chi, self._volumes = graph, stress.chi.x.array, stress.domain.volumes
-        self.rate, self._began, self._least = rate, -np.inf, np.zeros(0)
+        self.rate, self._began = rate, -np.inf
         self._before: Values = np.ones(0)
+        self._least: Values = np.zeros(0)
 
     def begin(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved, for the first time or once more."""
