@@ -64,7 +64,7 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     from ..fracture.energy.tips import CrackTips
 
     assert study.fracture is not None and study.fracture.energy is not None
-    stress, strength = balance.stress, _strength(study, balance.domain, graph)
+    stress, strength = balance.stress, strength_of(study, balance.domain, graph)
     tips = CrackTips(stress, graph, strength, study.fracture.energy, opened)
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     pace = tips.pace() if moves and balance.scheme.implicit and not given else None

@@ -134,6 +134,7 @@ class Study(Table):
         others = {
             "fracture.approach": (table.approach != "chi", 'cells that a crack cuts fade: choose approach = "chi"'),
             "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
+            "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
             "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
             'output.cut = "forces"': (self.output.cut == "forces", "cracks say where they cut: remove it"),
             "fracture.unilateral": (table.unilateral, "cracks that take an energy do not close yet: remove unilateral"),

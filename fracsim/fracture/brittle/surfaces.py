@@ -48,7 +48,7 @@ class BrittleSurfaces:
         """Surfaces that may still start."""
         return self._rules.surfaces - len(self.starts)
 
-    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
+    def __call__(self, stress: Values, psi: Values | None = None) -> tuple[Edges, Values]:
         """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""
         none = np.empty(0, np.int64), np.empty(0)
         if not self.left:
