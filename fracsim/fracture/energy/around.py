@@ -15,6 +15,8 @@ from ...mesh.halo import Halo
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
+MANY = 1000  # places from which on all cells are wanted
+
 
 def local_size(domain: Domain) -> Values:
     """(cells,) h = sqrt(2 A) in m, A the mean area of the cells around the nodes of each cell (collective)."""
@@ -65,19 +67,28 @@ class Around:
         own = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._halo = Halo(domain.comm, own, reach)
         number = self._halo(domain.cell_input[:, None].astype(float))[:, 0]
-        self._order = np.argsort(number, kind="stable")
-        self.centres = self._halo(own)[self._order]
-        self.volumes = self._halo(domain.volumes[:, None])[self._order, 0]
-        self._tree = cKDTree(self.centres)
+        self._order = np.argsort(number, kind="stable")  # sums are in the order of the input mesh
+        self.centres = self._halo(own)
+        self.volumes = self._halo(domain.volumes[:, None])[:, 0]
+        self._tree = cKDTree(self.centres[self._order])
+        self._own, self._reach, self._comm = cKDTree(own), reach, domain.comm
 
     def exchange(self, values: Values) -> Values:
-        """(near, n) rows of owned and near cells from those of owned ones (cells, n) (collective)."""
-        return self._halo(values)[self._order]
+        """(near, n) rows of owned and near cells, in this order, from those of owned ones (cells, n) (collective)."""
+        return self._halo(values)
+
+    def wanted(self, places: Values) -> Ints:
+        """Owned cells near the places (n, d) that any rank looks at (collective)."""
+        every = np.concatenate(self._comm.allgather(places))
+        if len(every) > MANY:
+            return np.arange(self._own.n)
+        found = self._own.query_ball_point(every, self._reach) if len(every) else []
+        return np.unique(np.concatenate([np.empty(0, np.int64), *map(np.asarray, found)]).astype(np.int64))
 
     def pairs(self, places: Values, radius: Values) -> Pairs:
         """Cells whose centres lie within `radius` (n,) of places (n, d)."""
         found = self._tree.query_ball_point(places, radius, return_sorted=True) if len(places) else []
         place = np.repeat(np.arange(len(places)), [len(each) for each in found])
-        cell = np.concatenate([np.empty(0, np.int64), *map(np.asarray, found)]).astype(np.int64)
+        cell = self._order[np.concatenate([np.empty(0, np.int64), *map(np.asarray, found)]).astype(np.int64)]
         apart = self.centres[cell] - places[place]
         return Pairs(place, cell, apart, np.linalg.norm(apart, axis=1), len(places))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.spatial import cKDTree
 
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
@@ -26,7 +25,7 @@ class Seen:
     """The body as it is: rows of the cells of this rank and those near them, in the order of `around`.
 
     Attributes:
-        stress: (near, 2, 2) Cauchy stress of the undamaged material, Pa.
+        stress: (near, 2, 2) Cauchy stress of the undamaged material, Pa; 0 far from where anybody looks.
         sigma: (near, 2, 2) Eshelby's stress of the body as it is, Pa; 0 far from tips.
         inertia: (near, 2) rho (H^T a - (grad v)^T v), N/m^3; 0 far from tips, and where nothing has a mass.
         split, damaged: (near,) come apart; with a broken edge.
@@ -90,29 +89,27 @@ class Sight:
         domain = self._domain = stress.domain
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
         self.motion: tuple[Values, Values] | None = None
-        self._reach, farther = (
-            float(domain.comm.allreduce(float(np.max(each, initial=0.0)), op=MPI.MAX)) for each in (disc, disc + beyond)
-        )
-        self.around = Around(domain, farther)
+        farthest = float(np.max(disc + beyond, initial=0.0))
+        self.around = Around(domain, float(domain.comm.allreduce(farthest, op=MPI.MAX)))
         self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))
 
-    def look(self, stress: Values, psi: Values, points: Values) -> Seen:
-        """What is around (collective)."""
+    def look(self, stress: Values, psi: Values, points: Values, others: Values) -> Seen:
+        """What is around the tips at `points` (n, 2), and `others` (m, 2) where cracks may begin (collective)."""
         graph, count = self._graph, len(stress)
-        sigma, inertia = np.zeros((count, 2, 2)), np.zeros((count, 2))
-        every = np.concatenate(self._domain.comm.allgather(points))
-        if len(every):
-            near, _ = cKDTree(every).query(self.centres, distance_upper_bound=self._reach)
-            assert self._stress.chi is not None
-            cells = np.flatnonzero(np.isfinite(near) & (self._stress.chi.x.array[:count] > 0))
-            H = self.gradients(cells, self._stress.u.x.array)
-            sigma[cells] = self._eshelby(cells, tensors(stress[cells], 2), psi[cells], H)
-            if self.motion is not None:
-                kinetic, inertia[cells] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
-                sigma[cells] += kinetic[:, None, None] * np.eye(2)
-        flags = graph.split[:, None], graph.damaged[:, None]
-        rows = [tensors(stress, 2).reshape(-1, 4), sigma.reshape(-1, 4), inertia, *flags]
-        seen = self.around.exchange(np.hstack(rows))
+        rows = np.zeros((count, 12))
+        cells = self.around.wanted(np.concatenate([points, others]))
+        rows[cells, :4] = tensors(stress[cells], 2).reshape(-1, 4)
+        rows[cells, 10], rows[cells, 11] = graph.split[cells], graph.damaged[cells]
+        assert self._stress.chi is not None
+        cells = self.around.wanted(points)
+        cells = cells[self._stress.chi.x.array[cells] > 0]
+        H = self.gradients(cells, self._stress.u.x.array)
+        sigma = self._eshelby(cells, tensors(stress[cells], 2), psi[cells], H)
+        if self.motion is not None:
+            kinetic, rows[cells, 8:10] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
+            sigma += kinetic[:, None, None] * np.eye(2)
+        rows[cells, 4:8] = sigma.reshape(-1, 4)
+        seen = self.around.exchange(rows)
         stress, sigma = (seen[:, k : k + 4].reshape(-1, 2, 2) for k in (0, 4))
         return Seen(self.around, stress, sigma, seen[:, 8:10], seen[:, 10] > 0, seen[:, 11] > 0)
 

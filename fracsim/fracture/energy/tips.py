@@ -21,6 +21,7 @@ from ...mesh.simplices import local_edges
 from ..brittle.principal import directions, largest, material_normals, tensors, upper_bound
 from ..cracks import ends_in_order
 from ..criterion import Edges
+from ..edge_stress import frobenius_norm
 from ..strength import Strength, hashed
 from .around import local_size
 from .cutting import Cuts, leave, through_centre
@@ -89,13 +90,13 @@ class CrackTips:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
         graph = self._graph
         tips = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        weak = upper_bound(tensors(stress, 2)) >= self.strength.weakest
-        weak_cells = np.flatnonzero(weak & ~graph.damaged).astype(np.int64)
-        if not total(self._domain.comm, len(tips) + len(weak_cells))[0]:
+        weak = np.flatnonzero(~graph.damaged & (frobenius_norm(stress, 2) >= self.strength.weakest)).astype(np.int64)
+        weak = weak[upper_bound(tensors(stress[weak], 2)) >= self.strength.weakest]
+        if not total(self._domain.comm, len(tips) + len(weak))[0]:
             return np.empty(0, np.int64), np.empty(0)
         entry, point = self._entries(tips)
-        seen = self.sight.look(stress, psi, point)
-        edges = self._cut(*self._chosen(self._grown(seen, tips, entry, point), self._begun(seen, weak_cells)))
+        seen = self.sight.look(stress, psi, point, self.sight.centres[weak])
+        edges = self._cut(*self._chosen(self._grown(seen, tips, entry, point), self._begun(seen, weak)))
         return edges, np.ones(len(edges))
 
     def moving(self, v: Values, a: Values) -> None:
