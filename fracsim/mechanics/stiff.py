@@ -12,11 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, hstack
+from scipy.sparse.csgraph import connected_components
 
 Values = npt.NDArray[np.float64]
 
-DOFS, DIRECTIONS = 450, 64  # of what is few: more is dearer than the iterations that it saves
+# of what is few: dofs in one group of points that are coupled, and directions. More is dearer than the iterations that
+# it saves
+DOFS, DIRECTIONS = 450, 64
 
 
 @dataclass(frozen=True)
@@ -33,14 +36,21 @@ class Stiff:
 
 
 def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] | None:
-    """(n, m) orthonormal eigenvectors of a symmetric H (n, n) and (m,) eigenvalues above `least`, N/m; None where H
-    has more than DOFS rows that are not empty, or more than DIRECTIONS such values."""
+    """(n, m) orthonormal eigenvectors of a symmetric H (n, n) and (m,) eigenvalues above `least`, N/m; None where more
+    than DOFS rows are coupled, or there are more than DIRECTIONS such values."""
     rows = np.flatnonzero(np.diff(H.indptr))
-    if len(rows) > DOFS:
+    own = H[rows][:, rows]
+    _, group = connected_components(own, directed=False)
+    sizes = np.bincount(group)
+    if sizes.max(initial=0) > DOFS:
         return None
-    values, vectors = np.linalg.eigh(H[rows][:, rows].toarray())
-    stiff = np.flatnonzero(values > least)
-    if len(stiff) > DIRECTIONS:
-        return None
-    at = np.repeat(rows, len(stiff)), np.tile(np.arange(len(stiff)), len(rows))
-    return csr_matrix((vectors[:, stiff].reshape(-1), at), shape=(H.shape[0], len(stiff))), values[stiff]
+    columns, values = [csr_matrix((H.shape[0], 0))], [np.empty(0)]
+    for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]):
+        found, vectors = np.linalg.eigh(own[part][:, part].toarray())
+        stiff = found > least
+        count = int(stiff.sum())
+        at = np.repeat(rows[part], count), np.tile(np.arange(count), len(part))
+        columns.append(csr_matrix((vectors[:, stiff].reshape(-1), at), shape=(H.shape[0], count)))
+        values.append(found[stiff])
+    stiffness = np.concatenate(values)
+    return None if len(stiffness) > DIRECTIONS else (hstack(columns, format="csr"), stiffness)
