@@ -133,7 +133,7 @@ def test_a_body_at_rest_is_carried(tmp_path: Path) -> None:
     scene, state = make_scene(
         mesh=CUBE, material=SOFT, load={"gravity": [0.0, 0.0, -G]}, damping={"mass": 10.0}, solver=FINE,
         obstacle=[block(tmp_path, (200.0, 200.0, 100.0), "obj") | {"at": [0.5, 0.5, -0.52], "scale": 0.01}],
-        time={"scheme": "backward-euler", "step": 0.5, "end": 3.0},
+        time={"scheme": "backward-euler", "step": 0.5, "end": 5.0},
     )  # fmt: skip
     march(scene, state)
     found = last(scene)
