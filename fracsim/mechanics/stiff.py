@@ -53,4 +53,4 @@ def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] |
         columns.append(csr_matrix((vectors[:, stiff].reshape(-1), at), shape=(H.shape[0], count)))
         values.append(found[stiff])
     stiffness = np.concatenate(values)
-    return None if len(stiffness) > DIRECTIONS else (hstack(columns, format="csr"), stiffness)
+    return None if len(stiffness) > DIRECTIONS else (csr_matrix(hstack(columns)), stiffness)

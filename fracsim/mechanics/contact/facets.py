@@ -1,11 +1,12 @@
 """What an obstacle does to facets between their corners: their deepest place has a barrier, too.
 
-    F(x) = A [ b(gap) - B ],      B = (sum_c b(gap_c)^p)^(1/p)
+    F(x) = A [ b(gap) - b(gap') ]
 
-A the reference area of a facet, gap that of its deepest place (deepest), gap_c those of its corners, whose own energy
-A/c sum_c b(gap_c) is that of the points (touch). B is the largest of the b(gap_c), smoothly: where a facet is flat
-against the obstacle its deepest place is as deep as a corner, and nothing is counted twice; where the obstacle is round
-or small against it, nothing is subtracted, and F grows without bound before the facet is cut.
+A the reference area of a facet, gap that of its deepest place (deepest), gap' what it would be from the gaps of the
+corners before an obstacle that is flat (flat); the corners' own energy A/c sum_c b(gap_c) is that of the points (touch).
+Before what is flat F is 0 with all its derivatives, and nothing is counted twice; before what is round F > 0, and grows
+without bound before the facet is cut. (The largest of the b(gap_c), smoothly, in place of b(gap') is the same for a
+facet that lies flat, but not for one that is about to tilt: it made tangents of large flat faces indefinite.)
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy.typing as npt
 from .along import Along
 from .barrier import KEPT
 from .deepest import Deepest, before_the_core, deepest, most_above
+from .flat import IfFlat
 from .law import Repulsion
 from .placed import Placed
 from .touch import positive
@@ -27,7 +29,6 @@ from .touch import positive
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-POWER = 8
 HUGE = 1e200  # Pa, of a facet that is cut: no infinity, of which there is no product with 0
 SOFTEN = 0.1  # of the width of the barrier, of deepest places
 FLAT = 0.1  # of the width: facets that bend away from an obstacle by less are as good as flat
@@ -133,14 +134,15 @@ class Between:
     """F of facets near an obstacle.
 
     Attributes:
-        corners: (k, c) points.    area: (k,).    at: their deepest places.    law: b of their gaps.
-        of_corners: b of the gaps of all their corners.
+        corners: (k, c) points.    area: (k,).    at: their deepest places.
+        law, if_flat, of_corners: b of the gaps of these, of gap', and of all their corners.
     """
 
     corners: Ints
     area: Values
     at: Deepest
     law: Repulsion | Along
+    if_flat: Repulsion | Along
     of_corners: Repulsion | Along
 
     @cached_property
@@ -156,29 +158,22 @@ class Between:
         return self.at.placed.normal(self.at.x.reshape(-1, d)).reshape(k, c, d)
 
     @cached_property
-    def _largest(self) -> tuple[Values, Values]:
-        """(k,) B and (k, c) b_c / B."""
-        b = self.of_corners.energy(self._gaps.reshape(-1)).reshape(self._gaps.shape)
-        top = b.max(axis=1)
-        scale = np.where((top > 0) & np.isfinite(top), top, 1.0)
-        with np.errstate(invalid="ignore"):
-            B = scale * np.sum((b / scale[:, None]) ** POWER, axis=1) ** (1 / POWER)
-            return B, np.where(top[:, None] > 0, b / np.where(B > 0, B, 1.0)[:, None], 0.0)
+    def _flat(self) -> IfFlat:
+        return IfFlat(self._gaps, self.at.soften)
 
     @property
     def energy(self) -> Values:
         """(k,) J; infinite where a facet is cut."""
-        inner = self.law.energy(self.at.gap)
+        inner, flat = self.law.energy(self.at.gap), self.if_flat.energy(self._flat.gap)
         cut = ~np.isfinite(inner)
-        return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - self._largest[0]))
+        return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - np.where(cut, 0.0, flat)))
 
     @cached_property
     def forces(self) -> Values:
         """(k, c, d) on the corners, N."""
-        parts = self._largest[1] ** (POWER - 1)
-        slopes = self.of_corners.slope(self._gaps.reshape(-1)).reshape(self._gaps.shape)
         own = np.maximum(self.law.slope(self.at.gap), -HUGE)[:, None, None] * self.at.by_corner
-        return np.asarray(-self.area[:, None, None] * (own - (parts * slopes)[:, :, None] * self._normals))
+        slope = np.maximum(self.if_flat.slope(self._flat.gap), -HUGE)[:, None]
+        return np.asarray(-self.area[:, None, None] * (own - (slope * self._flat.share)[:, :, None] * self._normals))
 
     def exact(self) -> Values:
         """(k, c d, c d) second derivative of F, N/m."""
@@ -186,15 +181,18 @@ class Between:
         n = self.at.by_corner.reshape(k, c * d)
         own = self.law.curvature(self.at.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
         own = own + self.law.slope(self.at.gap)[:, None, None] * self.at.curvature()
-        B, ratio = self._largest
-        parts = ratio ** (POWER - 1)
-        bent = np.einsum("kc,kcij->kcij", parts, self._of_corners())
-        slopes = self.of_corners.slope(self._gaps.reshape(-1)).reshape(k, c, 1) * self._normals
-        twice = np.eye(c) * (ratio ** (POWER - 2))[:, None, :] - parts[:, :, None] * parts[:, None, :]
-        twice = twice * ((POWER - 1) / np.where(B > 0, B, np.inf))[:, None, None]
-        largest = np.einsum("kce,kci,kej->kciej", twice, slopes, slopes)
-        largest[:, range(c), :, range(c), :] += bent.transpose(1, 0, 2, 3)
-        return np.asarray(self.area[:, None, None] * (own - largest.reshape(k, c * d, c * d)))
+        return np.asarray(self.area[:, None, None] * (own - self._bent_if_flat()))
+
+    def _bent_if_flat(self) -> Values:
+        """(k, c d, c d) second derivative of b(gap'), Pa/m."""
+        k, c, d = self.at.x.shape
+        flat, n = self._flat, self._normals
+        slope, share = self.if_flat.slope(flat.gap)[:, None, None], flat.share
+        twice = self.if_flat.curvature(flat.gap)[:, None, None] * share[:, :, None] * share[:, None, :]
+        bent = np.einsum("kce,kci,kej->kciej", twice + slope * flat.curvature(), n, n)
+        H = self.at.placed.curvature(self.at.x.reshape(-1, d)).reshape(k, c, d, d)
+        bent[:, range(c), :, range(c), :] += (slope[..., None] * share[:, :, None, None] * H).transpose(1, 0, 2, 3)
+        return np.asarray(bent.reshape(k, c * d, c * d))
 
     def _of_corners(self) -> Values:
         """(k, c, d, d) second derivative of b at each corner, Pa/m."""
@@ -223,12 +221,14 @@ def between(
         near = np.union1d(near, facets.near(*start, law.width))
     corners, area = facets.corners[near], facets.area[near]
     at = facets.look(placed, x, near)
-    stored = Between(corners, area, at, law, law)
+    stored = Between(corners, area, at, law, law, law)
     if start is None:
         return stored, float(stored.energy.sum())
     then = deepest(start[0], start[1][corners], facets.soften, at.share).gap
     of_corners = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
-    return Between(corners, area, at, Along(law, then), Along(law, of_corners)), float(stored.energy.sum())
+    flat = IfFlat(of_corners.reshape(corners.shape), facets.soften).gap
+    laws = (Along(law, gap) for gap in (then, flat, of_corners))
+    return Between(corners, area, at, *laws), float(stored.energy.sum())
 
 
 def _diagonal(blocks: Values) -> Values:
