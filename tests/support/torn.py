@@ -326,7 +326,7 @@ def squeezed() -> Found:
     next(steps), next(steps)
     graph = scene.fracture.graph
     height = scene.domain.nodes[graph.edge_nodes] @ np.array([0.3, 1.0])
-    graph.break_edges((height.min(axis=1) < 0.45) & (height.max(axis=1) > 0.45))
+    graph.break_edges((height.min(axis=1) < 0.4) & (height.max(axis=1) > 0.4))
     scene.fracture.restored()
     scene.balance.damage_changed()
     scene.balance.edges_broke(graph.pattern)
