@@ -2,8 +2,8 @@
 
     F(x) = A [ b(gap) - b(gap') ]
 
-A the reference area of a facet, gap that of its deepest place (deepest), gap' what it would be from the gaps of the
-corners before an obstacle that is flat (flat); the corners' own energy A/c sum_c b(gap_c) is that of the points (touch).
+A the reference area of a facet, gap that of its deepest place (deepest), gap' what it would be from the gaps of its
+corners before an obstacle that is flat (flat). The corners' own energy A/c sum_c b(gap_c) is that of points (touch).
 Before what is flat F is 0 with all its derivatives, and nothing is counted twice; before what is round F > 0, and grows
 without bound before the facet is cut. (The largest of the b(gap_c), smoothly, in place of b(gap') is the same for a
 facet that lies flat, but not for one that is about to tilt: it made tangents of large flat faces indefinite.)
