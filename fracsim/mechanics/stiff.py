@@ -44,7 +44,7 @@ def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] |
     sizes = np.bincount(group)
     if sizes.max(initial=0) > DOFS:
         return None
-    columns, values = [csr_matrix((H.shape[0], 0))], [np.empty(0)]
+    columns, values = [csr_matrix((H.shape[0], 0))], list[Values]()
     for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]):
         found, vectors = np.linalg.eigh(own[part][:, part].toarray())
         stiff = found > least
@@ -52,5 +52,5 @@ def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] |
         at = np.repeat(rows[part], count), np.tile(np.arange(count), len(part))
         columns.append(csr_matrix((vectors[:, stiff].reshape(-1), at), shape=(H.shape[0], count)))
         values.append(found[stiff])
-    stiffness = np.concatenate(values)
+    stiffness: Values = np.concatenate(values) if values else np.empty(0)
     return None if len(stiffness) > DIRECTIONS else (csr_matrix(hstack(columns)), stiffness)

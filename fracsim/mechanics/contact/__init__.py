@@ -4,7 +4,7 @@ obstacles         the term of the balance
 touching, touch   what touches in a step; barrier and friction at the points of a surface, by their law
 skin, course      the points that touch; obstacles on their ways
 facets, deepest   facets between their points before round and small obstacles: what acts at their deepest place
-shares            a step of Newton's method to that
+shares, flat      a step of Newton's method to that; where it would be before what is flat
 joined            that, with what acts at the points
 obstacle          one that is held or driven
 free_obstacles    the term with obstacles that move by themselves; free_obstacle, shifted: one of them, on a hinge
