@@ -24,6 +24,7 @@ from mpi4py import MPI
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.output.fields import Frames
+from fracsim.output.same_study import differences
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh, save_mesh
@@ -272,6 +273,14 @@ def test_a_restart_of_another_study_is_refused(tmp_path: Path, stopped: Path, ta
     assert f"--restart: {out / 'checkpoint' / 'state.h5'} is of another study: {message}" in str(refused.value)
     assert "Only time.step, time.end, time.adapt, time.smallest, [solver], [output] and the title" in str(refused.value)
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_tables_that_an_earlier_version_did_not_know_are_empty() -> None:
+    """A list of tables is absent where it is empty, and not where it has an entry."""
+    then: dict[str, object] = {"mesh": {"h": 0.1}}
+    assert list(differences(then, then | {"crack": []})) == []
+    (found,) = differences(then, then | {"crack": [{"segment": [0.0, 1.0]}]})
+    assert found.startswith("crack.0.segment was absent")
 
 
 @pytest.mark.parametrize("ranks", [0, 2])

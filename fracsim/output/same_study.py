@@ -60,7 +60,10 @@ def _within(key: str, names: list[str] | tuple[str, ...]) -> bool:
 
 
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of a TOML document; entries of lists of tables by their number."""
+    """(dotted key, value) of a TOML document; entries of lists of tables by their number. An empty list is no key:
+    tables that an earlier version did not know are empty."""
+    if value == []:
+        return
     if isinstance(value, list) and value and isinstance(value[0], dict):
         value = dict(enumerate(value))
     if not isinstance(value, dict):
