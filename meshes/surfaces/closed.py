@@ -13,6 +13,7 @@ from ..data import Indices, MeshError, Points
 from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
+from .enclosed import enclosed_volumes, windings
 
 JOINED = 1e-6  # points nearer than this share of the body's size are one
 PROBES = 300  # points of a part that are looked up in another part
@@ -60,12 +61,6 @@ class ClosedSurface:
         """Points and triangles of one shell."""
         used, triangles = np.unique(self.triangles[self.shell == shell], return_inverse=True)
         return self.points[used], triangles.reshape(-1, 3)
-
-
-def enclosed_volumes(points: Points, triangles: Indices) -> Floats:
-    """The triangles' shares x_0 . (x_1 x x_2) / 6 of the enclosed volume (divergence theorem) [m^3]: (k,)."""
-    a, b, c = (points - points.mean(axis=0))[triangles].transpose(1, 0, 2)
-    return np.einsum("ki,ki->k", a, np.cross(b, c)) / 6
 
 
 def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
@@ -240,7 +235,7 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
     corners = [points[triangles[shell == j]] for j in range(count)]
     for i, j in _near(corners):
         probes = np.unique(corners[i].reshape(-1, 3), axis=0)
-        within = np.array([abs(_winding(p, corners[j])) > 0.5 for p in probes[:: 1 + len(probes) // PROBES]])
+        within = abs(windings(probes[:: 1 + len(probes) // PROBES], corners[j])) > 0.5
         if within.any() and not within.all():
             raise MeshError(
                 f"{source} has parts that cut each other, near {middle_of(points, triangles[shell == i].ravel())}; "
@@ -256,15 +251,3 @@ def _near(corners: list[Floats]) -> list[tuple[int, int]]:
     high = np.array([c.max(axis=(0, 1)) for c in corners])
     overlap = (low[:, None] < high[None]).all(axis=2) & (low[None] < high[:, None]).all(axis=2)
     return [(int(i), int(j)) for i, j in np.argwhere(overlap) if i != j]
-
-
-def _winding(point: Floats, corners: Floats) -> float:
-    """How often the triangles (k, 3, 3) wind around the point: the sum of their solid angles over 4 pi.
-
-    tan(omega / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|)   (Van Oosterom, Strackee 1983)
-    """
-    a, b, c = (corners - point).transpose(1, 0, 2)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    dots = [np.einsum("ki,ki->k", v, w) for v, w in ((a, b), (b, c), (c, a))]
-    below = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
-    return float(np.arctan2(np.einsum("ki,ki->k", a, np.cross(b, c)), below).sum() / (2 * np.pi))

@@ -16,7 +16,8 @@ from ..parameters import affordable, positive, require
 from ..sizing import Sizing, cells_for_body
 from ..timed import within
 from ..topology import Floats, boundary_facets, distinct_rows, facets_of, signed_measures
-from .closed import ClosedSurface, enclosed_volumes, read_surface
+from .closed import ClosedSurface, read_surface
+from .enclosed import enclosed_volumes
 
 SHARP = 40 * pi / 180  # edges where the normal turns by more than this are kept
 REMESHED = 0.10  # a remeshed surface may enclose this much more or less of its volume, or its own triangles are taken

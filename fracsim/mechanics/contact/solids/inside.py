@@ -7,13 +7,14 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ....meshes.surfaces.enclosed import AT_ONCE, parts, windings
+
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 type Closed = tuple[Values, Ints]  # points (n, 3), m, and triangles (k, 3)
 
-AT_ONCE = 1_000_000  # pairs of a point and a triangle
-MOST = 30 * AT_ONCE  # of those looked at
+MOST = 30 * AT_ONCE  # pairs of a point and a triangle that are looked at
 
 
 def depth(one: Closed, other: Closed, *, cut: bool) -> float | None:
@@ -46,19 +47,8 @@ def _asked(surface: Closed, *, cut: bool) -> Ints:
 
 
 def is_inside(x: Values, corners: Values) -> Flags:
-    """(n,) whether triangles (k, 3, 3) wind around points x (n, 3): their solid angles over 4 pi come to 1 or more.
-
-    tan(omega / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|)   (Van Oosterom, Strackee 1983)
-    """
-
-    def windings(x: Values) -> Values:
-        a, b, c = (corners[None] - x[:, None, None]).transpose(2, 0, 1, 3)
-        la, lb, lc = (np.linalg.norm(each, axis=2) for each in (a, b, c))
-        ab, bc, ca = (np.einsum("nki,nki->nk", *pair) for pair in ((a, b), (b, c), (c, a)))
-        above = np.einsum("nki,nki->nk", a, np.cross(b, c))
-        return np.asarray(np.arctan2(above, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi))
-
-    return np.concatenate([windings(part) for part in _parts(x, len(corners))]) > 0.5
+    """(n,) whether triangles (k, 3, 3) wind around points x (n, 3) once or more."""
+    return windings(x, corners) > 0.5
 
 
 def distances(x: Values, corners: Values) -> Values:
@@ -77,9 +67,4 @@ def distances(x: Values, corners: Values) -> Values:
         height = abs(np.einsum("nki,ki->nk", to[:, :, 0], normal))
         return np.asarray(np.where(over, height, least).min(axis=1))
 
-    return np.concatenate([nearest(part) for part in _parts(x, len(corners))])
-
-
-def _parts(x: Values, count: int) -> list[Values]:
-    """Of points (n, 3), each few enough for `count` triangles at once."""
-    return np.array_split(x, 1 + len(x) * count // AT_ONCE)
+    return np.concatenate([nearest(part) for part in parts(x, len(corners))])

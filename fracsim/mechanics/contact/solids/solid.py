@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ....meshes.surfaces.enclosed import enclosed_volumes
 from ..outlines import Outline
 
 Values = npt.NDArray[np.float64]
@@ -33,9 +34,8 @@ class Solid:
 
     @property
     def volume(self) -> float:
-        """m^3, by the divergence theorem."""
-        a, b, c = self.points[self.triangles].transpose(1, 0, 2)
-        return float(np.einsum("ki,ki->", a, np.cross(b, c)) / 6)
+        """m^3."""
+        return float(enclosed_volumes(self.points, self.triangles).sum())
 
     def distance(self, x: Values) -> Values:
         """NotImplementedError."""
