@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from support.ranks import Arrays, OnRanks
+from support.ranks import OnRanks, Results, starting
 from support.tearing import RUNS
 
 pytestmark = pytest.mark.ranks
-Results = Callable[[int], Arrays]
 
 
 @pytest.fixture(scope="module")
 def results(on_ranks: OnRanks) -> Results:
     """Arrays of a rank count."""
-    prefix = "tearing-"
-    return lambda ranks: {
-        key.removeprefix(prefix): each for key, each in on_ranks(ranks)[0].items() if key.startswith(prefix)
-    }
+    return starting("tearing-", on_ranks)
 
 
 @pytest.mark.parametrize("name", RUNS)

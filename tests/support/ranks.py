@@ -15,6 +15,7 @@ import numpy.typing as npt
 TESTS = Path(__file__).resolve().parents[1]
 Arrays = dict[str, npt.NDArray[np.generic]]
 OnRanks = Callable[[int], tuple[Arrays, Path]]
+Results = Callable[[int], Arrays]
 
 
 def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> Arrays:
@@ -41,3 +42,12 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> A
 def loaded(target: Path) -> Arrays:
     with np.load(target) as arrays:
         return dict(arrays)
+
+
+def starting(prefix: str, on_ranks: OnRanks) -> Results:
+    """Arrays of a rank count whose names start with a prefix, without it."""
+
+    def results(ranks: int) -> Arrays:
+        return {key.removeprefix(prefix): each for key, each in on_ranks(ranks)[0].items() if key.startswith(prefix)}
+
+    return results

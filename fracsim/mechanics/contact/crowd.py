@@ -9,13 +9,14 @@ again, and those left out come back, where nothing acts on them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from ...errors import InputError
-from ...mesh.split.build import Split, split
+from ...mesh.split.build import split
 from ...mesh.split.identity import found_again, identity
 from ...mesh.split.places import whole
 from ...mesh.split.skeleton import Skeleton
@@ -60,14 +61,17 @@ class Surface:
 
     Attributes:
         made: the surface.    at: where its points are, new walls drawn back.    pairs: what may touch.
+        gap: between the sides of a new crack, in distances of the barrier.
     """
+
+    gap: ClassVar[float] = GAP
 
     def __init__(
         self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
     ) -> None:
         """`u`: (nodes, d) where the body is, m; `before`: the surface until now."""
         self.made = split_of_pieces(skeleton, pattern) if law.pieces else split(skeleton, pattern)
-        self._rest = receded(self.made, GAP * law.distance)
+        self._rest = receded(self.made, self.gap * law.distance)
         self.at = whole(self.made, skeleton, pattern, self._rest)
         self._how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         copies = np.zeros(len(self._rest), bool)
@@ -78,19 +82,31 @@ class Surface:
         self._out: Ints = np.empty(0, np.int64)
         self._pause = (1, 1)  # steps between two looks for room, and to the next
         if before is None:
-            _check_apart(self.pairs, self.made)
+            self._check_apart()
         else:
             share, load = self._known(before, u)
             self.at = self.at.drawn_in(share)
             self._settle(u, load)
 
+    def _check_apart(self) -> None:
+        """InputError where a body at rest cuts or touches itself."""
+        if len(found := self.pairs.overlaps(self.made.points)):
+            where = format_point(self.made.points[self.made.elements[found[0]]].mean(axis=(0, 1)))
+            raise InputError(
+                f"[contact]: {len(found)} pairs of surface elements cut or touch each other at the start, the first "
+                f"near {where}; move the bodies apart"
+            )
+
     def _all_pairs(self) -> Pairs:
-        return Pairs(self._rest, self.made.elements, **self._how)
+        return self._pairs_of(self.made.elements)
+
+    def _pairs_of(self, elements: Ints) -> Pairs:
+        return Pairs(self._rest, elements, **self._how)
 
     def _leave_out(self, elements: Ints) -> None:
         """Pairs without these elements (k,)."""
         if len(elements):
-            self.pairs = Pairs(self._rest, np.delete(self.made.elements, elements, axis=0), **self._how)
+            self.pairs = self._pairs_of(np.delete(self.made.elements, elements, axis=0))
         self._out = elements
 
     def memory(self) -> Memory:
@@ -215,13 +231,3 @@ class Surface:
             return K, None
         directions, stiffness = found
         return K, ((W.T @ directions).toarray().reshape(self._nodes, d * len(stiffness)), stiffness)
-
-
-def _check_apart(pairs: Pairs, made: Split) -> None:
-    """InputError where a body at rest cuts or touches itself."""
-    if len(found := pairs.overlaps(made.points)):
-        where = format_point(made.points[made.elements[found[0]]].mean(axis=(0, 1)))
-        raise InputError(
-            f"[contact]: {len(found)} pairs of surface elements cut or touch each other at the start, the first near "
-            f"{where}; move the bodies apart"
-        )
