@@ -36,10 +36,18 @@ def _part(a: Values, b: Values, c: Values, d: Values) -> Flags:
 def _of_triangles(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
     near = _pairs([(each.edge_id, each.face_id) for each in phase.detect_edge_face_candidates()])
     near = near[_pierced(x[mesh.edges[near[:, 0]]], x[mesh.faces[near[:, 1]]])]
-    of_edge = np.empty(len(mesh.edges), np.int64)  # a triangle of each edge
-    of_edge[mesh.faces_to_edges.ravel()] = np.repeat(np.arange(len(mesh.faces)), 3)
-    near[:, 0] = of_edge[near[:, 0]]
-    return np.unique(np.sort(near, axis=1), axis=0)
+    which, triangle = _around(mesh.faces_to_edges, near[:, 0])
+    return np.unique(np.sort(np.column_stack([triangle, near[which, 1]]), axis=1), axis=0)
+
+
+def _around(edges: Ints, of: Ints) -> tuple[Ints, Ints]:
+    """All triangles at the edges `of` (k,): (m,) which of the k, and (m,) the triangle; `edges` (triangles, 3)."""
+    order = np.argsort(edges, axis=None, kind="stable")
+    sorted_edges = edges.reshape(-1)[order]
+    first, end = (np.searchsorted(sorted_edges, of, side) for side in ("left", "right"))
+    which = np.repeat(np.arange(len(of)), count := end - first)
+    at = np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
+    return which, order[at] // edges.shape[1]
 
 
 def _pierced(ends: Values, corners: Values) -> Flags:

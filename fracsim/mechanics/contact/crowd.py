@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, kron
 
 from ...errors import InputError
 from ...mesh.split.build import split
@@ -225,7 +225,10 @@ class Surface:
     def stiffness(self, H: csr_matrix, least: float) -> tuple[csr_matrix, tuple[Values, Values] | None]:
         """(nodes d, nodes d) of (n d, n d), N/m; and where it is little, (nodes, d m) directions stiffer than `least`
         N/m with their (m,) stiffness."""
-        W, d = self.at.by_component, self._rest.shape[1]
+        d = self._rest.shape[1]
+        points = np.unique(np.flatnonzero(np.diff(H.indptr)) // d)  # few, mostly
+        rows = (d * points[:, None] + np.arange(d)).reshape(-1)
+        W, H = kron(self.at.weights[points], np.eye(d), format="csr"), H[rows][:, rows]
         K = (W.T @ H @ W).tocsr()
         if (found := stiff_directions(H, least)) is None:
             return K, None

@@ -22,17 +22,10 @@ CCD = ipctk.AdditiveCCD(ROUNDS, 1.0 - KEPT)
 
 @dataclass(frozen=True)
 class Kind:
-    """The barrier of one kind of pairs, and the list of ipctk's candidates that is not looked at."""
+    """The barrier of one kind of pairs, and the name of its list among ipctk's candidates."""
 
     barrier: ipctk.BarrierPotential
-    drop: str
-
-    def candidates(self, mesh: ipctk.CollisionMesh, *x: Values, radius: float) -> ipctk.Candidates:
-        """Pairs nearer than twice `radius` (m) at x, or on the way from one x to the other."""
-        found = ipctk.Candidates()
-        found.build(mesh, *x, radius, ipctk.LBVH())
-        setattr(found, self.drop, [])
-        return found
+    name: str
 
     def touching(self, candidates: ipctk.Candidates, mesh: ipctk.CollisionMesh, x: Values) -> ipctk.NormalCollisions:
         """Those of the candidates on which the barrier acts."""
@@ -80,7 +73,9 @@ class Near:
     def _look(self, x: Values, to: Values) -> None:
         """Candidates on the way from x to `to`; what all points have in common brings nothing together."""
         start, end = centred(x), centred(to)
-        self._candidates = [kind.candidates(self._mesh, start, end, radius=self._radius) for kind in self._kinds]
+        found = ipctk.Candidates()  # one tree for all kinds: it is most of what a look costs
+        found.build(self._mesh, start, end, self._radius, ipctk.LBVH())
+        self._candidates = [*(_taken(found, kind.name) for kind in self._kinds[:-1]), found]
         self._from, self._way = start, end - start
 
     def _holds(self, x: Values) -> bool:
@@ -88,6 +83,14 @@ class Near:
         off, squares = centred(x) - self._from, np.sum(self._way**2, axis=1)
         along = np.clip(np.sum(off * self._way, axis=1) / np.where(squares > 0, squares, 1.0), 0.0, 1.0)
         return longest(off - along[:, None] * self._way) <= self._margin
+
+
+def _taken(found: ipctk.Candidates, name: str) -> ipctk.Candidates:
+    """The candidates of that name, which `found` loses."""
+    part = ipctk.Candidates()
+    setattr(part, name, getattr(found, name))
+    setattr(found, name, [])
+    return part
 
 
 def centred(x: Values) -> Values:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .crossings import NONE, crossings
-from .near import Kind, Near, longest
+from .near import Kind, Near
 from .slip import Friction, projection
 
 Values = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ Ints = npt.NDArray[np.int64]
 
 EDGES = 0.5  # of the distance of the barrier
 MARGIN = 1.0  # of the distance of the barrier: how far points may move before candidates are looked for again
-MOST = 100  # pieces of a step
+MOST, WIDE = 128, 3.0  # pieces of a step, and the measure of the boxes in one
 
 
 class Pairs:
@@ -53,9 +53,9 @@ class Pairs:
         faces = (corners,) if solid else ()
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest, ipctk.edges(corners) if solid else corners, *faces)
         # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
-        kinds = [((1 + solid) * stiffness, 1.0, "ee_candidates")]
-        kinds += [(stiffness, EDGES, "fv_candidates")] if solid else []
-        made = [Kind(ipctk.BarrierPotential(share * distance, k, True), drop) for k, share, drop in kinds]
+        kinds = [((1 + solid) * stiffness, 1.0, "fv_candidates" if solid else "ev_candidates")]
+        kinds += [(stiffness, EDGES, "ee_candidates")] if solid else []
+        made = [Kind(ipctk.BarrierPotential(share * distance, k, True), name) for k, share, name in kinds]
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction = friction
@@ -110,17 +110,25 @@ class Pairs:
     def longest_step(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the straight way from x to `to` on which nothing meets.
 
-        The way is walked in pieces of an edge's length, MOST at most (boxes around longer ones would all meet), and
-        the pair that would meet is left at least KEPT of its distance at the begin of the piece.
+        The way is walked in pieces, MOST at most (boxes around longer ones would all meet), and the pair that would
+        meet is left at least KEPT of its distance at the begin of the piece.
         """
         on, way = self._mesh.vertices(x), self._mesh.vertices(to) - self._mesh.vertices(x)
         way -= way.mean(axis=0)  # what all have in common brings nothing together
-        pieces = max(1, int(np.ceil(longest(way) / self._edge)))
+        pieces = self._pieces(way)
         for piece in range(min(pieces, MOST)):
             share = self._near.free(on + piece / pieces * way, on + (piece + 1) / pieces * way)
             if share < 1.0:
                 return (piece + share) / pieces
         return min(pieces, MOST) / pieces
+
+    def _pieces(self, way: Values) -> int:
+        """In how many pieces a way (n, d) is walked: so many that the boxes around what moves have on average WIDE times
+        the measure of one around an edge. A few fast points alone do not make ways shorter."""
+        pieces = 1
+        while pieces < 2**30 and np.mean(np.prod(1.0 + abs(way) / (pieces * self._edge), axis=1)) > WIDE:
+            pieces *= 2
+        return pieces
 
     def overlaps(self, x: Values) -> Ints:
         """(k, 2) elements that cut each other."""

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, diags, kron
+from scipy.sparse import csr_matrix, diags
 
 from ..simplices import is_split
 from .build import Split
@@ -51,11 +51,6 @@ class Places:
     def weights(self) -> csr_matrix:
         """(n, nodes) w."""
         return (self._mean + diags(self.share) @ self._arms).tocsr()
-
-    @cached_property
-    def by_component(self) -> csr_matrix:
-        """(n d, nodes d) w of each component."""
-        return kron(self.weights, np.eye(self.rest.shape[1]), format="csr")
 
     def drawn_in(self, share: Values) -> Places:
         """The points with `share` (n,) of their arms."""

@@ -51,9 +51,3 @@ class Front(Surface):
     def _pairs_of(self, elements: Ints) -> Facings:  # type: ignore[override]
         how = {name: self._how[name] for name in ("distance", "stiffness")}  # friction is each solid's own
         return Facings(self._rest, elements, self._solids, **how)
-
-    def _settle(self, u: Values, load: Values) -> None:
-        super()._settle(u, load)
-        while len(cut := self.pairs.overlaps(self.at(u))[:, 0]):  # a side that cuts is told of one of its two elements
-            kept = np.delete(np.arange(len(self.made.elements)), self._out)
-            self._leave_out(np.union1d(self._out, kept[cut]))
