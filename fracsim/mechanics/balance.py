@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,9 @@ from .stress import Stress
 from .tangent import Assembly
 from .term import Form, Level, Term
 from .vectors import Assembler
+
+if TYPE_CHECKING:
+    from .positive import Positive
 
 Values = npt.NDArray[np.float64]
 
@@ -72,6 +76,7 @@ class Balance:
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
         self._touches = True  # whether the tangent has contact in it
+        self._positive: Positive | None = None
         self.low_rank: list[tuple[Values, Values]] = []
         self.springs: list[Stiff] = []
         self.moves = 0
@@ -246,11 +251,12 @@ class Balance:
         """The matrix of K, until `shrink_tangent` makes another."""
         return self._tangent.matrix
 
-    def assemble_tangent(self, K: PETSc.Mat) -> None:
-        """K at the current u, rows and columns of prescribed dofs replaced by the identity's (collective)."""
+    def assemble_tangent(self, K: PETSc.Mat, *, small: float | None = None) -> None:
+        """K at the current u, rows and columns of prescribed dofs replaced by the identity's; `small`: with moduli
+        made positive to within that share of them (collective)."""
         if self._coupled:
             K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
-        self._tangent(self.motion.bcs)
+        self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
         self.springs = []
@@ -261,6 +267,17 @@ class Balance:
         self.low_rank = [part for term in self.terms for part in term.low_rank()] if self._touches else []
         for U, _ in self.low_rank:
             U[self.motion.owned] = 0.0
+
+    def _positive_moduli(self, small: float) -> fem.Form:
+        """What makes the moduli positive at the current u."""
+        if self._positive is None:
+            from .positive import Positive
+
+            self._positive = Positive(self.stress)
+            self._forms.append(self._positive.form)
+            self._leave_out_dead(self._positive.form)
+        self._positive.update(small)
+        return self._positive.form
 
     @contextmanager
     def untouched(self) -> Iterator[None]:
@@ -398,9 +415,12 @@ class Balance:
         """Cells lost stiffness: those without any stress are not integrated from here on (not collective)."""
         for term in self.terms:
             term.damage_changed()
+        for form in self._forms:
+            self._leave_out_dead(form)
+
+    def _leave_out_dead(self, form: CellForm) -> None:
         if (dead := self.stress.stressless) is not None:
-            for form in self._forms:
-                form.leave_out(dead)
+            form.leave_out(dead)
 
     def shrink_tangent(self, share: float) -> bool:
         """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a

@@ -154,6 +154,11 @@ class Stress(Term):
         """chi, 1 where there is none; in a quasi-static study with a floor, so that the tangent stays regular."""
         return self._floored(self.chi)
 
+    @property
+    def remaining_stiffness_of_energy(self) -> Expr | float:
+        """What multiplies `energy`: 1 where chi is part of it."""
+        return self._floored(self.multiplier)
+
     def _floored(self, chi: Expr | None) -> Expr | float:
         if chi is None:
             return 1.0

@@ -64,10 +64,12 @@ class Assembly:
         self._make()
         return True
 
-    def __call__(self, bcs: list[fem.DirichletBC]) -> None:
-        """Assemble; rows and columns of prescribed dofs become the identity's (collective)."""
+    def __call__(self, bcs: list[fem.DirichletBC], more: fem.Form | None = None) -> None:
+        """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's
+        (collective)."""
         self._sum.data[:] = 0.0
-        fem.assemble_matrix(self._sum, self.form, bcs)  # type: ignore[arg-type]
+        for form in (self.form, more) if more is not None else (self.form,):
+            fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         self._sum.scatter_reverse()
         self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
         self.matrix.assemble()

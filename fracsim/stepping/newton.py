@@ -19,7 +19,7 @@ from .rigid_modes import rigid_modes
 from .stepper import SolveResult
 
 if TYPE_CHECKING:
-    from .descent import Descent
+    from .downhill import Downhill
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -59,6 +59,7 @@ class Solver:
     """SNES on a `Balance`, set up once and kept for the whole run.
 
     Attributes:
+        snes: that of the last attempt.
         linear_failures: linear solves that failed outright and were taken as no correction.
     """
 
@@ -66,9 +67,11 @@ class Solver:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance = balance
         self.linear_failures = 0
+        self._down: Downhill | None = None  # what the SNES of the last attempt goes by
         chosen = _chosen(balance, given)
         self._options = OptionSet(chosen)
         snes = self.snes = PETSc.SNES().create(balance.domain.comm)
+        self._made = [snes]
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(lambda _, x, b: balance.free_residual(x, b), balance.vector)
         self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
@@ -76,15 +79,13 @@ class Solver:
         self._x, self._correction = balance.vector.duplicate(), balance.vector.duplicate()
         self._configure(given)
         snes.setConvergenceTest(self._converged)
-        self._descent: Descent | None = None
         if balance.limits_steps:
             snes.setLineSearchPreCheck(self._limit)
             if balance.conservative:
-                from .descent import Descent
+                from .downhill import Downhill
 
-                self._descent = descent = Descent(balance, snes)
-                snes.setObjective(lambda _, x: descent(x))
-                snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
+                self._down = Downhill(balance, snes)
+        self._first_choice, self._downhill = (snes, self._down), self._down
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
@@ -102,7 +103,8 @@ class Solver:
 
             parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
             self._operator = Condensed(tangent, parts, springs).matrix()
-        self.snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), self._operator, tangent)
+        for snes in self._made:
+            snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), self._operator, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
 
@@ -154,7 +156,7 @@ class Solver:
         if self._misled(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
             self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
-            result = self._attempt(guess)
+            result = self._attempt_positively(guess) if self.balance.conservative else self._attempt(guess)
             self._preconditioner.keep = self._iterative
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
         if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
@@ -164,6 +166,35 @@ class Solver:
             result = self._attempt(guess)
             self.snes.ksp.setType("cg")
         return result
+
+    def _attempt_positively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+        """With moduli made positive, down the incremental potential. (From the start of every attempt they would cost
+        more than they save.)"""
+        from .downhill import POSITIVE
+
+        down = self._downhill = self._downhill or self._another_downhill()
+        for how in POSITIVE:
+            down.made_positive(how)
+            result = self._attempt(guess, (down.snes, down))
+            if not self._misled(result):
+                break
+        down.made_positive(None)
+        return result
+
+    def _another_downhill(self) -> Downhill:
+        """A second SNES, with the linear solver of the first."""
+        from .downhill import Downhill
+
+        snes = PETSc.SNES().create(self.balance.domain.comm)
+        snes.setOptionsPrefix(self._options.prefix)
+        snes.setKSP(self.snes.ksp)
+        down = Downhill(self.balance, snes)
+        self._made.append(snes)
+        self._take_tangent()
+        snes.setLineSearchPreCheck(self._limit)
+        snes.setFromOptions()
+        snes.setConvergenceTest(self._converged)
+        return down
 
     def _may_factorise(self) -> bool:
         dofs = self.balance.vector.getSize()
@@ -203,7 +234,8 @@ class Solver:
         line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
 
-    def _attempt(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+    def _attempt(self, guess: npt.NDArray[np.float64], other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
+        self.snes, self._down = other or self._first_choice
         self._shrink()
         self._x.array_w[:] = guess
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
@@ -228,8 +260,8 @@ class Solver:
             if leg >= LEAST_LEGS and left > (LEGS - leg) * (before - left):
                 break
             self._rtol = ON_THE_WAY if left else self._own_rtol
-            if self._descent is not None:
-                self._descent.begin()
+            if self._down is not None:
+                self._down.descent.begin()
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
@@ -274,7 +306,8 @@ class Solver:
         return bool(ksp.reason > 0)
 
     def _assemble(self, tangent: PETSc.Mat) -> None:
-        self.balance.assemble_tangent(tangent)
+        small = None if self._down is None else self._down.small
+        self.balance.assemble_tangent(tangent, small=small)
 
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
@@ -306,8 +339,10 @@ class Solver:
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
-        if self._descent is not None:
-            self._descent.set_out()
+        if self._down is not None:
+            self._down.descent.set_out()
+        if not self.balance.limits_steps:
+            return
         share = self.balance.longest_step(-y.array_r)
         if share < 1:
             y.scale(share)
@@ -340,10 +375,10 @@ class Solver:
     def destroy(self) -> None:
         """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
         self._options.remove()
-        for kept in (self.snes, self._x, self._correction):
+        for kept in (*self._made, self._x, self._correction):
             kept.destroy()
-        if self._descent is not None:
-            self._descent.destroy()
+        if self._downhill is not None:
+            self._downhill.destroy()
         if self._near_null is not None:
             self._near_null.destroy()
 

@@ -46,12 +46,13 @@ def lumped_mass(nodes: Values, cells: npt.NDArray[np.integer], density: float) -
     return np.repeat(mass, nodes.shape[1])
 
 
-def dense_tangent(scene: Scene) -> Values:
-    """The assembled tangent at the present displacement, without inertia, as a dense matrix (serial)."""
+def dense_tangent(scene: Scene, *, small: float | None = None) -> Values:
+    """The assembled tangent at the present displacement, without inertia, as a dense matrix (serial); `small`: with
+    moduli made positive."""
     balance = scene.balance
     x = balance.vector.duplicate()
     x.array_w[:] = balance.u.x.array
-    balance.assemble_tangent(balance.tangent)
+    balance.assemble_tangent(balance.tangent, small=small)
     matrix = balance.tangent.copy()
     dense = matrix.convert(PETSc.Mat.Type.DENSE).getDenseArray().copy()
     x.destroy()

@@ -44,7 +44,7 @@ def _around(edges: Ints, of: Ints) -> tuple[Ints, Ints]:
     """All triangles at the edges `of` (k,): (m,) which of the k, and (m,) the triangle; `edges` (triangles, 3)."""
     order = np.argsort(edges, axis=None, kind="stable")
     sorted_edges = edges.reshape(-1)[order]
-    first, end = (np.searchsorted(sorted_edges, of, side) for side in ("left", "right"))
+    first, end = np.searchsorted(sorted_edges, of, "left"), np.searchsorted(sorted_edges, of, "right")
     which = np.repeat(np.arange(len(of)), count := end - first)
     at = np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
     return which, order[at] // edges.shape[1]

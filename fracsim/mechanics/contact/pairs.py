@@ -123,7 +123,7 @@ class Pairs:
         return min(pieces, MOST) / pieces
 
     def _pieces(self, way: Values) -> int:
-        """In how many pieces a way (n, d) is walked: so many that the boxes around what moves have on average WIDE times
+        """In how many pieces a way (n, d) is walked: so many that boxes around what moves have on average WIDE times
         the measure of one around an edge. A few fast points alone do not make ways shorter."""
         pieces = 1
         while pieces < 2**30 and np.mean(np.prod(1.0 + abs(way) / (pieces * self._edge), axis=1)) > WIDE:

@@ -1,0 +1,51 @@
+"""Newton's method down the incremental potential: the objective of a SNES, and tangents that are made positive.
+
+Exact tangents of a body that tears, buckles or is squeezed are not positive: CG stops, and what other methods find may
+go up. With positive moduli (mechanics.positive) directions go down from anywhere. Near the solution tangents are exact
+again, for there Newton's method gains its digits; where they are not positive even there, they stay as they were made.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+from ..mechanics.balance import Balance
+from .descent import Descent
+
+# attempts with positive moduli: below which share of their residual tangents are exact, and negative eigenvalues that
+# are let be, in mean moduli of a cell
+POSITIVE = (1e-2, 1e-2), (0.0, 0.0)
+
+
+class Downhill:
+    """What a SNES goes by.
+
+    Attributes:
+        snes: it.    descent: its objective.
+    """
+
+    def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
+        """Makes the incremental potential of `balance`, which has one, the objective of `snes`."""
+        self.snes = snes
+        self.descent = descent = Descent(balance, snes)
+        snes.setObjective(lambda _, x: descent(x))
+        snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
+        self.made_positive(None)
+
+    def made_positive(self, how: tuple[float, float] | None) -> None:
+        """An attempt begins: tangents are those of one of POSITIVE, or exact."""
+        self._how, self._highest = how, 0.0
+
+    @property
+    def small(self) -> float | None:
+        """Of the tangent at the present iterate (Balance.assemble_tangent); None: it is exact."""
+        if self._how is None:
+            return None
+        exact_below, small = self._how
+        norm = self.snes.getFunctionNorm()
+        self._highest = max(self._highest, norm)
+        return None if norm < exact_below * self._highest else small
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+        self.descent.destroy()
