@@ -28,8 +28,16 @@ REPEATS = (
     "test_sweep.py::test_runs_on_two_ranks",
     # whose a folder is: on one process
     "test_own_files.py::test_a_folder_of_the_users_is_left_alone[2]",
+    # a run that is killed as it sets up: before its first file, and after its last
+    "test_own_files.py::test_a_run_that_was_killed_is_recognised[run.InvertedCells]",
+    "test_own_files.py::test_a_run_that_was_killed_is_recognised[output.frame_files",
     # studies on a figure: those on a vase run as they do
     "test_studies.py::test_a_coarse_version_runs[jelly-figure]",
+    "test_studies.py::test_a_coarse_version_runs[hammered-figure]",
+    "test_studies.py::test_a_coarse_version_runs[rigid-figure]",
+    "test_studies.py::test_what_the_comments_offer_is_valid[hammered-figure]",
+    "test_study_file.py::test_studies_of_the_package_survive_being_written[hammered-figure]",
+    "test_study_file.py::test_studies_of_the_package_survive_being_written[rigid-figure]",
     "test_studies.py::test_what_the_comments_offer_is_valid[struck-figure]",
     "test_studies.py::test_what_the_comments_offer_is_valid[jelly-figure]",
     "test_studies.py::test_a_coarse_version_runs[struck-figure]",
@@ -38,7 +46,10 @@ REPEATS = (
     "test_study_file.py::test_studies_of_the_package_survive_being_written[jelly-figure]",
     # a figure by its defaults: it is built by them, and checked, in test_meshes_builders
     "test_required_keys.py::test_builders_require_nothing[figure]",
-    # pictures by other fields: a number (age), a component (stress:xy)
+    # pictures by other fields: a number (age), a component (stress:xy), exploded
+    "test_surface_run.py::test_looks_differ_and_show_something[look0]",
+    "test_surface_run.py::test_looks_differ_and_show_something[look2]",
+    "test_surface_run.py::test_looks_differ_and_show_something[look3]",
     "test_surface_run.py::test_looks_differ_and_show_something[look1]",
     "test_surface_run.py::test_looks_differ_and_show_something[look6]",
     "test_study_file.py::test_studies_of_the_package_survive_being_written[struck-figure]",
@@ -58,8 +69,8 @@ REPEATS = (
     # plane strain against 3D: neo-hookean; corotated and stvk by their closed forms in both
     "test_energies.py::test_plane_strain_is_3d_at_unit_thickness_stretch[corotated]",
     "test_energies.py::test_plane_strain_is_3d_at_unit_thickness_stretch[stvk]",
-    "test_patch.py::test_static_patch[corotated-2]",
-    "test_patch.py::test_static_patch[stvk-2]",
+    "test_patch.py::test_static_patch[corotated",
+    "test_patch.py::test_static_patch[stvk",
     # further energies of plasticity: neo-hookean, the default
     "test_plasticity.py::test_stress_beyond_yield_decays_with_the_flow_rate[corotated]",
     "test_plasticity.py::test_stress_beyond_yield_decays_with_the_flow_rate[stvk]",
@@ -79,6 +90,7 @@ REPEATS = (
     "test_closing.py::test_equal_bars_exchange_their_velocities[chi-stvk]",
     # free obstacles: generalized-alpha of Newmark and backward Euler; a mass between a heavy and a light one
     "test_free_obstacles.py::test_an_isolated_pair_keeps_its_momentum[generalized-alpha]",
+    "test_free_obstacles.py::test_an_isolated_pair_keeps_its_momentum[backward-euler]",
     "test_free_obstacles.py::test_a_free_striker_faster_than_its_step_does_not_tunnel[0.1]",
     # trials of the report: the other rows of its table
     "test_evidence_stability.py::test_two_approaches_fail_and_chi_holds",
@@ -107,6 +119,9 @@ REPEATS = (
     "test_bent.py::test_a_round_press_gains_nothing[newmark]",
     "test_blow.py::test_a_body_that_breaks_as_it_lands_keeps_the_books[newmark]",
     "test_stops.py::test_a_weight_bounces_on_a_held_floor[newmark-0.8]",
+    "test_stops.py::test_a_driven_wall_takes_a_weight_along[3.0-newmark]",
+    "test_stops.py::test_a_driven_wall_takes_a_weight_along[30.0-newmark]",
+    "test_blow.py::test_a_bounce_returns_the_height_less_the_loss_of_the_scheme[newmark",
     "test_obstacles.py::test_the_impulse_of_contact_is_what_balances_momentum[newmark]",
     "test_obstacles.py::test_a_step_that_balances_inside_books_what_its_obstacle_did[newmark]",
 )

@@ -21,15 +21,15 @@ FLOOR, TOP, RADIUS, SPEED = -0.001, 0.132, 0.03, 3.0
 def crushed(**change: Any) -> dict[str, Any]:
     """A soft plate between a hammer and a floor, which breaks to crumbs under it."""
     body: dict[str, Any] = {
-        "mesh": {"builder": "box", "size": [0.2, 0.1], "h": 0.016, "pattern": "unstructured"},
+        "mesh": {"builder": "box", "size": [0.2, 0.1], "h": 0.025, "pattern": "unstructured"},
         "material": {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0},
-        "fracture": {"strength": 4e4, "radius": 0.02},
+        "fracture": {"strength": 3e4, "radius": 0.03},
         "contact": {},
         "obstacle": [
             {"name": "floor", "shape": "plane", "at": [0.0, FLOOR], "normal": [0.0, 1.0]},
             {"name": "hammer", "shape": "sphere", "radius": RADIUS, "at": [0.1, TOP], "velocity": [0.0, -SPEED]},
         ],
-        "time": {"scheme": "backward-euler", "step": 4e-4, "end": 0.0122},
+        "time": {"scheme": "backward-euler", "step": 4e-4, "end": 0.011},
         "output": {"interval": 4e-4, "picture": False},
     }
     return body | change

@@ -49,7 +49,7 @@ def acting(placed: Placed, x: Values) -> Between:
 def test_the_place_is_the_deepest(name: str) -> None:
     """Against a lattice of places: none is nearer than the gap, nor is the gap smaller by more than the softening; and
     the softened least of the lattice is never below it."""
-    placed, x = facets_near(name, 60)
+    placed, x = facets_near(name, 40)
     c, d = x.shape[1:]
     steps = np.stack(np.meshgrid(*[np.arange(41)] * (c - 1), indexing="ij"), axis=-1).reshape(-1, c - 1) / 40
     shares = np.column_stack([steps, 1 - steps.sum(axis=1)])
@@ -84,7 +84,7 @@ def test_the_least_of_a_quadratic_over_shares(c: int) -> None:
 @pytest.mark.parametrize("name", ["box", "rectangle"])
 def test_the_deepest_place_does_not_depend_on_where_it_is_looked_for_first(name: str) -> None:
     """From a corner, or where it was before another obstacle."""
-    placed, x = facets_near(name, 60)
+    placed, x = facets_near(name, 40)
     shares, start = deepest(placed, x, SOFTEN).share, np.zeros(x.shape[:2])
     start[np.arange(len(x)), np.random.default_rng(5).integers(x.shape[1], size=len(x))] = 1.0
     for begin in (start, np.roll(shares, 1, axis=0)):
@@ -96,7 +96,7 @@ def test_the_deepest_place_does_not_depend_on_where_it_is_looked_for_first(name:
 @pytest.mark.parametrize("name", SHAPES)
 def test_forces_and_stiffness_are_derivatives(name: str) -> None:
     """By finite differences of the energy, and of the forces; the tangent's share is positive with that of corners."""
-    placed, x = facets_near(name, 40)
+    placed, x = facets_near(name, 25)
     n, size = len(x), x[0].size
     found, h = acting(placed, x), 1e-6
     by_force, by_energy = np.zeros((n, size, size)), np.zeros((n, size))

@@ -20,7 +20,8 @@ from support.brittle import Broken, cut_points, open_at
 ROUND_OFF = 1e3 * np.finfo(float).eps
 
 
-def box(dim: int, h: float = 0.06) -> MeshData:
+def box(dim: int, h: float = 0.0) -> MeshData:
+    h = h or {2: 0.06, 3: 0.08}[dim]
     size = [1.0, 0.8, 0.5][:dim]
     return build_mesh(Mesh.model_validate({"builder": "box", "size": size, "h": h, "pattern": "unstructured"}))
 

@@ -91,7 +91,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
                 {"on": "bottom", "fix": "xy"},
                 {"on": "top", "displacement": {"time": [0.0, 0.4], "value": [[0.0, 0.0], [0.0, -0.05]]}}],
             probe=[{"name": "base", "on": "bottom"}], damping={"mass": 20.0}, solver=FINE,
-            time={"scheme": "backward-euler", "step": 0.02, "end": 0.6}, **contact,
+            time={"scheme": "backward-euler", "step": 0.03, "end": 0.6}, **contact,
         )  # fmt: skip
         graph = scene.fracture.graph
         y = scene.domain.nodes[graph.edge_nodes][:, :, 1]
@@ -131,7 +131,7 @@ def test_friction_between_bodies_is_in_the_books(tmp_path: Path) -> None:
     for mu in (0.0, 0.5):
         scene, state = make_scene(
             mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"friction": mu}, solver=FINE,
-            time={"scheme": "backward-euler", "step": 0.01, "end": 0.3},
+            time={"scheme": "backward-euler", "step": 0.01, "end": 0.2},
         )  # fmt: skip
         X = positions(scene)
         v = np.zeros_like(X)

@@ -229,7 +229,7 @@ def test_rounded_notch_area(notch: str) -> None:
 
 
 def test_charpy_supports_lie_where_they_should() -> None:
-    mesh = BUILDERS["notched-bar"](h=0.002, h_notch=0.0005).build()
+    _, mesh = made("notched-bar", json.dumps({"h": 0.002, "h_notch": 0.0004}))
     for name, x, z in (("support-left", 0.0075, 0.0), ("support-right", 0.0475, 0.0), ("load", 0.0275, 0.010)):
         patch = mesh.facet_groups[name]
         assert facet_measures(mesh.points, patch).sum() == pytest.approx(0.001 * 0.010, rel=1e-9)
@@ -287,7 +287,7 @@ def test_plate_with_a_hole_lacks_a_quarter_circle() -> None:
 def test_loaf_without_dome_is_a_block_with_round_edges() -> None:
     """Steiner's formula for a box with edges p, q, s thickened by r: pqs + 2r(pq + qs + sp) + pi r^2 (p + q + s)
     + 4/3 pi r^3. Facets on the round parts cut off a share of about (h / r)^2 / 24 of their volume."""
-    r, size, h = 0.025, (0.25, 0.11, 0.10), 0.01
+    r, size, h = 0.025, (0.25, 0.11, 0.10), 0.0125
     mesh = BUILDERS["loaf"](size=size, h=h, rounding=r, bottom_rounding=r, dome=0.0, flare=0.0).build()
     p, q, s = (length - 2 * r for length in size)
     rounded = pi * r**2 * (p + q + s) + 4 / 3 * pi * r**3
@@ -309,7 +309,7 @@ def test_vase_is_a_body_of_revolution() -> None:
     """Pappus: pi times the integral of r^2 dz, here by Simpson's rule over the points of the Bezier curve itself,
     r = sum B_i(t) c_i and z = t height, scaled so that the belly has the radius asked for. The outside is a polyhedron
     with its nodes on the surface, which takes off a share of about (h / r)^2 / 6 of what a solid vase holds."""
-    builder: Any = BUILDERS["vase"](wall=0.0, height=0.3, radius=0.1, h=0.01)
+    builder: Any = BUILDERS["vase"](wall=0.0, height=0.3, radius=0.1, h=0.015)
     t = np.linspace(0.0, 1.0, 2001)
     basis = np.array([comb(6, i) * t**i * (1 - t) ** (6 - i) for i in range(7)])
     r = np.array(CONTROL) @ basis
@@ -317,12 +317,12 @@ def test_vase_is_a_body_of_revolution() -> None:
     simpson = np.r_[1.0, np.tile([4.0, 2.0], 999), 4.0, 1.0] / 6000
     wanted = pi * 0.3 * float(simpson @ r**2)
     assert builder.volume() == pytest.approx(wanted, rel=1e-6)
-    assert volume(builder.build()) == pytest.approx(wanted, rel=(0.01 / 0.06) ** 2 / 6)
+    assert volume(builder.build()) == pytest.approx(wanted, rel=(0.015 / 0.06) ** 2 / 6)
 
 
 def test_a_hollow_vase_has_a_wall_and_a_floor() -> None:
     """The inside lies `wall` nearer to the axis than the outside, above a floor as thick; volumes as of two solids."""
-    builder: Any = BUILDERS["vase"](wall=0.006, h=0.006)
+    builder: Any = BUILDERS["vase"](wall=0.006, h=0.008)
     mesh = builder.build()
     inside = mesh.points[np.unique(mesh.facet_groups["inside"])]
     outside = mesh.points[np.unique(mesh.facet_groups["side"])]
@@ -334,7 +334,7 @@ def test_a_hollow_vase_has_a_wall_and_a_floor() -> None:
     hole = np.trapezoid((builder.outline()(z) - 0.006) ** 2, z) * pi
     solid: Any = BUILDERS["vase"](wall=0.0)
     assert builder.volume() == pytest.approx(solid.volume() - hole, rel=1e-6)
-    assert volume(mesh) == pytest.approx(builder.volume(), rel=2e-3)
+    assert volume(mesh) == pytest.approx(builder.volume(), rel=3.5e-3)
 
 
 def test_a_round_cone_is_the_hull_of_its_balls() -> None:
@@ -404,7 +404,7 @@ def test_a_hollow_figure_is_nowhere_thinner_than_its_wall() -> None:
 
 
 def test_the_same_parameters_make_the_same_mesh_quietly(capfd: pytest.CaptureFixture[str]) -> None:
-    first, second = (BUILDERS["loaf"](h=0.015).build() for _ in range(2))
+    first, second = (BUILDERS["loaf"](h=0.02).build() for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
     np.testing.assert_array_equal(first.cells, second.cells)
     assert capfd.readouterr() == ("", "")

@@ -78,7 +78,7 @@ def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT, load={"gravity": [0.0, -G]},
         obstacle=[floor(-0.2, friction=0.3)], solver=FINE,
-        time={"scheme": scheme, "step": 0.01, "end": 0.5},
+        time={"scheme": scheme, "step": 0.01, "end": 0.4},
     )  # fmt: skip
     impulse, touched, before = np.zeros(2), 0, 0.0
     for report in each_step(scene, state):
@@ -92,7 +92,7 @@ def test_the_impulse_of_contact_is_what_balances_momentum(scheme: str) -> None:
         before = force[1]
     momentum = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
     np.testing.assert_allclose(momentum, impulse - np.array([0.0, 100 * G * state.t]), atol=1e-4)
-    assert touched > 15 and np.ptp(impulse) > 500
+    assert touched > 15 and np.ptp(impulse) > 450
 
 
 def test_an_obstacle_that_touches_nothing_changes_nothing() -> None:
@@ -220,7 +220,7 @@ def test_gaps_and_work_are_those_of_the_nodes_and_of_the_force(tmp_path: Path) -
 def test_a_block_on_a_slope(share: float, sticks: bool) -> None:
     """tan(theta) = 0.5 and mu = `share` of it: it stays, or slides with g (sin - mu cos); gravity is turned, not the
     slope. It is laid on without a drop, and left to settle a little before anything is measured."""
-    slope, steps = 0.5, 60
+    slope, steps = 0.5, 40
     down = np.array([slope, -1.0]) / np.hypot(1, slope) * G
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT | {"young": 1e6},
@@ -305,6 +305,6 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
         "solver": FINE,
         "output": {"picture": False},
     }
-    going, stopped, again = going_stopped_resumed(tables, tmp_path, 6, 2)
-    assert stopped.breaks.figures[0] > 0
+    going, broken, again = going_stopped_resumed(tables, tmp_path, 2, 1)
+    assert 0 < broken < going.breaks.figures[0]
     assert_alike(again, going, 1e-6)

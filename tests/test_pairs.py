@@ -146,7 +146,7 @@ def test_energy_is_the_work_on_the_way(dim):
     """No jump while points pass over elements, edges and corners, and while candidates are found anew."""
     pairs, x, upper = rough(dim)
     way = upper[:, None] * np.array([0.17, 0.11, 0.03])[3 - dim :]
-    share = np.linspace(0, 1, 1001)
+    share = np.linspace(0, 1, 501)
     energy = np.array([pairs.energy(x + each * way) for each in share])
     rate = np.array([np.sum(pairs.gradient(x + each * way) * way) for each in share])
     work = (rate[1:] + rate[:-1]) / 2 * np.diff(share)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,22 @@ from fracsim.scene import build_scene
 from .scenes import make_study
 
 
-def going_stopped_resumed(tables: dict[str, Any], path: Path, before: int, after: int) -> tuple[Run, Run, Run]:
-    """One run after `before` + `after` steps, one that was stopped after `before`, and what resumed it; on one rank."""
+def going_stopped_resumed(tables: dict[str, Any], path: Path, before: int, after: int) -> tuple[Run, int, Run]:
+    """A run after `before` + `after` steps, how many edges were broken after `before`, and a run that went on from the
+    checkpoint that the first one wrote there; on one rank."""
 
     def begun(folder: str, *, restart: bool = False) -> Run:
         return Run(build_scene(MPI.COMM_SELF, make_study(**tables)), path / folder, restart=restart)
 
-    going, stopped = begun("going"), begun("stopped")
-    _step((going, stopped), before)
-    stopped.checkpoint()
+    going = begun("going")
+    _step(going, before)
+    going.checkpoint()
+    broken = going.breaks.figures[0]
+    shutil.copytree(path / "going", path / "stopped")
     again = begun("stopped", restart=True)
-    _step((going, again), after)
-    return going, stopped, again
+    _step(going, after)
+    _step(again, after)
+    return going, broken, again
 
 
 def assert_alike(again: Run, going: Run, tolerance: float) -> None:
@@ -37,7 +42,6 @@ def assert_alike(again: Run, going: Run, tolerance: float) -> None:
     np.testing.assert_allclose(again.scene.probes(), going.scene.probes(), atol=tolerance)
 
 
-def _step(runs: tuple[Run, Run], count: int) -> None:
-    for run in runs:
-        for _ in range(count):
-            run.step()
+def _step(run: Run, count: int) -> None:
+    for _ in range(count):
+        run.step()

@@ -31,7 +31,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "mesh": _PLATE, "material": _SOFT | {"energy": "corotated"}, "fracture": {"strength": 1e5, "energy": 0.05},
         "crack": [{"segment": [[0.0, 0.52], [0.5, 0.52]]}],
         "boundary": [{"on": "bottom", "velocity": [0.0, -0.4]}, {"on": "top", "velocity": [0.0, 0.4]}],
-        "time": {"scheme": "newmark", "step": 5e-4, "end": 0.02},
+        "time": {"scheme": "newmark", "step": 5e-4, "end": 0.008},
     },
 }  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ class Motion:
 
     def gap(self, share: Values) -> Values:
         """(n,) distances after shares (n,) of the motion, m."""
-        return self.obstacle.shape.distance(self._seen(self._from_centre(share), share))
+        return self.obstacle.shape.distance(self._place(share))
 
     def speed(self, share: Values) -> Values:
         """(n,) no gap closes faster than this from `share` to the end, m per whole motion.
@@ -36,31 +37,41 @@ class Motion:
         above its tangent: a gap loses no more than -n . v, n its normal at `share`. So what slides along a floor may go
         on. To a hollow body the distance is 1-Lipschitz only: |v|. A turn by w adds |w| times the reach.
         """
-        v = self._relative()
+        v = self._relative
         if self.obstacle.shape.convex:
-            n = self.obstacle.shape.normal(self._seen(self._from_centre(share), share))
+            n = self.obstacle.shape.normal(self._place(share))
             closing = np.maximum(-np.einsum("ni,ni->n", n, self._seen(v, share)), 0)
         else:
             closing = np.linalg.norm(v, axis=1)
-        return closing + np.linalg.norm(self._turn()) * self._reach()
+        return closing + self._turning
 
+    @cached_property
     def _relative(self) -> Values:
         return self.moved - self.q[: self.obstacle.pose.dim]
 
+    @cached_property
     def _turn(self) -> Values:
         return self.q[self.obstacle.pose.dim :]
 
+    @cached_property
+    def _turning(self) -> Values:
+        """(n,) |w| times the largest distance from the centre on the way, which is at one of its ends."""
+        ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), share)), axis=1) for share in (0.0, 1.0)]
+        return np.asarray(np.linalg.norm(self._turn) * np.maximum(*ends))
+
+    def _place(self, share: Values) -> Values:
+        """(n, d) the points in the frame of the body. Kept: gaps and speeds are asked for at the same shares."""
+        kept = vars(self).get("kept")
+        if kept is None or kept[0] is not share:
+            kept = vars(self)["kept"] = share, self._seen(self._from_centre(share), share)
+        return kept[1]
+
     def _from_centre(self, share: Values) -> Values:
-        return np.asarray(self.x - self.obstacle.pose.centre + share[:, None] * self._relative())
+        return np.asarray(self.x - self.obstacle.pose.centre + share[:, None] * self._relative)
 
     def _seen(self, vectors: Values, share: Values) -> Values:
         """(n, d) vectors in the frame that the body has at each share."""
-        return np.asarray(turned(vectors, -share[:, None] * self._turn()) @ self.obstacle.pose.rotation)
-
-    def _reach(self) -> Values:
-        """(n,) the largest distance from the centre on the way, which is at one of its ends."""
-        ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), share)), axis=1) for share in (0.0, 1.0)]
-        return np.maximum(*ends)
+        return np.asarray(turned(vectors, -share[:, None] * self._turn) @ self.obstacle.pose.rotation)
 
 
 class Passing:
