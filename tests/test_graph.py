@@ -128,3 +128,20 @@ def test_components_are_numbered_by_their_lowest_node() -> None:
     assert count == len(first) > 100
     assert np.all(np.diff(first) > 0)
     assert np.array_equal(part[links[:, 0]], part[links[:, 1]])
+
+
+@pytest.mark.parametrize("kind", ("sparse", "dense", "chain", "zigzag", "none"))
+def test_components_are_those_of_scipy(kind: str) -> None:
+    """Of random graphs, and of chains whose numbers rise along them or go to and fro; numbered by their lowest node."""
+    random, n = np.random.default_rng(7), 400
+    chain = {"chain": np.arange(n), "zigzag": np.column_stack([np.arange(n // 2), np.arange(n)[: n // 2 - 1 : -1]])}
+    links = {
+        "sparse": random.integers(n, size=(n // 2, 2)), "dense": random.integers(n, size=(3 * n, 2)),
+        "none": np.empty((0, 2), int),
+    } | {name: np.column_stack([way.ravel()[:-1], way.ravel()[1:]]) for name, way in chain.items()}  # fmt: skip
+    count, label = components(links[kind], n)
+    graph = coo_matrix((np.ones(len(links[kind])), links[kind].T), shape=(n, n))
+    parts, expected = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)
+    assert count == parts and np.all(np.diff(first) > 0)
+    assert len(np.unique(np.column_stack([label, expected]), axis=0)) == parts

@@ -8,12 +8,14 @@ are told apart here, and seen to exactly (stepping.woodbury), with the body's ow
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
-from scipy.sparse import csr_matrix, hstack
-from scipy.sparse.csgraph import connected_components
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 Values = npt.NDArray[np.float64]
 
@@ -38,6 +40,9 @@ class Stiff:
 def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] | None:
     """(n, m) orthonormal eigenvectors of a symmetric H (n, n) and (m,) eigenvalues above `least`, N/m; None where more
     than DOFS rows are coupled, or there are more than DIRECTIONS such values."""
+    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
+    from scipy.sparse.csgraph import connected_components
+
     rows = np.flatnonzero(np.diff(H.indptr))
     own = H[rows][:, rows]
     _, group = connected_components(own, directed=False)

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -26,7 +25,7 @@ from ..mesh.ranks import Gather, on_root
 from ..meshes.data import MeshData
 from ..stepping.state import State
 from .own_files import CHECKPOINT
-from .writing import ROOM, hdf5_file, replacing, written
+from .writing import ROOM, hdf5_file, hdf5_there, replacing, written
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surfaces import BrittleSurfaces
@@ -167,7 +166,7 @@ def _opened(folder: Path) -> Iterator[Any]:
     if not path.exists():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
     try:
-        with h5py.File(path) as file:
+        with hdf5_there(path) as file:
             yield file
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"--restart: cannot read {path}: {error}; run without --restart") from None

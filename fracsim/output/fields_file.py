@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.data import MeshData
-from .writing import ROOM, append, hdf5_file, replace_text, replacing
+from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text, replacing
 
 Values = npt.NDArray[np.float64]
 TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
@@ -65,12 +64,12 @@ class FieldsFile:
         kept = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
         if len(kept) < len(times):
             self._drop_others(kept)
-        with h5py.File(self.h5) as file:
+        with hdf5_there(self.h5) as file:
             return "".join(self._again(name, file["frames"][name]) for name in kept)
 
     def _drop_others(self, kept: list[str]) -> None:
         size = self.h5.stat().st_size
-        with replacing(self.h5) as new, h5py.File(self.h5) as old, hdf5_file(new, size, begin=True) as file:
+        with replacing(self.h5) as new, hdf5_there(self.h5) as old, hdf5_file(new, size, begin=True) as file:
             for name in ("points", "cells"):
                 old.copy(name, file)
             frames = file.create_group("frames")
@@ -128,7 +127,7 @@ class FieldsFile:
 def read_times(h5: Path) -> dict[str, float]:
     """Name -> time (s) of every frame of a fields.h5. InputError where it cannot be read."""
     try:
-        with h5py.File(h5) as file:
+        with hdf5_there(h5) as file:
             return {name: float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])}
     except (OSError, KeyError, RuntimeError) as error:
         raise InputError(f"--restart: cannot read {h5} ({error}); move it away to go on without its frames") from None

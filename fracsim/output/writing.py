@@ -78,6 +78,13 @@ def write_all(file: RawIOBase, text: bytes) -> None:
         rest = rest[file.write(rest) :]
 
 
+def hdf5_there(path: Path) -> Any:
+    """An HDF5 file, to be read. h5py is imported by the rank that reads or writes one."""
+    import h5py
+
+    return h5py.File(path)
+
+
 @contextlib.contextmanager
 def hdf5_file(path: Path, size: int, *, begin: bool = False) -> Iterator[Any]:
     """An HDF5 file that is to take `size` more bytes; `begin`: a new one. OSError where it cannot, on closing too.
