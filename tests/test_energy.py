@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from scipy.optimize import brentq
 
 from fracsim.errors import InputError
 from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
-from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient
+from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
 from fracsim.fracture.energy.seen import Seen
 from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
@@ -66,6 +68,19 @@ def test_eshelbys_stress_is_what_moving_the_material_costs() -> None:
     np.testing.assert_allclose(eshelby(np.array([psi(F)]), H[None], P[None])[0] - sigma, P, rtol=1e-12)
     cauchy = P @ F.T / J
     np.testing.assert_allclose(first_piola(cauchy[None], H[None], linear=False)[0], P, rtol=1e-12)
+
+
+@pytest.mark.parametrize("linear", (True, False))
+def test_the_springs_of_closed_edges(linear: bool) -> None:
+    """P is the derivative of psi by F, by finite differences; edges that are longer, or not broken, give nothing."""
+    rng = np.random.default_rng(4)
+    vectors, modulus = rng.standard_normal((5, 3, 2)), rng.uniform(0, 2, (5, 3)) * (rng.uniform(0, 1, (5, 3)) > 0.3)
+    H, B, step = 0.3 * rng.standard_normal((5, 2, 2)), rng.standard_normal((5, 2, 2)), 1e-6
+    _, P = springs(vectors, modulus, H, linear=linear)
+    up, down = (springs(vectors, modulus, H + s * step * B, linear=linear)[0] for s in (1, -1))
+    np.testing.assert_allclose(np.sum(P * B, axis=(1, 2)), (up - down) / (2 * step), atol=1e-8)
+    longer, _ = springs(vectors, modulus, np.tile(0.1 * np.eye(2), (5, 1, 1)), linear=linear)
+    np.testing.assert_array_equal(longer, 0.0)
 
 
 def test_the_mean_square_near_a_tip() -> None:
@@ -224,6 +239,50 @@ def test_event_by_event_the_crack_takes_its_energy(kind: str, n: int, monkeypatc
     assert np.abs(y - y[0]).max() < 1e-3 / n  # straight on, within a cell
 
 
+def test_a_tougher_region_takes_its_own_energy() -> None:
+    """A plate pulled by a tenth more than starts its crack stays whole, within 2 h, from where a region of 4 G_c
+    begins; without it the crack goes on by more than half of the way that is left."""
+    mesh = square("unstructured", 24, 1e-3)
+    tough = np.flatnonzero(mesh.points[mesh.cells].mean(axis=1)[:, 0] > 0.7e-3)
+    rest = np.setdiff1d(np.arange(len(mesh.cells)), tough)
+    reached = []
+    for energy in (2.7e3, 4 * 2.7e3):
+        study = make_study(
+            **plate_tables() | {"material": plate_tables()["material"] | {"tough": {"fracture_energy": energy}}},
+            crack=[{"segment": [[0.0, 5.12e-4], [5e-4, 5.12e-4]]}], probe=[{"name": "grip", "on": "top"}],
+            boundary=[{"on": "bottom", "fix": "xy"},
+                      {"on": "top", "displacement": {"time": [0, 1], "value": [[0, 0], [0, 5e-6]]}}],
+            time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+        )  # fmt: skip
+        scene = scene_on(distribute(MPI.COMM_SELF, replace(mesh, regions={"tough": tough, "rest": rest})), study)
+        *_, (_, tip, _) = torn(scene)
+        reached.append(tip)
+    assert not reached[0] < 0.8e-3
+    assert reached[1] == pytest.approx(0.7e-3, abs=2e-3 / 24)
+
+
+def test_a_crack_with_an_energy_closes() -> None:
+    """A cracked plate with `unilateral` is as stiff as a whole one when pushed, to 5 %, and breaks under the same load
+    as one without it when pulled; nothing breaks where it is pushed ten times as far."""
+    at, forces = (0.5 + 0.3 / 24) * 1e-3, {}
+    for far, crack, closes in ((-4.1e-5, True, True), (-4.1e-5, False, False), (5e-6, True, True), (5e-6, True, False)):
+        motion = {"time": [0, 1, 9], "value": [[0, 0], [0, 0.85 * far], [0, far]]}
+        study = make_study(
+            **plate_tables(unilateral=closes), probe=[{"name": "grip", "on": "top"}],
+            crack=[{"segment": [[0.0, at], [5e-4, at]]}] if crack else [],
+            boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": motion}],
+            time={"scheme": "quasi-static", "step": 1.0, "end": 9.0 if far > 0 else 1.0},
+        )  # fmt: skip
+        scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", 24, 1e-3)), study)
+        before = int(scene.fracture.graph.broken.sum())
+        found = [abs(reaction) for reaction, _, _ in torn(scene)]
+        assert far > 0 or scene.fracture.graph.broken.sum() == before
+        forces[far, crack, closes] = max(found)
+    pushed, whole, pulled, open_ = forces.values()
+    assert pushed == pytest.approx(whole, rel=0.05)
+    assert pulled == pytest.approx(open_, rel=0.01)
+
+
 def test_a_smooth_bar_breaks_at_its_strength() -> None:
     """Uniform stress: it breaks in the first step in which the stress reaches f_t, and loses G_c times its section at
     least: where stress decides it may lose more."""
@@ -333,12 +392,26 @@ def test_a_state_is_advanced_twice_alike() -> None:
         ({"fracture": {"strength": 1.0, "energy": -1.0}}, "greater than 0"),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "radius": 0.1}}, r"not go with fracture\.radius.*3 h"),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "approach": "edge"}}, 'choose approach = "chi"'),
-        ({"fracture": {"strength": 1.0, "energy": 1.0, "unilateral": True}}, "do not close yet: remove unilateral"),
+        (
+            {
+                "fracture": {"strength": 1.0, "energy": 1.0},
+                "plasticity": {"yield_stress": 0.5},
+                "material": {"energy": "corotated", "young": 1.0, "poisson": 0.0, "density": 1.0},
+            },
+            r"energy does not go with \[plasticity\]: the force on a tip is that of an elastic body",
+        ),
         ({"fracture": {"strength": 1.0, "energy": 1.0}, "output": {"cut": "forces"}}, "say where they cut"),
         ({"fracture": {"strength": 1.0, "energy": 1.0, "cap": 0.1}}, "one cell a pass: remove cap"),
         (
             {"fracture": {"strength": 1.0, "energy": 1.0}, "brittle": {"surfaces": 1}},
             r"energy does not go with \[brittle\]",
+        ),
+        (
+            {
+                "fracture": {"strength": 1.0},
+                "material": {"young": 1.0, "poisson": 0.0, "density": 1.0, "rim": {"fracture_energy": 1.0}},
+            },
+            r"material\.rim\.fracture_energy needs fracture\.energy",
         ),
     ],
 )
@@ -354,5 +427,14 @@ def test_space_is_refused() -> None:
 
 
 def test_check_tells_irwins_length() -> None:
-    (line,) = [line for line in check_study(make_study(**plate_tables())) if line.startswith("fracture")]
-    assert f"{STIFF * 2.7e3 / 1e22:.3g} m" in line
+    """l_ch over the finest cells, of each region that differs; a note where cells are too long, the body too small."""
+    lines = check_study(make_study(**plate_tables()))
+    length = STIFF * 2.7e3 / 1e22
+    assert any(f"l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / 0.5:.3g} h" in line for line in lines)
+    assert any("less than h = 0.5 m" in line and f"h = {length:.2g} m" in after for line, after in pairwise(lines))
+    tables = plate_tables(strength=1e9) | {"mesh": {"builder": "notched-plate", "h": 0.001}}
+    assert any(f"= {STIFF * 2.7e3 / 1e18 / 0.00025:.3g} h" in line for line in check_study(make_study(**tables)))
+    fine = {"builder": "box", "size": [1.0, 1.0], "h": 0.05}
+    lines = check_study(make_study(**plate_tables(strength=3e7), mesh=fine))
+    assert any("over a fifth of the body" in line for line in lines)
+    assert not any("note" in line for line in check_study(make_study(**plate_tables(strength=7.9e7), mesh=fine)))

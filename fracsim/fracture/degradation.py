@@ -104,7 +104,7 @@ class Chi:
         """What goes goes at once."""
 
 
-class _Edges:
+class EdgeEnergy:
     """Integrity of each edge of each cell, and the energy that depends on it."""
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
@@ -130,7 +130,7 @@ class Projection:
     idle = False
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
-        self._edges = _Edges(stress, graph)
+        self._edges = EdgeEnergy(stress, graph)
 
     def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
         """Released: what the projected energy lost at this displacement as edges broke."""
@@ -158,7 +158,7 @@ class ClosingChi(Chi):
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         super().__init__(stress, graph)
-        self._edges = _Edges(stress, graph)
+        self._edges = EdgeEnergy(stress, graph)
 
     def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
         """Released: what the energy lost at this displacement as chi fell and edges broke."""

@@ -60,15 +60,17 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
 def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
     """What breaks where cracks take an energy."""
     from ..fracture.breaking import Breaking
-    from ..fracture.energy.splitting import Splitting
+    from ..fracture.energy.splitting import ClosingSplitting, Splitting
     from ..fracture.energy.tips import CrackTips
 
     assert study.fracture is not None and study.fracture.energy is not None
     stress, strength = balance.stress, strength_of(study, balance.domain, graph)
-    tips = CrackTips(stress, graph, strength, study.fracture.energy, opened)
+    toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
+    tips = CrackTips(stress, graph, strength, toughness, opened)
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     pace = tips.pace() if moves and balance.scheme.implicit and not given else None
-    splitting = Splitting(stress, graph, tips.release_rate() if moves else None)
+    kind = ClosingSplitting if stress.closes else Splitting
+    splitting = kind(stress, graph, tips.release_rate() if moves else None)
     return Breaking(stress, graph, tips, passes=passes, opened=opened, degradation=splitting, pace=pace)
 
 

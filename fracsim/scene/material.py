@@ -37,8 +37,13 @@ def _flowing(study: Study, domain: Domain, material: MaterialFields) -> Material
     return plastic_material(domain, law, material, implicit=study.time.kind.implicit)
 
 
-def per_cell(study: Study, domain: Domain, table: Any, key: str) -> PerCell:
-    """`key` of a table as one number, or as (cells,) where a region of the material overrides it."""
-    regions = study.material.regions.items()
-    special = {name: getattr(region, key) for name, region in regions if getattr(region, key) is not None}
+def per_cell(study: Study, domain: Domain, table: Any, key: str, special_key: str | None = None) -> PerCell:
+    """`key` of a table as one number, or as (cells,) where a region of the material overrides it.
+
+    `special_key`: the region's key, where it is another.
+    """
+    special_key, regions = special_key or key, study.material.regions.items()
+    special = {
+        name: getattr(region, special_key) for name, region in regions if getattr(region, special_key) is not None
+    }
     return by_region(domain, float(getattr(table, key)), special)

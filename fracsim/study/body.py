@@ -48,6 +48,7 @@ class Region(Table):
     poisson: Poisson | None = None
     density: Positive | None = None
     strength: Strength | None = None
+    fracture_energy: Positive | None = None  # J/m^2, in place of fracture.energy
     yield_stress: Strength | None = None
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from math import factorial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from ..meshes.words import AXES, format_point
 from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
+from .tearing import tearing
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
@@ -39,6 +41,7 @@ class Anatomy:
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     size: str  # how many cells, in words
+    h: float  # of the finest cells, or of the mean one of a mesh that was read, m
     surface: Callable[[], str]  # how many facets, in words; counted when asked
     volume: float | None = None  # m^d, where it is known
     notes: tuple[str, ...] = ()  # what was mended while reading
@@ -70,12 +73,14 @@ def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
         lower, upper = builder.bounds()
         count = builder.cells_estimate()
         size, facets = f"about {count:,} cells", partial(_at_least, count, len(lower))
-        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size, facets)
+        h = _finest(builder)
+        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size, h, facets)
     if surface is not None:
         count = cells_inside(study.mesh, surface)
         size, facets = f"about {count:,} cells in {len(surface.triangles):,} triangles", partial(_at_least, count, 3)
         lower, upper = (tuple(corner.tolist()) for corner in (surface.points.min(axis=0), surface.points.max(axis=0)))
-        return Anatomy(3, ("surface",), (), lower, upper, size, facets, surface.volume, surface.notes)
+        h = float(study.mesh.parameters["h"])
+        return Anatomy(3, ("surface",), (), lower, upper, size, h, facets, surface.volume, surface.notes)
     return None
 
 
@@ -86,7 +91,14 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
     volume = float(signed_measures(mesh.points, mesh.cells).sum())
     groups, regions, facets = tuple(mesh.facet_groups), tuple(mesh.regions), partial(_counted, mesh)
-    return Anatomy(mesh.dim, groups, regions, lower, upper, size, facets, volume, mesh.notes)
+    h = (factorial(mesh.dim) * volume / len(mesh.cells)) ** (1 / mesh.dim)
+    return Anatomy(mesh.dim, groups, regions, lower, upper, size, h, facets, volume, mesh.notes)
+
+
+def _finest(builder: Any) -> float:
+    """The least of a builder's sizes of cells, m; h at a notch or a hole is h / 4 where it is left out."""
+    sizes = {name: size for name, size in vars(builder).items() if name == "h" or name.startswith("h_")}
+    return float(min(builder.h / 4 if size is None else size for size in sizes.values()))
 
 
 def _counted(mesh: MeshData) -> str:
@@ -183,7 +195,12 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     yield f"material    {study.material.energy}{plane}{regions}"
-    yield f"fracture    {_fracture(study)}"
+    if study.fracture is not None and study.fracture.energy is not None:
+        first, *others = tearing(study, anatomy.h, float(np.max(np.subtract(anatomy.upper, anatomy.lower))))
+        yield f"fracture    {first}"
+        yield from (f"            {line}" for line in others)
+    else:
+        yield f"fracture    {_fracture(study)}"
     yield f"plasticity  {_plasticity(study)}"
     if study.brittle is not None:
         yield f"brittle     {_brittle(study.brittle)}"
@@ -285,8 +302,6 @@ def _fracture(study: Study) -> str:
     fracture = study.fracture
     approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
     closing = ", cracks close" if fracture.unilateral else ""
-    if fracture.energy is not None:
-        return _tearing(study, fracture.energy)
     return f"{approach}, strength {fracture.strength:g} Pa, {_average(fracture)}{closing}"
 
 
@@ -294,19 +309,6 @@ def _average(fracture: Fracture) -> str:
     if fracture.kernel == "neighbours":
         return "average over neighbouring cells"
     return f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
-
-
-def _tearing(study: Study, energy: float) -> str:
-    """Irwin's length l_ch = E' G_c / f_t^2 says how large cells may be, and that of a body how small it may not be."""
-    table, material = study.fracture, study.material
-    assert table is not None
-    stiff = material.young / (1 - material.poisson**2 if material.plane == "strain" else 1.0)
-    length = stiff * energy / table.strength**2
-    return (
-        f"cracks that take {energy:g} J/m^2, and begin at {table.strength:g} Pa; "
-        f"l_ch = E' G_c / f_t^2 = {length:.3g} m "
-        "(less than h: cracks begin late; more than a fifth of the body: loads are too high)"
-    )
 
 
 def _plasticity(study: Study) -> str:

@@ -73,6 +73,9 @@ class Study(Table):
         special = [name for name, region in self.material.regions.items() if region.strength is not None]
         if special and self.fracture is None:
             raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
+        special = [name for name, region in self.material.regions.items() if region.fracture_energy is not None]
+        if special and (self.fracture is None or self.fracture.energy is None):
+            raise ValueError(f"material.{special[0]}.fracture_energy needs fracture.energy, that of the other regions")
         return self
 
     @model_validator(mode="after")
@@ -137,7 +140,6 @@ class Study(Table):
             "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
             "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
             'output.cut = "forces"': (self.output.cut == "forces", "cracks say where they cut: remove it"),
-            "fracture.unilateral": (table.unilateral, "cracks that take an energy do not close yet: remove unilateral"),
             "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
             "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
         }

@@ -29,6 +29,24 @@ def plateau_gradient(apart: Values, radius: Values) -> Values:
     return slope[:, None] * apart
 
 
+def springs(vectors: Values, modulus: Values, H: Values, *, linear: bool) -> tuple[Values, Values]:
+    """(n,) psi in J/m^3 and (n, d, d) P in Pa of springs along edges that are shorter than at rest (forms.closing).
+
+    psi = k/2 sum min(s, 0)^2, s = (|F d|^2 / |d|^2 - 1) / 2, or d . H d / |d|^2 where strains are taken for small.
+    `vectors`: (n, edges, d) m. `modulus`: (n, edges) k in Pa, 0 of edges without one.
+    """
+    square = np.einsum("nei,nei->ne", vectors, vectors)
+    moved = np.einsum("nij,nej->nei", H, vectors)
+    strain = np.einsum("nei,nei->ne", vectors, moved) / square
+    if not linear:
+        strain += np.einsum("nei,nei->ne", moved, moved) / (2 * square)
+        moved += vectors
+    shorter = np.minimum(strain, 0.0)
+    pulled = vectors if linear else moved
+    P = np.einsum("ne,nei,nej->nij", modulus * shorter / square, pulled, vectors)
+    return np.einsum("ne,ne->n", modulus, shorter**2) / 2, P
+
+
 def first_piola(cauchy: Values, H: Values, *, linear: bool) -> Values:
     """(n, d, d) P = J sigma F^-T in Pa, F = I + H; sigma itself where strains are taken for small."""
     if linear:

@@ -8,12 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ...forms.closing import spring_modulus
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
+from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..brittle.principal import largest, tensors
 from .around import Around, Pairs
-from .force import eshelby, first_piola, plateau, plateau_gradient
+from .force import eshelby, first_piola, plateau, plateau_gradient, springs
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -102,7 +104,7 @@ class Sight:
         rows[cells, 10], rows[cells, 11] = graph.split[cells], graph.damaged[cells]
         assert self._stress.chi is not None
         cells = self.around.wanted(points)
-        cells = cells[self._stress.chi.x.array[cells] > 0]
+        cells = cells if self._stress.closes else cells[self._stress.chi.x.array[cells] > 0]
         H = self.gradients(cells, self._stress.u.x.array)
         sigma = self._eshelby(cells, tensors(stress[cells], 2), psi[cells], H)
         if self.motion is not None:
@@ -118,7 +120,20 @@ class Sight:
         P = first_piola(stress, H, linear=self._stress.energy.linear)
         assert self._stress.chi is not None
         chi = self._stress.chi.x.array[cells]
-        return eshelby(chi * psi, H, chi[:, None, None] * P)
+        psi, P = chi * psi, chi[:, None, None] * P
+        if self._stress.closes:
+            pressed, push = self._pressed(cells, 1 - chi, H)
+            psi, P = psi + pressed, P + push
+        return eshelby(psi, H, P)
+
+    def _pressed(self, cells: Ints, share: Values, H: Values) -> tuple[Values, Values]:
+        """psi (n,) in J/m^3 and P (n, d, d) in Pa of the broken edges of cells, with `share` of their springs."""
+        graph, material = self._graph, self._stress.material
+        nodes = self._domain.nodes[self._domain.cell_nodes[cells]]
+        first, second = local_edges(2).T
+        stiff = np.broadcast_to(spring_modulus(material, 2, len(first)), (len(self.centres),))[cells]
+        modulus = (share * stiff)[:, None] * ~graph.intact(cells)
+        return springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
 
     def _moved(self, cells: Ints, H: Values, v: Values, a: Values) -> tuple[Values, Values]:
         """(n,) rho v^2 / 2 in J/m^3, and (n, 2) rho (H^T a - (grad v)^T v) in N/m^3, in the middles of cells."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
-from ..degradation import Lost
+from ..degradation import EdgeEnergy, Lost
 
 Values = npt.NDArray[np.float64]
 
@@ -57,3 +57,29 @@ class Splitting:
     def opened(self) -> None:
         """Cells that have come apart carry nothing."""
         self._chi[np.flatnonzero(self._graph.split)] = 0.0
+
+
+class ClosingSplitting(Splitting):
+    """chi as `Splitting` has it, beside the springs of broken edges, which have 1 - chi of a share (forms.closing)."""
+
+    def __init__(self, stress: Stress, graph: EdgeGraph, rate: Values | None = None) -> None:
+        super().__init__(stress, graph, rate)
+        self._edges = EdgeEnergy(stress, graph)
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
+        """Released: what the energy lost at this displacement as chi fell and edges broke."""
+        before = self._edges.energy()
+        lost = super().__call__(broke, stress, psi)
+        if broke:
+            self._edges.update()
+        after = self._edges.energy()
+        return Lost(before - after, after, lost.loss, lost.died)
+
+    def restore(self) -> None:
+        """chi itself is in the checkpoint."""
+        self._edges.update()
+
+    def opened(self) -> None:
+        """Cells that have come apart carry nothing but pressure."""
+        super().opened()
+        self._edges.update()

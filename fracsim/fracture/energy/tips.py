@@ -14,6 +14,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
+from ...mechanics.material import PerCell
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
 from ...mesh.ranks import total
@@ -68,11 +69,11 @@ class CrackTips:
 
     Attributes:
         cut: (edges,) where cracks cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
-        toughness: G_c in J/m^2.    strength: of each edge in each cell.
+        toughness: G_c in J/m^2, a number or (cells,).    strength: of each edge in each cell.
     """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, toughness: float, opened: Values | None = None
+        self, stress: Stress, graph: EdgeGraph, strength: Strength, toughness: PerCell, opened: Values | None = None
     ) -> None:
         """`opened`: (edges,) where the cracks that are there already cut edges (collective)."""
         self._stress, self._graph, self.strength, self.toughness = stress, graph, strength, toughness
@@ -144,9 +145,10 @@ class CrackTips:
         sigma = largest(mean)
         behind, mature = seen.behind(point, radius, FULL * h)
         size = np.linalg.norm(force, axis=1)
-        strained = np.sqrt(NEAR_TIP * self._modulus[tips] * self.toughness / (AVERAGE * h))
+        toughness = np.broadcast_to(self.toughness, len(self._h))[tips]
+        strained = np.sqrt(NEAR_TIP * self._modulus[tips] * toughness / (AVERAGE * h))
         young = (sigma >= self._strength_of(tips)) | (np.sqrt(square) >= strained)
-        active = np.flatnonzero(np.where(mature, size >= self.toughness, young) & (sigma > 0))
+        active = np.flatnonzero(np.where(mature, size >= toughness, young) & (sigma > 0))
         ahead = np.where(mature[:, None], force, point - behind)[active]
         rank = self._ranked(0, sigma[active], point[active], radius[active])
         return Proposal(rank, tips[active], mean[active], entry[active], ahead)

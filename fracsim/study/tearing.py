@@ -1,0 +1,46 @@
+"""What `fracsim check` says of cracks that take an energy: whether cells and body suit Irwin's length (METHOD 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from . import Study
+from .body import Region
+
+PART = 5.0  # times that Irwin's length goes into the body, from which on a crack has room for its tip
+
+
+def tearing(study: Study, h: float, side: float) -> Iterator[str]:
+    """What cracks take and where they begin, of each region that differs, and what to change.
+
+    l_ch = E' G_c / f_t^2 (Irwin) against the finest cells `h` and the body's longest `side`, m.
+    """
+    table = study.fracture
+    assert table is not None
+    regions = study.material.regions.items()
+    differ = ("young", "poisson", "strength", "fracture_energy")
+    every = [("", Region())] + [each for each in regions if any(getattr(each[1], key) is not None for key in differ)]
+    for name, region in every:
+        energy, strength = region.fracture_energy or table.energy, region.strength or table.strength
+        assert energy is not None
+        length = _stiff(study, region) * energy / strength**2
+        where = f"in {name}: " if name else ""
+        yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa"
+        yield f"{where}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
+        yield from _unfit(length, strength, h, side)
+
+
+def _stiff(study: Study, region: Region) -> float:
+    """E' in Pa."""
+    material = study.material
+    young, poisson = region.young or material.young, material.poisson if region.poisson is None else region.poisson
+    return young / (1 - poisson**2 if material.plane == "strain" else 1.0)
+
+
+def _unfit(length: float, strength: float, h: float, side: float) -> Iterator[str]:
+    """What is wrong with it."""
+    if 0 < length < h:
+        yield f"note: that is less than h = {h:.3g} m: in smooth places cracks begin late and take more than G_c;"
+        yield f"h = {length:.2g} m would do, or a strength of {strength * (length / h) ** 0.5:.2g} Pa"
+    elif length * PART > side:
+        yield "note: that is over a fifth of the body: a crack's process zone has no room, and loads are too high"
