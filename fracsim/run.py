@@ -31,6 +31,8 @@ from .study import Study
 from .study.file import study_text
 
 if TYPE_CHECKING:
+    from .output.crack_front import CrackFront
+    from .output.load_drop import LoadDrop
     from .output.meetings import Meetings, Met
     from .output.overlapping import Overlapping
     from .output.passing import Passing
@@ -94,17 +96,20 @@ class Run:
         """Open the output, of a run that goes on where there are notes of it."""
         study, restart, folder = self.scene.study, notes is not None, self.folder
         step, t = (self.state.step, self.state.t) if restart else (None, None)
-        names, columns = self.scene.probes.names, history_columns(self.scene.probes.names)
+        self.front = self._crack_front()
+        names = [*self.scene.probes.names, *(self.front.names if self.front is not None else [])]
+        columns = history_columns(names)
         if step is not None:
             on_root(self.comm, lambda: check_readable(folder, columns, step))
         self.interrupt.writing = True
         on_root(self.comm, lambda: make_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
-        self.history = History(self.comm, folder / "history.csv", names, step)
+        self.history = History(self.comm, folder / "history.csv", names, step, study.thickness)
         self._watch(notes)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), passing=self.passing, resume_at=t,
+            thickness=study.thickness,
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
@@ -117,10 +122,36 @@ class Run:
         self.inverted = InvertedCells(stress, self.scene.fracture)
         self.gained = EnergyGain(at_rest=self.scene.study.at_rest, floor=worth_telling(stress))
         self.meetings, self.overlapping, self.passing = self._contact_watched()
-        others = [each for each in (self.meetings, self.overlapping, self.passing) if each is not None]
+        self.drop = self._load_drop()
+        watching = (self.meetings, self.overlapping, self.passing, self.drop)
+        others = [each for each in watching if each is not None]
         self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter, others)
         if notes is not None:
             self.monitors.restore(notes.monitors)
+
+    def _crack_front(self) -> CrackFront | None:
+        """Where cracks say where they cut: how long they are, and their tip."""
+        study = self.scene.study
+        if study.fracture is None or not (study.crack or study.fracture.energy):
+            return None
+        from .output.crack_front import CrackFront
+
+        assert self.breaks.record is not None
+        return CrackFront(self.breaks.record)
+
+    def _load_drop(self) -> LoadDrop | None:
+        """What ends the run early."""
+        study = self.scene.study
+        if (until := study.time.until) is None:
+            return None
+        from .output.load_drop import LoadDrop
+
+        return LoadDrop(study.watched, until.drop, until.above, breaks=study.fracture is not None)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is at its end: that of the study, or that of `time.until`."""
+        return self.scene.ended(self.state) or (self.drop is not None and self.drop.reached)
 
     def _contact_watched(self) -> tuple[Meetings | None, Overlapping | None, Passing | None]:
         """What watches obstacles, those that move freely, and pieces that nothing keeps apart: each only where it can
@@ -150,10 +181,14 @@ class Run:
         if report.broken:
             self.note_breaks()
         probes = self.scene.probes()
-        self.history.append(self.state, report, self.breaks.figures, probes)
-        if self.meetings is not None:
+        front = self.front() if self.front is not None else ()
+        self.history.append(self.state, report, self.breaks.figures, np.array([*probes, *front]))
+        if self.meetings is not None or self.drop is not None:
             figures = {name: float(value) for name, value in zip(self.scene.probes.names, probes, strict=True)}
-            self.meetings.look(self.state, report.dt, figures)
+            if self.meetings is not None:
+                self.meetings.look(self.state, report.dt, figures)
+            if self.drop is not None:
+                self.drop.look(self.state.t, figures, self.breaks.figures[0])
         self.gained.look(report, self.state)
         return report
 
@@ -161,6 +196,8 @@ class Run:
         """Edges have broken since the last step, in it or by hand: when, where, and into how many pieces
         (collective)."""
         self.breaks.note(self.state.t)
+        if self.front is not None:
+            self.front.look()
 
     def write_frame(self) -> None:
         """Write the body as it is now, and look at its cells. Raises CannotWrite (collective)."""
@@ -217,9 +254,9 @@ class Run:
         if reason := self.interrupt.signalled():
             raise Stopped(f"stopped by {reason} before the first step, at t = {self.state.t:g} s")
         last, every = time.monotonic(), self.scene.study.output.checkpoint
-        while not self.scene.ended(self.state):
+        while not self.ended:
             report = self.step()
-            done = self.scene.ended(self.state)
+            done = self.ended
             if done or self._clock.due(self.state):
                 self.write_frame()
             progress.update(self.state, report, self.breaks.figures)
@@ -245,14 +282,14 @@ class Run:
         return summary
 
     def _summary(self, outcome: str) -> dict[str, Any]:
-        state, domain = self.state, self.scene.domain
+        state, domain, thick = self.state, self.scene.domain, self.scene.study.thickness
         broken, split, pieces = self.breaks.figures
         sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces,
-            "external_work": state.work, "dissipated": state.dissipated, **self.monitors.summary(),
+            "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.monitors.summary(),
         }  # fmt: skip
 
     # --- where to go on from ---

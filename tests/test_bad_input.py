@@ -83,7 +83,7 @@ REFUSED: list[tuple[Data, str]] = [
     (without("time"), "time is missing; every study needs it"),
     (without("material", "density"), "material.density is missing; the table [material] needs it"),
     (without("fracture", "strength", STRIP), "fracture.strength is missing; the table [fracture] needs it"),
-    (right(), "boundary.1: give exactly one of fix, displacement, velocity, traction, pressure; found none"),
+    (right(), "boundary.1: give exactly one of fix, displacement, velocity, traction, force, pressure; found none"),
     (right(fix="x", pressure=1.0), "found fix and pressure"),
     (changed(BAR, mesh=None) | {"mesh": {}}, "mesh: give exactly one of builder, file, surface; found none of them"),
     (changed(BAR, mesh={"file": "a.msh"}), "found builder and file"),

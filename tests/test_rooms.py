@@ -19,11 +19,10 @@ LAYERS = ("mesh", "mechanics", "fracture", "stepping", "rigid", "output")  # eac
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}
-# a sweep asks the schema and who owns a folder; runs ask how groups are driven; colours and pictures read files
+# a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {
     "picture": {"output.surface.collection"},
     "colouring": {"output.fields_file"},
-    "runs": {"study.conditions", "study.file"},
     "sweep": {"study.check", "study.file", "output.own_files"},
 }
 

@@ -13,6 +13,7 @@ from ufl.core.expr import Expr
 from ..forms.balance import pressure_work, traction_work
 from ..mesh.dolfinx_calls import exterior_facets
 from ..mesh.domain import Domain, Ints
+from ..mesh.ranks import total
 from .kernels import compile_form
 from .term import Level, Term
 from .time_functions import TimeFunction
@@ -137,6 +138,18 @@ class Pressure(Term):
     def applied(self) -> Values:
         """(owned dofs,) force of the pressures on the current shape, N (collective)."""
         return -self._assembler(self._form)
+
+
+def area(domain: Domain, facets: Ints) -> float:
+    """Of local exterior facets in the body at rest, on all ranks, m^2; in 2D their length, m (collective)."""
+    cell, opposite = exterior_facets(domain.mesh, facets).reshape(-1, 2).T
+    nodes = domain.cell_nodes[cell]
+    corners = nodes[np.arange(nodes.shape[1]) != opposite[:, None]].reshape(len(nodes), domain.dim)
+    x = domain.nodes[corners]
+    sides = x[:, 1:] - x[:, :1]
+    gram = np.einsum("nik,njk->nij", sides, sides)
+    own = np.sqrt(np.linalg.det(gram)) / (domain.dim - 1)  # of a segment its length, of a triangle half the product
+    return float(total(domain.comm, np.sum(own))[0])
 
 
 def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:

@@ -36,9 +36,10 @@ class FrameFiles:
         surface: bool,
         passing: Passing | None = None,
         resume_at: float | None = None,
+        thickness: float = 1.0,
     ) -> None:
         """`fields`: by the names of output.fields; `passing`: watches pieces that nothing keeps apart; `resume_at`:
-        keep the frames up to this time, s (collective).
+        keep the frames up to this time, s; `thickness`: m, of a 2D body (collective).
 
         Raises CannotWrite.
         """
@@ -46,7 +47,7 @@ class FrameFiles:
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
         self._values, source = Frames(stress, fields, breaking), stress.domain.source
         self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
-        self.surface = _surface(folder, balance, breaks, passing, resume_at) if surface else None
+        self.surface = _surface(folder, balance, breaks, passing, resume_at, thickness) if surface else None
 
     def write(self, state: State) -> None:
         """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
@@ -61,12 +62,12 @@ class FrameFiles:
 
 
 def _surface(
-    folder: Path, balance: Balance, breaks: Breaks, passing: Passing | None, resume_at: float | None
+    folder: Path, balance: Balance, breaks: Breaks, passing: Passing | None, resume_at: float | None, thickness: float
 ) -> SurfaceOutput:
     """The split surface: imported, built and kept only where it is wanted."""
     from .surface.output import SurfaceOutput
 
-    density, terms = balance.stress.material.density, balance.terms
+    density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
         folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at,
         apart=[term.apart for term in terms if term.keeps_apart], beside=[term for term in terms if term.visible],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import RawIOBase
 from pathlib import Path
 from typing import Literal
@@ -15,6 +16,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
+from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
 from ..mesh.ranks import total
 from ..meshes.words import AXES
@@ -30,11 +32,14 @@ COLUMNS = (
 Reading = Callable[[], npt.NDArray[np.float64]]
 Figure = Callable[[], float]
 WORK = "work_"  # columns that are summed over steps
+# what a body of some thickness has as many times as one of 1 m: columns, and heads of columns of probes
+OF_THICKNESS = ("kinetic", "elastic", "dissipated", "external_work", "reaction_", "contact_", WORK, "kinetic_")
 
 
 @dataclass(frozen=True)
 class Probe:
-    """The mean displacement of nodes in m, or the sum of the reactions on them in N; `nodes`: local ones."""
+    """The mean displacement of nodes in m, or the sum of the reactions on them in N and how far they have moved in the
+    mean; `nodes`: local ones."""
 
     name: str
     quantity: Literal["displacement", "reaction"]
@@ -44,13 +49,20 @@ class Probe:
 class Probes:
     """Reads displacements and reactions off a body."""
 
-    def __init__(self, balance: Balance, probes: Sequence[Probe] = ()) -> None:
-        """Counts the nodes of each (collective)."""
+    def __init__(
+        self, balance: Balance, probes: Sequence[Probe] = (), *, ways: dict[str, TimeFunction] | None = None,
+        thickness: float = 1.0,
+    ) -> None:  # fmt: skip
+        """Counts the nodes of each. `ways`: (d,) how far each driven obstacle has moved, m; `thickness`: m, of a body
+        in 2D, whose forces and energies are of 1 m (collective)."""
         self._balance, self._domain = balance, balance.domain
-        kinds = {"reaction": "reaction", "displacement": "probe"}
         axes = AXES[: self._domain.dim]
-        self.names = [f"{kinds[probe.quantity]}_{probe.name}_{axis}" for probe in probes for axis in axes]
-        self._readings = [self._reading(probe) for probe in probes]
+        heads = [(head, probe) for probe in probes for head in HEADS[probe.quantity]]
+        self.names = [f"{head}_{probe.name}_{axis}" for head, probe in heads for axis in axes]
+        self._readings = [self._reading(probe, head) for head, probe in heads]
+        for name, way in (ways or {}).items():
+            self.names += [f"motion_{name}_{axis}" for axis in axes]
+            self._readings.append(partial(self._moved, way))
         readings: dict[str, Reading] = {}
         works: dict[str, Figure] = {}
         least: dict[str, Figure] = {}
@@ -61,6 +73,7 @@ class Probes:
         self.names += [*readings, *works, *least]
         self._readings += readings.values()
         self._works, self._least = list(works.values()), list(least.values())
+        self._factor = factors(self.names, thickness)
 
     def __call__(self) -> npt.NDArray[np.float64]:
         """All readings in the order of `names`; work_NAME is that of the last step (collective)."""
@@ -69,14 +82,18 @@ class Probes:
         parts = [reading() for reading in self._readings] + [np.array([each() for each in self._works])]
         sums = total(self._domain.comm, np.concatenate(parts))
         if not self._least:
-            return sums
+            return sums * self._factor
         least = np.array([each() for each in self._least])
         self._domain.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
-        return np.concatenate([sums, least])
+        return np.asarray(np.concatenate([sums, least]) * self._factor)
 
-    def _reading(self, probe: Probe) -> Reading:
+    def _moved(self, way: TimeFunction) -> npt.NDArray[np.float64]:
+        """(d,) this rank's share."""
+        return way(self._balance.level.t) if self._domain.comm.rank == 0 else np.zeros(self._domain.dim)
+
+    def _reading(self, probe: Probe, head: str) -> Reading:
         owned = probe.nodes[probe.nodes < self._domain.node_count]
-        if probe.quantity == "displacement":
+        if head != "reaction":
             return self._mean_displacement(owned)
         return lambda: self._balance.reactions.reshape(-1, self._domain.dim)[owned].sum(axis=0)
 
@@ -84,6 +101,14 @@ class Probes:
         count = total(self._domain.comm, len(owned))[0]
         d = self._domain.dim
         return lambda: self._balance.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
+
+
+HEADS: dict[str, tuple[str, ...]] = {"reaction": ("reaction", "motion"), "displacement": ("probe",)}
+
+
+def factors(names: Sequence[str], thickness: float) -> npt.NDArray[np.float64]:
+    """(columns,) what figures of a 2D body of 1 m are multiplied with."""
+    return np.array([thickness if name.startswith(OF_THICKNESS) else 1.0 for name in names])
 
 
 def history_columns(probe_names: list[str]) -> list[str]:
@@ -99,10 +124,13 @@ class History:
         worked: name -> sum of the work of each obstacle so far, J.
     """
 
-    def __init__(self, comm: MPI.Comm, path: Path, probe_names: list[str], resume_at: int | None = None) -> None:
-        """`resume_at`: keep the rows up to this step, in a file that takes the place of the old one (collective)."""
+    def __init__(
+        self, comm: MPI.Comm, path: Path, probe_names: list[str], resume_at: int | None = None, thickness: float = 1.0
+    ) -> None:
+        """`resume_at`: keep the rows up to this step, in a file that takes the place of the old one; `thickness`: m, of
+        a 2D body, whose energies are of 1 m (collective)."""
         self.comm, self._path = comm, path
-        self.columns = history_columns(probe_names)
+        self.columns, self._factor = history_columns(probe_names), factors(COLUMNS, thickness)
         self.step = resume_at or 0
         self.peaks = dict.fromkeys((name for name in probe_names if name.startswith("reaction_")), 0.0)
         self.worked = dict.fromkeys((name for name in probe_names if name.startswith(WORK)), 0.0)
@@ -119,9 +147,10 @@ class History:
         """One row; `damage` is (broken edges, split cells, pieces). Raises CannotWrite (collective)."""
         values: list[int | float] = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
-            report.solve.newton, report.solve.krylov, report.seconds, *probes,
+            report.solve.newton, report.solve.krylov, report.seconds,
         ]  # fmt: skip
-        self.append_row(values)
+        of_body = [each if factor == 1 else each * factor for each, factor in zip(values, self._factor, strict=True)]
+        self.append_row([*of_body, *probes])
 
     def append_row(self, values: Sequence[int | float]) -> None:
         """One row of values in the order of `columns`, the step first. Raises CannotWrite (collective)."""

@@ -12,7 +12,10 @@ from typing import Any
 
 from ..errors import InputError
 
-FREE = ("title", "time.step", "time.end", "time.adapt", "time.smallest", "solver", "output", "mesh")
+FREE = (
+    "title", "time.step", "time.end", "time.adapt", "time.smallest", "time.breaking_step", "time.until", "solver",
+    "output", "mesh",
+)  # fmt: skip
 # tables that may come or go while nothing has broken or flowed, which the checkpoint is asked for; with the key of a
 # region that comes and goes with them
 LATE = {"fracture": "strength", "plasticity": "yield_stress", "brittle": ""}
@@ -30,8 +33,8 @@ def check_same_study(path: Path, then: dict[str, Any], now: dict[str, Any]) -> N
     more = f"; and {len(found) - _SAID} more" if len(found) > _SAID else ""
     raise InputError(
         f"--restart: {path} is of another study: {'; '.join(found[:_SAID])}{more}. Only time.step, time.end, "
-        "time.adapt, time.smallest, [solver], [output] and the title may change; put the others back, or run without "
-        "--restart in another folder"
+        "time.adapt, time.smallest, time.breaking_step, time.until, [solver], [output] and the title may change; put "
+        "the others back, or run without --restart in another folder"
     )
 
 

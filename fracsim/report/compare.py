@@ -85,8 +85,10 @@ def series(run: RunData, x: str, y: str, label: str) -> Series:
 
 
 def curves(runs: list[RunData]) -> Section:
-    """Reactions over the motion of their group (where it is driven) and over time, and probes over time."""
-    columns = list(dict.fromkeys(key for run in runs for key in run.history if key.startswith(("reaction_", "probe_"))))
+    """Reactions and forces of contact over the motion of their group or obstacle (where it moves) and over time, and
+    probes over time."""
+    kinds = ("reaction_", "contact_", "probe_")
+    columns = list(dict.fromkeys(key for run in runs for key in run.history if key.startswith(kinds)))
     plots = []
     for column in columns:
         having = [run for run in runs if column in run.history]
@@ -111,14 +113,15 @@ def _worth_showing(runs: list[RunData], column: str) -> bool:
 
 
 def _motions_of(column: str, runs: list[RunData]) -> Iterator[str]:
-    """The motion of the same probe along the same axis, where all the runs have one."""
+    """The motion of the same probe or obstacle along the same axis, where it moves in all the runs."""
     kind, _, place = column.partition("_")
-    if kind == "reaction" and all(f"motion_{place}" in run.history for run in runs):
-        yield f"motion_{place}"
+    motion = f"motion_{place}"
+    if kind != "probe" and all(np.any(run.history.get(motion, np.zeros(1))) for run in runs):
+        yield motion
 
 
 def _axis(column: str) -> str:
-    units = {"time": "s", "reaction": "N", "probe": "m", "motion": "m"}
+    units = {"time": "s", "reaction": "N", "contact": "N", "probe": "m", "motion": "m"}
     kind = column.partition("_")[0]
     return f"{column}, {units[kind]}" if kind in units else column
 

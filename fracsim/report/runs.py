@@ -25,7 +25,7 @@ class RunData:
     Attributes:
         name: how the page calls it.
         settings: "table.key" -> value of the study as run.
-        history: column -> values, a number a step; with the motions of driven groups (motion_<probe>_<axis>, m).
+        history: column -> values, a number a step.
         summary: of summary.json; empty where the run was killed.
     """
 
@@ -118,7 +118,7 @@ def read_run(folder: Path, name: str) -> RunData:
         summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{folder}: its files are not those of a run: {error}") from None
-    return RunData(name, folder, flattened(study), history | _motions(folder, history), summary)
+    return RunData(name, folder, flattened(study), history, summary)
 
 
 def _read_history(path: Path) -> dict[str, Values]:
@@ -129,29 +129,6 @@ def _read_history(path: Path) -> dict[str, Values]:
         raise ValueError("history.csv has no columns step, time and wall_step")
     table = np.array([row for row in rows if len(row) == len(header)], float).reshape(-1, len(header))
     return dict(zip(header, table.T, strict=True))
-
-
-def _motions(folder: Path, history: dict[str, Values]) -> dict[str, Values]:
-    """How far the groups are driven whose reaction is recorded, m: against it a reaction is usually plotted."""
-    from ..study.conditions import conditions, place_of
-    from ..study.file import load_study
-
-    motions: dict[str, Values] = {}
-    try:
-        study = load_study(folder / "study.toml")
-    except InputError:  # written by another version: its history can be shown all the same
-        return motions
-    for i, probe in enumerate(study.probe):
-        axes = [axis for axis in "xyz" if f"reaction_{probe.name}_{axis}" in history]
-        if not axes or probe.on is None:
-            continue
-        place = place_of(probe.on, len(axes), f"probe.{i}.on")
-        for entry in conditions(study, len(axes)):
-            if entry.place == place and entry.kind in ("displacement", "velocity"):
-                path = np.array([entry.function(t) for t in history["time"]]).reshape(-1, len(axes))
-                chosen = [k for k in range(len(axes)) if entry.components[k] and np.any(path[:, k])]
-                motions |= {f"motion_{probe.name}_{axes[k]}": path[:, k] for k in chosen}
-    return motions
 
 
 def flattened(data: Any, prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ breaking    what flows and what breaks after a step
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ from ..stepping.state import State
 from ..stepping.stepper import Stepper, StepSizes
 from ..study import Study, Time
 from ..study.check import checked_mesh
-from ..study.conditions import initial_motion, of_size, place_of
+from ..study.conditions import initial_motion, obstacles, of_size, place_of
 from .breaking import breaking_of, flow_of
 from .material import material_of
 from .terms import TERMS, Parts, balance_of
@@ -87,7 +88,9 @@ def scene_on(domain: Domain, study: Study, material: MaterialFields | None = Non
     breaking = breaking_of(study, balance)
     solver = Solver(balance, study.solver) if scheme.implicit else None
     stepper = make_stepper(balance, study.time, flow, breaking or Unbreakable(balance, flow), solver)
-    return Scene(study, domain, balance, solver, stepper, breaking, Probes(balance, _probes(study, domain)))
+    ways = {each.name: each.moved for each in obstacles(study, domain.dim) if each.moved is not None}
+    probes = Probes(balance, _probes(study, domain), ways=ways, thickness=study.thickness)
+    return Scene(study, domain, balance, solver, stepper, breaking, probes)
 
 
 def make_scheme(timing: Time) -> Scheme:
@@ -97,7 +100,8 @@ def make_scheme(timing: Time) -> Scheme:
 
 def make_stepper(balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None) -> Stepper:
     """What steps a balance of this scheme."""
-    sizes = StepSizes(timing.step, timing.end, timing.smallest or timing.step / 1024, timing.adapt)
+    sizes = StepSizes(timing.step, timing.end, timing.smallest or timing.step / 1024, timing.adapt,
+                      timing.breaking_step or math.inf)  # fmt: skip
     if solver is None:
         from ..stepping.explicit import ExplicitStepper
 

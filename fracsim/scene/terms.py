@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
 from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
-from ..mechanics.loads import DeadLoads, OnFacets, Pressure
+from ..mechanics.loads import DeadLoads, OnFacets, Pressure, area
 from ..mechanics.material import MaterialFields, coefficient
 from ..mechanics.prescribed_motion import PrescribedMotion
 from ..mechanics.stress import RESIDUAL_STIFFNESS, Stress, Weakening
 from ..mechanics.term import Term
+from ..mechanics.time_functions import TimeFunction
 from ..mechanics.vectors import Assembler
 from ..mesh.domain import Domain
 from ..study import Study
@@ -67,12 +69,21 @@ def _pressure(parts: Parts) -> Term | None:
 
 
 def _dead_loads(parts: Parts) -> Term | None:
-    tractions, on_volume = parts.on_facets("traction"), volume_loads(parts.study, parts.domain.dim)
+    tractions, on_volume = [*parts.on_facets("traction"), *_spread(parts)], volume_loads(parts.study, parts.domain.dim)
     if not tractions and not on_volume:
         return None
     gravity = (parts.density, on_volume["gravity"]) if "gravity" in on_volume else None
     body_force = on_volume.get("body_force")
     return DeadLoads(parts.assembler, parts.u, tractions=tractions, gravity=gravity, body_force=body_force)
+
+
+def _spread(parts: Parts) -> list[OnFacets]:
+    """Forces as tractions on the area of their facets (collective)."""
+    return [(facets, _shared(force, area(parts.domain, facets))) for facets, force in parts.on_facets("force")]
+
+
+def _shared(force: TimeFunction, area: float) -> TimeFunction:
+    return lambda t: np.asarray(force(t) / area)
 
 
 def _obstacles(parts: Parts) -> Term | None:

@@ -57,7 +57,7 @@ class ImplicitStepper(BalanceStepper):
             _, v, a = self._arrive(state, dt)
             self._let_flow()
             self.breaking.moving(v, a)
-            result = self.breaking()
+            result = self._broken_in(dt)
             if not result.broken:
                 self._return_to(solved, state, dt)
                 break

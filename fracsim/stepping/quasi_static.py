@@ -80,7 +80,7 @@ class QuasiStaticStepper(ImplicitStepper):
             self.balance.arrive()
             path.to(self._solved(), *acting(self.balance, lumped=False))
             flowed = self._let_flow()
-            result = self._pass(path)
+            result = self._pass(path, dt)
             broken, released = broken + result.broken, released + result.released
             if path.out_of_balance is None or number + 1 == limit:
                 break
@@ -107,10 +107,10 @@ class QuasiStaticStepper(ImplicitStepper):
             before=(state.u, dt), out_of_balance=path.out_of_balance,
         )  # fmt: skip
 
-    def _pass(self, path: _Path) -> PassResult:
+    def _pass(self, path: _Path, dt: float) -> PassResult:
         """A pass where the path has come to, and what it leaves out of balance there."""
         began = self.now()
-        result = self.breaking()
+        result = self._broken_in(dt)
         if result.broken or self.comm.allreduce(result.loss, op=MPI.MAX) > 0:
             self._damage_changed(result)
             balance = self.balance

@@ -9,6 +9,7 @@ fails, and grows back after easy ones; then the body flows and breaks.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict, dataclass, replace
 from typing import Protocol
@@ -52,12 +53,18 @@ class StepReport:
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Sizes of steps, s: the largest, the end of the run, the smallest; `adapt`: halve a step that fails."""
+    """Sizes of steps, s: the largest, the end of the run, the smallest; `adapt`: halve a step that fails; `breaking`:
+    the longest in which edges may break."""
 
     step: float
     end: float
     smallest: float
     adapt: bool = True
+    breaking: float = math.inf
+
+
+class TooLong(Exception):
+    """Edges break in a step that is longer than such a step may be (on all ranks)."""
 
 
 @dataclass
@@ -67,10 +74,12 @@ class Trouble:
     Attributes:
         steps_failed: attempts that did not converge, and were tried again otherwise.
         unbalanced_steps: steps that ended out of balance, for the body weakened by a break had no solution.
+        steps_retaken: steps that were taken again, shorter, since edges broke in them.
     """
 
     steps_failed: int = 0
     unbalanced_steps: int = 0
+    steps_retaken: int = 0
 
 
 class Stepper(Protocol):
@@ -156,11 +165,23 @@ class BalanceStepper:
         while True:
             dt = self._size(state)
             solve = self._attempt(state, dt)
-            if solve.converged:
-                break
-            self.trouble.steps_failed += 1
-            state = self._easier(state, dt, solve)
-        return self._finish(state, dt, solve, began)
+            if not solve.converged:
+                self.trouble.steps_failed += 1
+                state = self._easier(state, dt, solve)
+                continue
+            try:
+                return self._finish(state, dt, solve, began)
+            except TooLong:
+                self.trouble.steps_retaken += 1
+                state = replace(state, dt=max(dt / 2, self.sizes.breaking), easy=0)
+                self._recall(state)
+
+    def _broken_in(self, dt: float) -> PassResult:
+        """A pass of a step of dt s. Raises TooLong where edges break in it and it is longer than it may be then."""
+        result = self.breaking()
+        if result.broken and dt > self.sizes.breaking * (1 + 1e-9):
+            raise TooLong
+        return result
 
     def _memory(self) -> dict[str, object]:
         return {"damage": self.breaking.memory(), "flow": self.flow.memory(), "terms": self.balance.memory()}
@@ -204,8 +225,10 @@ class BalanceStepper:
             )
         return replace(state, dt=dt / 2, easy=0)
 
-    def _grown(self, state: State) -> State:
+    def _grown(self, state: State, broken: int) -> State:
         """After an easy step a halved one may double again."""
+        if broken and self.sizes.breaking < math.inf:
+            return replace(state, easy=0)
         if state.dt < self.sizes.step and state.easy + 1 >= EASY_STEPS:
             return replace(state, dt=min(2 * state.dt, self.sizes.step), easy=0)
         return replace(state, easy=state.easy + 1)
@@ -229,7 +252,7 @@ class BalanceStepper:
             state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag, before=(state.u, dt)
         )
         flowed = self._let_flow()
-        end, result = self._break(end, solved)
+        end, result = self._break(end, solved, dt)
         lost = viscous + (result.released + released + flowed)
         return self._booked(end, dt, solve, began, result.broken + broken, result.elastic, work, lost)
 
@@ -252,7 +275,7 @@ class BalanceStepper:
         end = replace(
             end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, memory=self._memory()
         )
-        return self._grown(end), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
+        return self._grown(end, broken), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
@@ -278,14 +301,14 @@ class BalanceStepper:
             self.phases["plasticity"] = self.phases.get("plasticity", 0.0) + time.perf_counter() - began
         return lost
 
-    def _break(self, end: State, solved: Values) -> tuple[State, PassResult]:
+    def _break(self, end: State, solved: Values, dt: float) -> tuple[State, PassResult]:
         """A pass, and the state with the forces and the acceleration that it leaves.
 
-        `solved`: (owned dofs,) displacement at which the step's forces balance.
+        `solved`: (owned dofs,) displacement at which the forces of the step, of dt s, balance.
         """
         began = time.perf_counter()
         self.breaking.moving(end.v, end.a)
-        result = self.breaking()
+        result = self._broken_in(dt)
         if result.broken:
             end = self._released(end, solved, result)
         self._damage_changed(result)

@@ -12,6 +12,7 @@ values          what a key may hold
 file            a study read by path or name, overridden, and written with every default
 explain         what is wrong, in one sentence
 check           `fracsim check`
+resultants      areas and resultants of loads
 mesh_source     from [mesh] to arrays
 catalogue       `fracsim list`
 """

@@ -57,6 +57,7 @@ class Material(Elastic):
 
     energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
     plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
+    thickness: Positive | None = None  # m, of a 2D mesh out of its plane; None: forces and energies are those of 1 m
     regions: dict[str, Region] = Field(default_factory=dict)
 
     @model_validator(mode="before")

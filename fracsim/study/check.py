@@ -25,6 +25,7 @@ from ..meshes.words import AXES, format_point
 from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
+from .resultants import resultants
 from .tearing import tearing
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class Anatomy:
     regions: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
+    cells: int  # about how many
     size: str  # how many cells, in words
     h: float  # of the finest cells, or of the mean one of a mesh that was read, m
     surface: Callable[[], str]  # how many facets, in words; counted when asked
@@ -74,13 +76,13 @@ def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
         count = builder.cells_estimate()
         size, facets = f"about {count:,} cells", partial(_at_least, count, len(lower))
         h = _finest(builder)
-        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), size, h, facets)
+        return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), count, size, h, facets)
     if surface is not None:
         count = cells_inside(study.mesh, surface)
         size, facets = f"about {count:,} cells in {len(surface.triangles):,} triangles", partial(_at_least, count, 3)
         lower, upper = (tuple(corner.tolist()) for corner in (surface.points.min(axis=0), surface.points.max(axis=0)))
         h = float(study.mesh.parameters["h"])
-        return Anatomy(3, ("surface",), (), lower, upper, size, h, facets, surface.volume, surface.notes)
+        return Anatomy(3, ("surface",), (), lower, upper, count, size, h, facets, surface.volume, surface.notes)
     return None
 
 
@@ -91,8 +93,8 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
     volume = float(signed_measures(mesh.points, mesh.cells).sum())
     groups, regions, facets = tuple(mesh.facet_groups), tuple(mesh.regions), partial(_counted, mesh)
-    h = (factorial(mesh.dim) * volume / len(mesh.cells)) ** (1 / mesh.dim)
-    return Anatomy(mesh.dim, groups, regions, lower, upper, size, h, facets, volume, mesh.notes)
+    h, cells = (factorial(mesh.dim) * volume / len(mesh.cells)) ** (1 / mesh.dim), len(mesh.cells)
+    return Anatomy(mesh.dim, groups, regions, lower, upper, cells, size, h, facets, volume, mesh.notes)
 
 
 def _finest(builder: Any) -> float:
@@ -168,6 +170,8 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
         raise InputError(
             "fracture.energy is for 2D meshes so far; this one has 3 dimensions: remove it, and edges break by strength"
         )
+    if dim == 3 and study.material.thickness is not None:
+        raise InputError("material.thickness is that of 2D meshes; this one has 3 dimensions: remove it")
     if dim == 3 and study.material.plane == "stress":
         raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
 
@@ -192,7 +196,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
         yield f"            note: {note}"
-    plane = f", plane {study.material.plane}" if anatomy.dim == 2 else ""
+    plane = f", plane {study.material.plane}{_thick(study)}" if anatomy.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     yield f"material    {study.material.energy}{plane}{regions}"
     if study.fracture is not None and study.fracture.energy is not None:
@@ -210,6 +214,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
+    for line in resultants(study, anatomy.dim, anatomy.cells):
+        yield f"            {line}"
     if study.obstacle:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
         if any(each.shape != "mesh" for each in study.obstacle):
@@ -226,6 +232,10 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
     yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
+    if study.time.breaking_step is not None:
+        yield f"            steps in which edges break are {study.time.breaking_step:g} s at most"
+    if (until := study.time.until) is not None:
+        yield f"            ends where the force on {study.watched} has fallen by {until.drop:.0%} from its peak"
     if _may_ring(study):
         yield "            note: in steps this long Newmark's method may gain energy at large strains;"
         yield '            scheme = "generalized-alpha" does not'
@@ -274,6 +284,10 @@ def _motion(obstacle: Obstacle) -> str:
 def _solid(file: Path, scale: float, key: str) -> str:
     surface = open_solid(file, scale, key)
     return f"{len(surface.triangles):,} triangles, {surface.extent}, {surface.volume:.4g} m^3; {_PRICE_OF_SOLIDS}"
+
+
+def _thick(study: Study) -> str:
+    return "" if study.material.thickness is None else f", {study.material.thickness:g} m thick"
 
 
 RINGS = 2.0  # times that a wave passes an edge in a step, from which on Newmark's method may gain energy

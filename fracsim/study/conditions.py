@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,9 @@ class Condition:
     """An entry of [[boundary]].
 
     Attributes:
-        key: where the study has it.    kind: fix, displacement, velocity, traction or pressure.
-        function: of time: displacement (d,) in m of the three motions, traction (d,) or pressure (1,) in Pa.
+        key: where the study has it.    kind: fix, displacement, velocity, traction, force or pressure.
+        function: of time: displacement (d,) in m of the three motions, traction (d,) or pressure (1,) in Pa, force (d,)
+            in N, in 2D per metre of thickness.
         components: (d,) which components a motion prescribes; none of a load.
     """
 
@@ -68,7 +70,8 @@ class Loose:
     """What an entry of [[obstacle]] says of one that is free; d = 2 or 3, r = 1 or 3, p = d + r.
 
     Attributes:
-        mass: kg, or density: kg/m^3.    hinge: (d,) the point that it turns about, m; None: its centre moves.
+        mass: kg (2D: per metre of thickness), or density: kg/m^3.
+        hinge: (d,) the point that it turns about, m; None: its centre moves.
         ways: (p, k) what it may do: increments of its pose.    rate: (k,) how fast at the start, m/s and rad/s.
         gravity: (d,) m/s^2.
     """
@@ -82,11 +85,43 @@ class Loose:
 
 
 def conditions(study: Study, dim: int) -> list[Condition]:
-    """All entries of [[boundary]]. InputError where one does not fit the dimension."""
-    return [_condition(entry, dim, f"boundary.{i}") for i, entry in enumerate(study.boundary)]
+    """All entries of [[boundary]]. InputError where one does not fit the dimension, or two do not agree."""
+    entries = [_condition(entry, dim, f"boundary.{i}", study.thickness) for i, entry in enumerate(study.boundary)]
+    check_agreement(entries, dim)
+    return entries
 
 
-def _condition(entry: Boundary, dim: int, key: str) -> Condition:
+def check_agreement(entries: Sequence[Condition], dim: int) -> None:
+    """InputError where two entries prescribe the same component of the same place, or a load acts along one that is
+    prescribed there and so does nothing."""
+    for one, other in permutations(entries, 2):
+        if one.place != other.place or not one.moves:
+            continue
+        both = one.components & (other.components if other.moves else _acts(other, dim))
+        if not both.any():
+            continue
+        axis = AXES[int(np.argmax(both))]
+        if not other.moves:
+            raise InputError(
+                f"{other.key}.{other.kind} acts along {axis} on {other.place}, where {one.key} prescribes {axis}: it "
+                f"would do nothing; set its {axis} to 0, or leave {axis} free"
+            )
+        if {one.kind, other.kind} != {"fix"}:
+            raise InputError(
+                f"{one.key} and {other.key} both prescribe {axis} of {one.place}: remove one of them, or give "
+                f'"free" for {axis}'
+            )
+
+
+def _acts(load: Condition, dim: int) -> Flags:
+    """(d,) components along which a traction or a force ever acts; a pressure has none of its own."""
+    if load.kind == "pressure":
+        return np.zeros(dim, bool)
+    assert isinstance(load.function, Tabulated)
+    return np.any(load.function.rows != 0, axis=0)
+
+
+def _condition(entry: Boundary, dim: int, key: str, thickness: float) -> Condition:
     place, value = place_of(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
     function: TimeFunction
     components: Flags = np.zeros(dim, bool)
@@ -98,6 +133,8 @@ def _condition(entry: Boundary, dim: int, key: str) -> Condition:
             components = ~np.isnan(table.rows[0])
         if entry.kind == "velocity":
             function = table.integral
+        if entry.kind == "force":
+            function = Tabulated(table.times, np.asarray(table.rows / thickness))
     return Condition(key, entry.kind, place, function, components)
 
 
@@ -136,10 +173,11 @@ def obstacles(study: Study, dim: int) -> list[Placing]:
     """All entries of [[obstacle]]. InputError where one does not fit the dimension."""
     load = volume_loads(study, dim)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(dim)
-    return [_placing(entry, dim, f"obstacle.{i}", gravity) for i, entry in enumerate(study.obstacle)]
+    entries = enumerate(study.obstacle)
+    return [_placing(entry, dim, f"obstacle.{i}", gravity, study.thickness) for i, entry in entries]
 
 
-def _placing(entry: Obstacle, dim: int, key: str, gravity: Values) -> Placing:
+def _placing(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: float) -> Placing:
     given = entry.geometry
     for name in {"normal", "axis", "size"} & set(given):
         given[name] = _vector(given[name], dim, f"{key}.{name}")
@@ -158,7 +196,7 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values) -> Placing:
         moved = in_time(entry.displacement, f"{key}.displacement", dim)
     elif entry.velocity is not None and not entry.free:
         moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
-    loose = _loose(entry, dim, key, gravity) if entry.free else None
+    loose = _loose(entry, dim, key, gravity, thickness) if entry.free else None
     return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction, loose)
 
 
@@ -169,7 +207,7 @@ def _check_file(entry: Obstacle, dim: int, key: str) -> None:
         raise InputError(f'{key}.file = "{entry.file}": there is no such file')
 
 
-def _loose(entry: Obstacle, dim: int, key: str, gravity: Values) -> Loose:
+def _loose(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: float) -> Loose:
     """What is free of an entry, and how it starts."""
     turns = 1 if dim == 2 else 3
     velocity = np.zeros(dim) if entry.velocity is None else of_size(entry.velocity, dim, f"{key}.velocity")  # type: ignore[arg-type]
@@ -186,7 +224,8 @@ def _loose(entry: Obstacle, dim: int, key: str, gravity: Values) -> Loose:
         if np.any(velocity[~along]):
             raise InputError(f"{key}.velocity = {velocity.tolist()}: it moves along {entry.guide} alone")
         ways, rate = ways[:, :dim][:, along], velocity[along]
-    return Loose(entry.mass, entry.density, hinge, ways, rate, gravity)
+    mass = None if entry.mass is None else entry.mass / thickness
+    return Loose(mass, entry.density, hinge, ways, rate, gravity)
 
 
 def _about(hinge: Hinge, dim: int, key: str) -> Values:

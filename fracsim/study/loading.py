@@ -44,13 +44,14 @@ Where = Annotated[
 
 
 class Boundary(Table):
-    """[[boundary]]: one condition on a group of facets, a box or a plane. Give exactly one of the six."""
+    """[[boundary]]: one condition on a group of facets, a box or a plane. Give exactly one of the kinds."""
 
     on: Where
     fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # components held at zero
     displacement: InTime[Motion] | None = None  # m; "free" leaves a component alone
     velocity: InTime[Motion] | None = None  # m/s
     traction: InTime[Vector] | None = None  # Pa of the reference area
+    force: InTime[Vector] | None = None  # N in all, spread evenly over the reference area; 2D: on `material.thickness`
     pressure: InTime[Finite] | None = None  # Pa, pushes where > 0, follows the surface
 
     @model_validator(mode="after")
@@ -69,7 +70,7 @@ class Boundary(Table):
         return self._given()[0]
 
 
-CONDITIONS = ("fix", "displacement", "velocity", "traction", "pressure")
+CONDITIONS = ("fix", "displacement", "velocity", "traction", "force", "pressure")
 MOTIONS = ("fix", "displacement", "velocity")
 
 

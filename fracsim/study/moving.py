@@ -51,6 +51,8 @@ def check_rigid(study: Study) -> None:
     for name, table in tables.items():
         if table:
             raise ValueError(f'[{name}] is not for time.scheme = "rigid": {hints.get(name, "remove it")}')
+    if study.time.until is not None or study.time.breaking_step is not None:
+        raise ValueError('time.until and time.breaking_step are not for time.scheme = "rigid": remove them')
     if study.material.energy != "linear":
         raise ValueError(f'time.scheme = "rigid" solves linear analyses: material.energy = "linear", not '
                          f'"{study.material.energy}"')  # fmt: skip

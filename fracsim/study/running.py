@@ -9,7 +9,15 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from ..forms.schemes import SCHEMES, Scheme
 from .loading import Where
-from .values import Finite, Flag, Positive, Seconds, Table, Vector
+from .values import Finite, Flag, NonNegative, Positive, Seconds, Table, Vector
+
+
+class Until(Table):
+    """[time] until: the run ends before `end` once a load has fallen from its peak."""
+
+    drop: Annotated[Finite, Field(gt=0, lt=1)]  # share of the peak that is lost
+    of: str | None = None  # name of a probe that records a reaction, or of an obstacle; default: the only one
+    above: NonNegative = 0.0  # N: peaks below do not count
 
 
 class Timing(Table):
@@ -20,6 +28,8 @@ class Timing(Table):
     end: Seconds  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
     smallest: Seconds | None = None  # s; default step / 1024
+    breaking_step: Seconds | None = None  # s: a longer step in which edges break is taken again, half as long
+    until: Until | None = None
     mass: Literal["lumped", "consistent"] = "lumped"
 
     @property
@@ -38,10 +48,21 @@ class Timing(Table):
             raise ValueError(f"step = {self.step:g} s is longer than the run: end = {self.end:g} s")
         if self.smallest is not None and self.smallest > self.step:
             raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.step:g} s")
+        if self.breaking_step is not None:
+            self._check_breaking_step(self.breaking_step)
         self.kind(**self.parameters).check()
         if not self.kind.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
+
+    def _check_breaking_step(self, step: float) -> None:
+        if not self.kind.implicit:
+            raise ValueError(f'breaking_step is for implicit and quasi-static steps, not scheme = "{self.scheme}"')
+        if not (self.smallest or self.step / 1024) <= step <= self.step:
+            raise ValueError(
+                f"breaking_step = {step:g} s must lie between smallest = {self.smallest or self.step / 1024:g} s and "
+                f"step = {self.step:g} s"
+            )
 
 
 def _keys_of_schemes() -> dict[str, Any]:

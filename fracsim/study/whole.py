@@ -209,6 +209,31 @@ class Study(Table):
         check_rigid(self)
         return self
 
+    @model_validator(mode="after")
+    def _a_load_ends_the_run(self) -> Study:
+        if self.time.until is None:
+            return self
+        named = [each.name for each in self.probe if each.quantity == "reaction"]
+        named += [each.name for each in self.obstacle]
+        of = self.time.until.of
+        if (len(named) == 1 and of is None) or of in named:
+            return self
+        which = f"of = {of!r} is none of them" if of is not None else "say which, of = NAME"
+        there = ", ".join(named) or "none: add a [[probe]] with on = the group that is driven"
+        raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
+
+    @property
+    def watched(self) -> str:
+        """Name of the probe or obstacle whose load ends the run (time.until)."""
+        names = [each.name for each in self.probe if each.quantity == "reaction"] + [e.name for e in self.obstacle]
+        assert self.time.until is not None
+        return self.time.until.of or names[0]
+
+    @property
+    def thickness(self) -> float:
+        """m, of a 2D body out of its plane: what forces and energies per metre are multiplied with."""
+        return self.material.thickness or 1.0
+
     @property
     def at_rest(self) -> bool:
         """Whether nothing moves at the start."""

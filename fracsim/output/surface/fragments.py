@@ -21,7 +21,7 @@ class Fragments:
     Attributes:
         name: (p,) number that stays with the piece over time.
         nodes: (p,) how many.
-        mass: (p,) kg (2D: per metre of thickness), the sum of the lumped nodal masses.
+        mass: (p,) kg (2D: of the thickness that the density is given for), the sum of the lumped nodal masses.
         volume: (p,) m^3 (2D: m^2) that the split surface encloses in the reference configuration.
         centre, velocity: (p, d) of mass, m and m/s.
         spin: (p, 3) rad/s; 2D: (p, 1). The least-squares solution of (tensor of inertia) spin = angular momentum, so 0

@@ -1,0 +1,93 @@
+"""How long cracks are and where their tip is: columns of history.csv where cracks say where they cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..fracture.cracks import ends_in_order
+from ..fracture.record import EdgeRecord
+from ..mesh.ranks import total
+from ..meshes.words import AXES
+
+Values = npt.NDArray[np.float64]
+PAIRINGS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])  # of four corners in two diagonals
+
+
+class CrackFront:
+    """Length of the cracks in m (3D: area in m^2) and the place of their tip at rest, m.
+
+    Attributes:
+        names: columns of history.csv.
+    """
+
+    def __init__(self, record: EdgeRecord) -> None:
+        graph = record.graph
+        self._record, self._graph, self._domain = record, graph, graph.domain
+        d = self._domain.dim
+        self.names = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
+        self._ends = ends_in_order(graph)
+        self._figures = np.full(1 + d, np.nan)
+        self.look()
+
+    def __call__(self) -> Values:
+        """(1 + d,) as of the last look; nan where there has been no tip yet."""
+        return self._figures
+
+    def look(self) -> None:
+        """Edges have broken (collective)."""
+        self._figures[0] = total(self._domain.comm, self._cut())[0]
+        tips = np.concatenate(self._domain.comm.allgather(self._tips()))
+        if len(tips):  # a crack that has run through has none: its last one stays
+            first = np.lexsort([tips[:, 2], tips[:, 1], -tips[:, 0]])[0]
+            self._figures[1:] = tips[first, 3:]
+
+    def _points(self, cells: npt.NDArray[np.integer]) -> Values:
+        """(n, k, d) places of the cuts of all edges of cells, m; nan of whole ones."""
+        edges = self._graph.cell_edges[cells]
+        share = np.where(np.isnan(self._record.cut[edges]), 0.5, self._record.cut[edges])[..., None]
+        ends = self._domain.nodes[self._ends[edges]]
+        at = ends[:, :, 0] + share * (ends[:, :, 1] - ends[:, :, 0])
+        return np.where(self._graph.broken[edges][..., None], at, np.nan)
+
+    def _cut(self) -> float:
+        """Length or area of the cuts through this rank's split cells."""
+        if self._domain.dim == 2:
+            # to the middle of the cuts: two of them are a segment, three a branch
+            points = self._points(np.flatnonzero(self._graph.split))
+            if not len(points):
+                return 0.0
+            middle = np.nanmean(points, axis=1, keepdims=True)
+            return float(np.nansum(np.linalg.norm(points - middle, axis=2)))
+        many = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern]
+        split = self._graph.split
+        corners = [self._corners(np.flatnonzero(split & (many == count)), count) for count in (3, 4)]
+        return float(_triangles(corners[0]).sum() + _quadrangles(corners[1]).sum())
+
+    def _corners(self, cells: npt.NDArray[np.integer], count: int) -> Values:
+        """(n, count, d) places of the cuts of cells with so many."""
+        points = self._points(cells)
+        return points[~np.isnan(points[..., 0])].reshape(len(cells), count, -1)
+
+    def _tips(self) -> Values:
+        """(n, 3 + d) of this rank's cells that cracks have come into and not left: when, which edge (two input nodes),
+        and where, m."""
+        graph, domain = self._graph, self._domain
+        cells = np.flatnonzero((graph.pattern > 0) & ~graph.split)
+        entry = np.argmin(graph.intact(cells), axis=1)
+        edges = graph.cell_edges[cells, entry]
+        keys = domain.node_input[self._ends[edges]]
+        return np.column_stack([self._record.at[edges], keys, self._points(cells)[np.arange(len(cells)), entry]])
+
+
+def _triangles(corners: Values) -> Values:
+    """(n,) areas of (n, 3, 3)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2)
+
+
+def _quadrangles(corners: Values) -> Values:
+    """(n,) areas of flat convex ones (n, 4, 3) whose corners are in any order: the diagonals are the pairs that span
+    most."""
+    a, b, c, e = np.moveaxis(corners[:, PAIRINGS], 2, 0)
+    return np.asarray(np.linalg.norm(np.cross(b - a, e - c), axis=2).max(axis=1, initial=0.0) / 2)
