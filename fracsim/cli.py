@@ -164,12 +164,19 @@ def sweep(
 
 
 @app.command(name="list")
-def list_() -> None:
-    """Show the studies, builders, energies and schemes that exist."""
+def list_(
+    what: Annotated[str | None, typer.Argument(help="materials: those that [material] like may name")] = None,
+) -> None:
+    """Show the studies, builders, energies and schemes that exist, or a table of materials."""
     if not _is_root():
         return
-    from .study.catalogue import catalogue
+    from .study.catalogue import catalogue, table_of_materials
 
+    if what is not None:
+        if what != "materials":
+            raise InputError(f'list {what}: there is "fracsim list" and "fracsim list materials"')
+        print("\n".join(table_of_materials()))
+        return
     for heading, entries in catalogue().items():
         print(heading)
         for name, words in entries.items():

@@ -12,9 +12,11 @@ values          what a key may hold
 file            a study read by path or name, overridden, and written with every default
 explain         what is wrong, in one sentence
 check           `fracsim check`
+lengths         whether strength, energy, mesh and body fit together
 resultants      areas and resultants of loads
 mesh_source     from [mesh] to arrays
 catalogue       `fracsim list`
+materials       materials by name, and where their values come from
 """
 
 from .body import Damping, Elastic, Material, Mesh, Region

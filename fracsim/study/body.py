@@ -44,6 +44,7 @@ class Elastic(Table):
 class Region(Table):
     """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
 
+    like: str | None = None  # name of a material that says what else differs: see materials
     young: Positive | None = None
     poisson: Poisson | None = None
     density: Positive | None = None
@@ -55,6 +56,7 @@ class Region(Table):
 class Material(Elastic):
     """[material]; tables inside it are regions."""
 
+    like: str | None = None  # name of a material whose values those left out are: see materials
     energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
     plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
     thickness: Positive | None = None  # m, of a 2D mesh out of its plane; None: forces and energies are those of 1 m

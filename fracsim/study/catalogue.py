@@ -8,6 +8,7 @@ from ..forms.schemes import SCHEMES
 from ..meshes import BUILDERS
 from ..studies import folder
 from . import Time
+from .materials import MATERIALS
 
 ENERGIES = {
     "linear": "Hooke's law; small strains and rotations; plane stress in 2D",
@@ -23,6 +24,20 @@ OBSTACLES = {
     "box": "size; rounded edges; hollow",
     "mesh": "file, scale: a closed surface of triangles; 3D; held or driven",
 }
+
+
+def table_of_materials() -> list[str]:
+    """Lines for `fracsim list materials`."""
+    head = f"{'':27}{'E, Pa':>9} {'nu':>5} {'rho':>6} {'f_t, Pa':>9} {'G_c, J/m^2':>10} {'l_ch, m':>8}  source"
+    lines = ["materials: [material] like = NAME; l_ch = E' G_c / f_t^2", head]
+    for name, each in MATERIALS.items():
+        energy, length = ("-" if value is None else f"{value:.3g}" for value in (each.energy, each.length))
+        flow = f"; yields at {each.yield_stress:.3g} Pa" if each.yield_stress is not None else ""
+        figures = (
+            f"{each.young:9.3g} {each.poisson:5.3g} {each.density:6.4g} {each.strength:9.3g} {energy:>10} {length:>8}"
+        )
+        lines.append(f"  {name:25}{figures}  {each.source}{flow}")
+    return lines
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -24,6 +24,7 @@ from ..meshes.topology import boundary_facets, signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
+from .lengths import fits
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 from .resultants import resultants
 from .tearing import tearing
@@ -198,13 +199,16 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield f"            note: {note}"
     plane = f", plane {study.material.plane}{_thick(study)}" if anatomy.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
-    yield f"material    {study.material.energy}{plane}{regions}"
+    like = f"; like {study.material.like}" if study.material.like else ""
+    yield f"material    {study.material.energy}{plane}{regions}{like}"
     if study.fracture is not None and study.fracture.energy is not None:
         first, *others = tearing(study, anatomy.h, float(np.max(np.subtract(anatomy.upper, anatomy.lower))))
         yield f"fracture    {first}"
         yield from (f"            {line}" for line in others)
     else:
         yield f"fracture    {_fracture(study)}"
+    for line in fits(study, float(np.min(np.subtract(anatomy.upper, anatomy.lower)))):
+        yield f"            {line}"
     yield f"plasticity  {_plasticity(study)}"
     if study.brittle is not None:
         yield f"brittle     {_brittle(study.brittle)}"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from .body import Damping, Material, Mesh
 from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
+from .materials import filled
 from .moving import Body, check_rigid
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
@@ -42,6 +45,11 @@ class Study(Table):
     contact: Contact | None = None
     probe: list[Probe] = Field(default_factory=list)
     output: Output = Output()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _materials_by_name(cls, data: Any) -> Any:
+        return filled(data) if isinstance(data, dict) else data
 
     @field_validator("probe", "obstacle")
     @classmethod

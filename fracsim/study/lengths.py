@@ -1,0 +1,58 @@
+"""Whether strength, fracture energy, mesh and body fit together: what `fracsim check` says of their lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from . import Study
+from .materials import MATERIALS
+
+PROCESS = 5.0  # of the body's least side over l_ch, below which loads come out too high
+DISC = 6.0  # h that a tip needs around it
+FAR = 3.0  # times that an energy may be off without a word
+
+
+def fits(study: Study, least: float) -> Iterator[str]:
+    """Notes on what does not fit together; `least`: the body's least side, m."""
+    table, material = study.fracture, study.material
+    if table is None or study.brittle is not None:
+        return
+    stiff = material.young / (1 - material.poisson**2 if material.plane == "strain" else 1.0)
+    h = study.mesh.parameters.get("h")
+    h = float(h) if isinstance(h, int | float) and not isinstance(h, bool) else None
+    if table.strength > 0.1 * material.young and table.strength < float("inf"):
+        yield f"note: strength is {table.strength / material.young:.2g} of young: only rubber is that strong"
+    if table.energy is None:
+        yield from _spent(study, stiff, table.radius or h)
+        return
+    length = stiff * table.energy / table.strength**2
+    if h is not None and length < h:
+        yield (
+            f"note: l_ch = {length:.3g} m is below h = {h:g} m: in whole material cracks begin late; h below that, or "
+            f"strength below (E' G_c / h)^1/2 = {(stiff * table.energy / h) ** 0.5:.3g} Pa"
+        )
+    if length > least / PROCESS:
+        yield (
+            f"note: l_ch = {length:.3g} m is more than a fifth of the body's least side, {least:.3g} m: its process "
+            "zone is as large as the body, and loads come out too high (strength decides there, not G_c)"
+        )
+    if h is not None and least < 2 * DISC * h:
+        most = least / 2 / DISC
+        yield f"note: tips need {DISC:g} h on every side, the body is {least / h:.3g} h across: h below {most:.2g} m"
+
+
+def _spent(study: Study, stiff: float, cell: float | None) -> Iterator[str]:
+    """What single edges take: the energy of a row of cells at their strength, f_t^2 h / 2 E', whatever G_c is."""
+    table, like = study.fracture, study.material.like
+    assert table is not None
+    if cell is None or not table.strength < float("inf"):
+        return
+    spent = table.strength**2 * cell / (2 * stiff)
+    of = MATERIALS[like].energy if like is not None else None
+    word = "radius" if table.radius else "h"
+    yield f"edges break one by one: a crack takes some f_t^2 {word} / 2 E' = {spent:.2g} J/m^2, as much as h has it"
+    if of is not None and not of / FAR < spent < of * FAR:
+        yield (
+            f"note: {like} takes {of:g} J/m^2: give fracture.energy = true (2D), or {word} = "
+            f"{2 * stiff * of / table.strength**2:.2g} m"
+        )
