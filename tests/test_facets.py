@@ -11,11 +11,15 @@ import pytest
 from fracsim.mechanics.contact.barrier import Barrier
 from fracsim.mechanics.contact.deepest import deepest, most_above
 from fracsim.mechanics.contact.facets import Between, Facets, between
+from fracsim.mechanics.contact.joined import joined
 from fracsim.mechanics.contact.obstacles import Obstacles
 from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
+from fracsim.mechanics.contact.pose import Pose, turning
+from fracsim.mechanics.contact.push import by_point_and_pose, on_obstacle, push
+from fracsim.mechanics.contact.reach import safe_shares
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
 from fracsim.mechanics.contact.shares import least_over_shares
+from fracsim.mechanics.contact.touch import Touch, nothing
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -109,7 +113,7 @@ def test_forces_and_stiffness_are_derivatives(name: str) -> None:
     scale = np.linalg.norm(found.forces.reshape(n, -1), axis=1)
     error = np.linalg.norm(found.forces.reshape(n, -1) + by_energy, axis=1)
     assert (error < 1e-5 * scale + 1e-7).all() and (scale > 0.1).sum() > n / 8
-    exact = found.exact()
+    exact = found.exact
     np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), atol=1e-9 * abs(exact).max())
     error = np.linalg.norm(exact - by_force, axis=(1, 2)) / (np.linalg.norm(exact, axis=(1, 2)) + 1.0)
     assert np.quantile(error, 0.9) < 1e-4  # the rest are at a kink of the curvature: where a rounded edge begins
@@ -125,7 +129,7 @@ def test_flat_against_flat_is_counted_once() -> None:
     found, own = acting(placed, x), np.abs(LAW.curvature(x[:, :, 2])).max()
     np.testing.assert_allclose(found.energy, 0.0, atol=1e-9 * LAW.energy(x[:, :, 2]).max())
     np.testing.assert_allclose(found.forces, 0.0, atol=1e-9 * own * WIDTH)
-    np.testing.assert_allclose(found.exact(), 0.0, atol=1e-8 * own)
+    np.testing.assert_allclose(found.exact, 0.0, atol=1e-8 * own)
 
 
 def test_a_facet_over_a_ball_is_held_before_it_is_cut() -> None:
@@ -159,11 +163,63 @@ def test_no_facet_near_an_obstacle_is_passed_over(name: str) -> None:
         assert placed.beyond(x) <= gaps[0].min() + facets.kept + 1e-12
         far = np.setdiff1d(np.arange(120), facets.near(placed, x, reach))
         assert (gaps[0][far] >= reach).all()
-        free = np.setdiff1d(np.arange(120), facets.closing(placed, x, relative, 1.2 * np.linalg.norm(relative, axis=1)))
+        closing = facets.closing(placed, x, relative, None, 1.2 * np.linalg.norm(relative, axis=1))
+        free = np.setdiff1d(np.arange(120), closing)
         assert (np.min(gaps, axis=0)[free] >= 0.1 * gaps[0][free] - 1e-12).all()
         skipped += [len(far), len(free)]
         x = x + 0.3 * relative
     assert np.mean(skipped) > 30
+
+
+@pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])
+def test_facets_before_what_turns_keep_a_tenth_of_their_gaps(name: str) -> None:
+    """Small steps along the share of the ways that is safe, of points and a turning obstacle: by the deepest places at
+    each. Facets allow less than their corners alone."""
+    rng, shape = np.random.default_rng(7), SHAPES[name]
+    placed, x = facets_near(name, 40)
+    d, apart, itself = shape.dim, [], Placed(shape, Pose.at(np.zeros(shape.dim)))
+    corners = np.arange(x.shape[0] * d).reshape(-1, d)
+    facets = Facets(corners, np.ones(len(corners)), SOFTEN)
+    for far in (0.0, 0.1, 0.3):
+        flat = (x + far * deepest(placed, x, SOFTEN).normal[:, None]).reshape(-1, d)
+        moved, q = 0.05 * rng.normal(size=flat.shape), np.r_[0.2 * rng.normal(size=d), rng.normal(size=2 * d - 3)]
+        every = safe_shares(placed, flat, moved, q, facets)
+        apart.append(float((safe_shares(placed, flat, moved, q) > every).mean()))
+        gap = facets.look(placed, flat, np.arange(len(corners))).gap
+        least = every[corners].min(axis=1)
+        for part in np.linspace(0.0, 1.0, 5):
+            ways = [(placed.pose.moved(part * s * q), flat[c] + part * s * moved[c])
+                    for c, s in zip(corners, least, strict=True)]  # fmt: skip
+            seen = np.array([pose.to_body(places) for pose, places in ways])
+            assert (deepest(itself, seen, SOFTEN).gap > 0.1 * gap - 1e-9).all()
+    assert max(apart) > 0.1
+
+
+@pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])
+def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
+    """Gradient and Hessian of their energy by an increment of the pose, against differences; the same forces and
+    stiffness on points and obstacle, from both sides."""
+    placed, corners = facets_near(name, 6)
+    d, x = placed.shape.dim, corners.reshape(-1, placed.shape.dim)
+    facets = Facets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
+
+    def felt(q: Values) -> Touch:
+        there = Placed(placed.shape, placed.pose.moved(q))
+        return joined(nothing(d), *between(facets, there, x, LAW))
+
+    p, h = 3 * d - 3, 1e-5
+    steps, found = h * np.eye(p), felt(np.zeros(p))
+    on = push(found, x, placed.pose, None, placed.pose)
+    by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
+    np.testing.assert_allclose(on.gradient, by_energy, atol=1e-6 * abs(on.gradient).max())
+    np.testing.assert_allclose(on_obstacle(found, x, placed.pose), -on.gradient, atol=1e-12 * abs(on.gradient).max())
+    for way in np.random.default_rng(2).normal(size=(4, p)):
+        twice = (felt(h * way).potential + felt(-h * way).potential - 2 * found.potential) / h**2
+        assert twice == pytest.approx(way @ on.hessian @ way, abs=1e-3 * abs(on.hessian).max())
+    arm = x[found.points] - placed.pose.centre
+    J = np.concatenate([np.broadcast_to(-np.eye(d), (len(arm), d, d)), turning(arm)], axis=2)
+    both = np.einsum("nip,niq->pq", J, by_point_and_pose(found, x, placed.pose))
+    np.testing.assert_allclose(both, on.stiffness, atol=1e-9 * abs(on.stiffness).max())
 
 
 # --- in a run ---

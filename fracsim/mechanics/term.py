@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..mesh.split.places import Places
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 type Form = ufl.Form | int  # 0: none
 
 
@@ -190,9 +191,10 @@ class Term:
         rank's share, J; asked once a step (collective)."""
         return 0.0, 0.0
 
-    def apart(self, at: Places, u: Values, t: float) -> Places:
+    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
-        it keeps apart is apart; `at`: where it is without. Asked of rank 0, for what is drawn (not collective)."""
+        it keeps apart is apart; `at`: where it is without, `elements` (m, d) the points of its segments or triangles.
+        Asked of rank 0, for what is drawn (not collective)."""
         return at
 
     def drawn(self, t: float) -> dict[str, Drawn]:

@@ -5,6 +5,7 @@ touching, touch   what touches in a step; barrier and friction at the points of 
 skin, course      the points that touch; obstacles on their ways
 facets, deepest   facets between their points before round and small obstacles: what acts at their deepest place
 shares, flat      a step of Newton's method to that; where it would be before what is flat
+candidates        facets that may be near an obstacle
 joined            that, with what acts at the points
 obstacle          one that is held or driven
 free_obstacles    the term with obstacles that move by themselves; free_obstacle, shifted: one of them, on a hinge

@@ -11,15 +11,16 @@ facet that lies flat, but not for one that is about to tilt: it made tangents of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .along import Along
 from .barrier import KEPT
+from .candidates import Candidates
 from .deepest import Deepest, before_the_core, deepest, most_above
 from .flat import IfFlat
 from .law import Repulsion
@@ -28,6 +29,7 @@ from .touch import positive
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 HUGE = 1e200  # Pa, of a facet that is cut: no infinity, of which there is no product with 0
 SOFTEN = 0.1  # of the width of the barrier, of deepest places
@@ -57,9 +59,8 @@ class Facets:
         return np.full(self.corners.shape, np.nan)
 
     @cached_property
-    def _sides(self) -> list[Any]:
-        """Points (n, d) with which sides were measured, m, and the longest, m; nothing: they never were."""
-        return []
+    def _candidates(self) -> Candidates:
+        return Candidates(self.corners)
 
     @property
     def kept(self) -> float:
@@ -80,11 +81,13 @@ class Facets:
         near, _, over, _ = self._tangents(placed, x, np.full(1, reach))
         return near[over.min(axis=1, initial=np.inf) < reach]
 
-    def closing(self, placed: Placed, x: Values, relative: Values, reach: Values) -> Ints:
+    def closing(self, placed: Placed, x: Values, relative: Values, swept: Values | None, reach: Values) -> Ints:
         """(k,) those whose gaps a motion may close by more than is safe (barrier), on the ways `relative` (n, d) of the
-        points to an obstacle, m, no longer than `reach` (n,)."""
+        points to an obstacle, m, that its turn adds `swept` (n,) to at most; all no longer than `reach` (n,)."""
         near, distance, over, normal = self._tangents(placed, x, reach)
         after = over + np.einsum("kcd,kd->kc", relative[self.corners[near]], normal)
+        if swept is not None:
+            after = after - swept[self.corners[near]]
         return near[np.minimum(over, after).min(axis=1, initial=np.inf) < KEPT * distance]
 
     def _tangents(self, placed: Placed, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
@@ -94,10 +97,8 @@ class Facets:
         (_, c), d = self.corners.shape, x.shape[1]
         if placed.beyond(x) >= reach.max(initial=0.0) + self.kept:
             return np.empty(0, np.int64), np.empty(0), np.empty((0, c)), np.empty((0, d))
-        wide = np.broadcast_to(reach, len(x))
-        within = np.max([wide[column] for column in self.corners.T], axis=0) + self.kept
-        near = np.flatnonzero(placed.distance(x)[self.corners[:, 0]] < within + self._longest(x))
-        within = within[near]
+        near = self._candidates(placed, x, float(reach.max(initial=0.0)) + self.kept)
+        within = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.kept
         corners = x[self.corners[near]]
         middle = corners.mean(axis=1)
         around, distance = np.linalg.norm(corners - middle[:, None], axis=2), placed.distance(middle)
@@ -105,22 +106,17 @@ class Facets:
         distance, normal, arms = distance[left], placed.normal(middle[left]), (corners - middle[:, None])[left]
         return near[left], distance, distance[:, None] - self.kept + np.einsum("kcd,kd->kc", arms, normal), normal
 
-    def _longest(self, x: Values) -> float:
-        """m, no side of a facet is longer with points at x (n, d): measured anew once points have gone far."""
-        if self._sides:
-            before, longest = self._sides
-            gone = 2 * float(np.sqrt(np.einsum("nd,nd->n", x - before, x - before).max(initial=0.0)))
-            if gone < longest:
-                return longest + gone
-        c = self.corners.shape[1]
-        sides = [x[self.corners[:, k]] - x[self.corners[:, (k + 1) % c]] for k in range(c)]
-        longest = float(np.sqrt(max(np.einsum("md,md->m", side, side).max(initial=0.0) for side in sides)))
-        self._sides[:] = x, longest
-        return longest
-
     def distances(self, placed: Placed, x: Values, reach: float) -> Values:
         """(k,) of the deepest places of those that are near, m."""
         return placed.distance(self.look(placed, x, self.near(placed, x, reach)).place)
+
+    def are_open(self, every: Sequence[Placed], x: Values) -> Flags:
+        """(m,) those that none of several obstacles cuts."""
+        found = np.ones(len(self.area), bool)
+        for placed in every:
+            near = self.near(placed, x, 0.0)
+            found[near] &= self.look(placed, x, near).gap > 0
+        return found
 
     def gaps(self, placed: Placed, x: Values, reach: float) -> Values:
         """(m,) to an obstacle, m; infinite of those that are not near."""
@@ -175,6 +171,7 @@ class Between:
         slope = np.maximum(self.if_flat.slope(self._flat.gap), -HUGE)[:, None]
         return np.asarray(-self.area[:, None, None] * (own - (slope * self._flat.share)[:, :, None] * self._normals))
 
+    @cached_property
     def exact(self) -> Values:
         """(k, c d, c d) second derivative of F, N/m."""
         k, c, d = self.at.x.shape
@@ -202,13 +199,14 @@ class Between:
         bent = self.of_corners.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
         return np.asarray(bent + self.of_corners.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
 
+    @cached_property
     def stiffness(self) -> Values:
         """(k, c d, c d) for a tangent: positive semi-definite together with the share of the facet in the stiffness of
         its corners, which have that already (touch)."""
         k, c, d = self.at.x.shape
         own = (self.area / c)[:, None, None, None] * self._of_corners()
         kept = positive(own.reshape(-1, d, d)).reshape(k, c, d, d)
-        return np.asarray(positive(self.exact() + _diagonal(own)) - _diagonal(kept))
+        return np.asarray(positive(self.exact + _diagonal(own)) - _diagonal(kept))
 
 
 def between(

@@ -97,7 +97,10 @@ class FreeObstacles(Flights):
         return bool(self._level.dt) and all(each.is_under_way for each in self.free.values())
 
     def _around(self, number: int) -> Around:
-        return Around(self.skin, self.x, partial(self._feel, number), self._course.placed)
+        return self._around_at(number, self.x)
+
+    def _around_at(self, number: int, x: Values) -> Around:
+        return Around(self.skin, x, partial(self._feel, number), self._facets(number), self._course.placed)
 
     def _place(self) -> None:
         """All see free obstacles where they are."""
@@ -186,22 +189,22 @@ class FreeObstacles(Flights):
         moved = self.skin.places(level.at_end(u)) - x
         share, taken = 1.0, {}
         for number, each in self.free.items():
-            taken[number], free = self._first_guess(each, x, moved)
+            taken[number], free = self._first_guess(each, self._around_at(number, x), moved)
             share = min(share, free)
         for number, z in taken.items():
             self.free[number].put(share * z)
         self._place()
         return u if share == 1 else np.asarray(level.u + share * (u - level.u))
 
-    def _first_guess(self, each: FreePose, x: Values, moved: Values) -> tuple[Values, float]:
+    def _first_guess(self, each: FreePose, around: Around, moved: Values) -> tuple[Values, float]:
         """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
-        that way that closes no gap, with points that go from x (n, d) by `moved` (collective)."""
+        that way that closes no gap, with points that go by `moved` (n, d) (collective)."""
         others = self._course.whole()
         along = [each.led_by(way) for _, way in others.values() if way.any()]
         ways = [each.step.ahead, 0 * each.step.ahead, *along]
         first = 0.0
         for z in ways:
-            share = each.safe_share(self.skin, x, moved, z, others)
+            share = each.safe_share(around, moved, z, others)
             if share == 1:
                 return z, 1.0
             first = min(first, share) if first else share

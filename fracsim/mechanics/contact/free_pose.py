@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from ...mesh.ranks import total
 from .course import Going
+from .facets import Facets
 from .free_obstacle import Flight, FreeObstacle
 from .placed import Placed
 from .push import Push, by_point_and_pose, on_obstacle, push, resultant
@@ -33,13 +34,22 @@ class Around:
 
     Attributes:
         skin: its points.    x: (n, d) where they are, m.    feel: what the obstacle does to them at a place.
-        placed: where all obstacles are, by their numbers.
+        facets: that feel it between their points.    placed: where all obstacles are, by their numbers.
     """
 
     skin: Skin
     x: Values
     feel: Callable[[Placed], Touch]
+    facets: Facets | None
     placed: list[Placed]
+
+    def is_open(self, placed: Placed) -> bool:
+        """Whether nothing of the body is in the obstacle there (collective)."""
+        if not self.skin.are_apart(placed.distance(self.x)):
+            return False
+        return self.facets is None or bool(
+            self.skin.comm.allreduce(self.facets.are_open([placed], self.x).all(), op=MPI.LAND)
+        )
 
 
 @dataclass(frozen=True)
@@ -119,8 +129,7 @@ class FreePose:
         self._settled = None
         for z in self._candidates(around):
             self.put(z)
-            open_to_body = around.skin.are_apart(self.placed.distance(around.x))
-            if open_to_body and self.stops.are_open(self.placed.pose, around.placed):
+            if around.is_open(self.placed) and self.stops.are_open(self.placed.pose, around.placed):
                 break
         else:
             return  # the body or a stop is in the obstacle: Newton's method finds no finite force, and fails
@@ -153,7 +162,7 @@ class FreePose:
         q, still = self.step.onward(z, dz), 0 * around.x
         others = {number: (placed, np.zeros_like(q)) for number, placed in enumerate(around.placed)}
         share = self.stops.safe_share(self.placed.pose, q, others)
-        return min(share, around.skin.safe(safe_shares(self.placed, around.x, still, q)))
+        return min(share, around.skin.safe(safe_shares(self.placed, around.x, still, q, around.facets)))
 
     # --- how it gives way ---
 
@@ -178,12 +187,12 @@ class FreePose:
         """Newton's method starts anew."""
         self._way = None
 
-    def safe_share(self, skin: Skin, x: Values, moved: Values, z: Values, others: dict[int, Going]) -> float:
+    def safe_share(self, around: Around, moved: Values, z: Values, others: dict[int, Going]) -> float:
         """Share of the ways of points, obstacle and others, from the start of the step, that closes no gap
         (collective)."""
         start, q = Placed(self.body.shape, self.step.start.pose), self.step.increment(z)
         share = self.stops.safe_share(start.pose, q, others)
-        return min(share, skin.safe(safe_shares(start, x, moved, q)))
+        return min(share, around.skin.safe(safe_shares(start, around.x, moved, q, around.facets)))
 
     def led_by(self, way: Values) -> Values:
         """(k,) z that takes it along with an obstacle on its way (p,), as far as it may go there."""

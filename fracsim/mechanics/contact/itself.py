@@ -24,6 +24,7 @@ from .crowd import Law, Surface
 from .slip import Friction
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 STIFF = 100.0  # of what a wall of an edge's size has: from there on directions are worth to be told apart (Stiff)
 
@@ -69,7 +70,7 @@ class SelfContact(Term):
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
         return self._domain.gather_nodes(np.asarray(u).reshape(-1, self._domain.dim))
 
-    def apart(self, at: Places, u: Values, t: float) -> Places:
+    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
         assert self._surface is not None
         if self.law.pieces:  # other points: walls inside pieces and crumbs are drawn where they are

@@ -31,4 +31,4 @@ def joined(found: Touch, inner: Between, stored: float) -> Touch:
         return exact, stick
 
     potential = found.potential + float(inner.energy.sum())
-    return Touch(points, found.energy + stored, normal, rubbed, potential, parts, (inner.corners, inner.stiffness))
+    return Touch(points, found.energy + stored, normal, rubbed, potential, parts, inner)

@@ -76,26 +76,41 @@ class Motion:
 
 class Passing:
     """Facets whose deepest places are `at`, and whose corners go straight by `relative` (k, c, d), m, past a convex
-    obstacle.
+    obstacle that turns by `turn` (r,), rad, meanwhile.
 
-    On the way these are found roughly: L (deepest) lies above its tangent at any place, which is what counts.
+    On the way these are found roughly: L (deepest) lies above its tangent at any place, which is what counts. The
+    obstacle stays where it was, and corners go as they are seen from it.
     """
 
-    def __init__(self, at: Deepest, relative: Values) -> None:
-        self._start, self._relative = at.x, relative
+    def __init__(self, at: Deepest, relative: Values, turn: Values) -> None:
+        self._start, self._relative, self._turn = at.x, relative, turn
         self._share: Values = np.zeros(len(at.x))
         self._at = at
+        self._centre, self._turns = at.placed.pose.centre, float(np.linalg.norm(turn))
+
+    @property
+    def count(self) -> int:
+        """k."""
+        return len(self._start)
 
     def of(self, which: Ints) -> Passing:
         """Some of them, at the start."""
         at = self._at
-        return Passing(Deepest(at.placed, at.x[which], at.soften, at.share[which]), self._relative[which])
+        some = Deepest(at.placed, at.x[which], at.soften, at.share[which])
+        return Passing(some, self._relative[which], self._turn)
 
     def _there(self, share: Values) -> Deepest:
         if not np.array_equal(share, self._share):
             x, at = self._start + share[:, None, None] * self._relative, self._at
+            if self._turns:
+                x = self._centre + self._seen(x - self._centre, share)
             self._share, self._at = share.copy(), deepest(at.placed, x, at.soften, at.share, ROUGH)
         return self._at
+
+    def _seen(self, vectors: Values, share: Values) -> Values:
+        """(k, c, d) vectors in the axes of the obstacle at each share, turned back to those that it had."""
+        (k, c, d), w = vectors.shape, -share[:, None] * self._turn
+        return turned(vectors.reshape(-1, d), np.repeat(w, c, axis=0)).reshape(k, c, d)
 
     def gap(self, share: Values) -> Values:
         """(k,) no less is left after shares (k,) of the motion, m."""
@@ -106,9 +121,17 @@ class Passing:
         """(k,) no gap closes faster than this from `share` to the end, m per whole motion.
 
         Each corner is over the tangent by its slack, or more: one that comes closer by v may go on by the share
-        (gap + slack) / v.
+        (gap + slack) / v. A turn by w adds |w| times the reach.
         """
         at, gap = self._there(share), np.maximum(self.gap(share), np.finfo(float).tiny)[:, None]
-        closing = np.maximum(-np.einsum("kcd,kd->kc", self._relative, at.normal), 0.0)
+        v = self._seen(self._relative, share) if self._turns else self._relative
+        closing = np.maximum(-np.einsum("kcd,kd->kc", v, at.normal), 0.0)
+        if self._turns:
+            closing += self._turns * self._reach()
         over = np.maximum(at.gap[:, None] + at.slack, gap)
         return np.asarray((closing * gap / over).max(axis=1))
+
+    def _reach(self) -> Values:
+        """(k, c) the largest distance of corners from the centre on the way, which is at one of its ends."""
+        ends = self._start - self._centre, self._start - self._centre + self._relative
+        return np.maximum(*(np.linalg.norm(each, axis=2) for each in ends))

@@ -28,11 +28,13 @@ from .law import Law
 from .obstacle import Obstacle
 from .placed import Placed, least_distance
 from .reach import safe_shares, within_reach
+from .room import uncut
 from .skin import clear_of
 from .touch import Touch
 from .touching import Touching
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 
 class Obstacles(Touching, Term):
@@ -72,8 +74,8 @@ class Obstacles(Touching, Term):
             return None
         points = np.concatenate([each.points for each in touches])
         part = self.skin.stiffness(points, np.concatenate([each.stiffness for each in touches]))
-        for corners, blocks in (each.between for each in touches if each.between is not None):
-            part = part + self.skin.stiffness_between(corners, blocks())
+        for between in (each.between for each in touches if each.between is not None):
+            part = part + self.skin.stiffness_between(between.corners, between.stiffness)
         return self._coupling((self._level.blow.factor * part).tocsr(), self.skin.columns)
 
     def stored(self) -> float:
@@ -157,9 +159,14 @@ class Obstacles(Touching, Term):
         """Each obstacle at the time t of the state, s (not collective)."""
         return [each.placed(t) for each in self.obstacles]
 
-    def apart(self, at: Places, u: Values, t: float) -> Places:
-        """Drawn in where it would lie in an obstacle, as the points are that touch."""
-        return clear_of(at, u, partial(least_distance, self.where(t)))
+    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+        """Drawn in where it would lie in an obstacle, or be cut by one that facets feel, as what touches is."""
+        placed = self.where(t)
+        at = clear_of(at, u, partial(least_distance, placed))
+        if not self._sharp:
+            return at
+        facets = self.skin.facets_of(elements)
+        return uncut(at, u, elements, lambda x: ~facets.are_open([placed[number] for number in self._sharp], x))
 
     def drawn(self, t: float) -> dict[str, Drawn]:
         """Each obstacle at time t, s, by its name."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from .placed import second_order_turn
 from .pose import Pose, Values, turning
-from .touch import Grip, Touch
+from .touch import Grip, Jointly, Touch
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) ->
     arm = x[found.points] - pose.centre
     J, gradient = _by_pose(arm), -found.normal
     stiffness, hessian = (_summed(J, blocks) for blocks in (found.stiffness, found.exact))
+    if (inner := found.between) is not None:
+        facing = _of_facets(inner, x, pose)
+        stiffness, hessian = stiffness + _summed(facing, inner.stiffness), hessian + _summed(facing, inner.exact)
     hessian = hessian + _turning_with(gradient, arm)
     total = np.einsum("ndp,nd->p", J, gradient)
     if held is not None and len(held.points):
@@ -83,7 +86,12 @@ def resultant(force: Values, arm: Values) -> Values:
 
 def by_point_and_pose(found: Touch, x: Values, pose: Pose) -> Values:
     """(k, d, p) derivative of minus the forces on the points by an increment of the pose, as `stiffness` has it."""
-    return np.asarray(found.stiffness @ _by_pose(x[found.points] - pose.centre))
+    result = np.asarray(found.stiffness @ _by_pose(x[found.points] - pose.centre))
+    if (inner := found.between) is not None:
+        blocks = inner.stiffness @ _of_facets(inner, x, pose)
+        at = np.searchsorted(found.points, inner.corners)
+        np.add.at(result, at, blocks.reshape(*at.shape, x.shape[1], -1))
+    return result
 
 
 def _by_pose(arm: Values) -> Values:
@@ -92,9 +100,17 @@ def _by_pose(arm: Values) -> Values:
     return np.concatenate([still, turning(arm)], axis=2)
 
 
+def _of_facets(inner: Jointly, x: Values, pose: Pose) -> Values:
+    """(k, c d, p) J of the corners of facets."""
+    k, c = inner.corners.shape
+    d = x.shape[1]
+    return _by_pose(x[inner.corners.reshape(-1)] - pose.centre).reshape(k, c * d, -1)
+
+
 def _summed(J: Values, blocks: Values) -> Values:
     """(p, p) sum of J^T B J."""
-    return np.asarray(np.einsum("nip,nij,njq->pq", J, blocks, J))
+    n, i, p = J.shape
+    return np.asarray(J.reshape(n * i, p).T @ (blocks @ J).reshape(n * i, p))
 
 
 def _turning_with(gradient: Values, arm: Values) -> Values:

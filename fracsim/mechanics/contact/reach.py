@@ -26,9 +26,12 @@ ROUNDS = 20  # in which points that follow several nodes are brought back
 def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Facets | None = None) -> Values:
     """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
     moves by q meanwhile, and of those of their `facets`; 0 where the gap is closed already."""
-    turn = np.linalg.norm(q[placed.pose.dim :])
+    turn = q[placed.pose.dim :]
     relative = moved - q[: placed.pose.dim]
-    reach = np.linalg.norm(relative, axis=1) + turn * (np.linalg.norm(x - placed.pose.centre, axis=1) + 1.0)
+    reach, swept = np.linalg.norm(relative, axis=1), None
+    if turn.any():
+        swept = np.linalg.norm(turn) * (np.linalg.norm(x - placed.pose.centre, axis=1) + reach)
+        reach = reach + swept
     if placed.beyond(x) > 1.2 * reach.max(initial=0.0):
         return np.ones(len(x))
     gap = placed.distance(x)
@@ -38,22 +41,20 @@ def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Fac
         motion = Motion(placed, x[near], moved[near], q)
         share[near] = longest_step(motion.gap, motion.speed, len(near))
     if facets is not None:
-        which, free = facet_shares(facets, placed, x, relative, reach)
-        np.minimum.at(share, facets.corners[which], free[:, None])
+        near = facets.closing(placed, x, relative, swept, 1.2 * reach)
+        free = _facet_shares(Passing(facets.look(placed, x, near), relative[facets.corners[near]], turn))
+        np.minimum.at(share, facets.corners[near], free[:, None])
     return share
 
 
-def facet_shares(facets: Facets, placed: Placed, x: Values, relative: Values, reach: Values) -> tuple[Ints, Values]:
-    """Facets (k,) that may meet an obstacle, and the shares (k,) of the ways `relative` (n, d) to it of points x, no
-    longer than `reach` (n,), that leave a tenth of their gaps. Obstacles with facets do not turn."""
-    near = facets.closing(placed, x, relative, 1.2 * reach)
-    passing = Passing(facets.look(placed, x, near), relative[facets.corners[near]])
-    gap, share = passing.gap(np.zeros(len(near))), np.zeros(len(near))
-    open_ = np.flatnonzero(gap > 0)
+def _facet_shares(passing: Passing) -> Values:
+    """(k,) shares of the ways of facets to an obstacle that leave a tenth of their gaps."""
+    gap = passing.gap(np.zeros(passing.count))
+    share, open_ = np.zeros(len(gap)), np.flatnonzero(gap > 0)
     if len(open_):
         passing = passing.of(open_)
         share[open_] = longest_step(passing.gap, passing.speed, len(open_))
-    return near, share
+    return share
 
 
 def within_reach(skin: Skin, ways: Sequence[Way], start: Values, end: Values) -> Values:

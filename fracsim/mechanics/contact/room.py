@@ -20,8 +20,10 @@ from ...mesh.split.places import Places
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 SHARES = np.linspace(1.0, 0.0, 11)  # of the share that a point had
+NEARER = (0.8,) * 12 + (0.0,)  # what an element that is cut leaves of its points' shares, each time
 OUT = 0.2  # of the arm, that a step gives back
 
 
@@ -63,6 +65,20 @@ def drawn_in(
         if not len(left):
             break
     return at if np.array_equal(found, at.share) else at.drawn_in(found), which[left]
+
+
+def uncut(at: Places, u: Values, elements: Ints, cut: Callable[[Values], Flags]) -> Places:
+    """Copies of elements (m, d) that are `cut` drawn in until none is, or they are at their nodes. `cut`: of points at
+    x (n, d), m, (m,) flags. `u`: (nodes, d) displacements, m."""
+    for part in NEARER:
+        tight = np.intersect1d(elements[cut(at(u))], at.copies)
+        tight = tight[at.share[tight] > 0]
+        if not len(tight):
+            break
+        share = at.share.copy()
+        share[tight] *= part
+        at = at.drawn_in(share)
+    return at
 
 
 def let_out(at: Places, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> Places:

@@ -62,6 +62,10 @@ class Skin:
             self._every = Facets(*self._surface.facets(), SOFTEN * self._width)
         return self._every
 
+    def facets_of(self, elements: Ints) -> Facets:
+        """Elements (m, d) of a surface that is drawn, as facets that feel obstacles."""
+        return Facets(elements, np.ones(len(elements)), SOFTEN * self._width)
+
     def leave_out_cut(self, x: Values, cuts: Cuts) -> None:
         """Facets that are cut with points at x (n, d) are left out until there is room."""
         every = self._all_facets()

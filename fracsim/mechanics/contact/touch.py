@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,22 @@ class Grip:
     start: Values
 
 
+class Jointly(Protocol):
+    """What acts between points and not at each alone (facets)."""
+
+    @property
+    def corners(self) -> Ints:
+        """(k, c) points."""
+
+    @property
+    def exact(self) -> Values:
+        """(k, c d, c d) minus the derivative of the forces, N/m."""
+
+    @property
+    def stiffness(self) -> Values:
+        """(k, c d, c d) the same, positive semi-definite together with that of the points."""
+
+
 @dataclass(frozen=True)
 class Touch:
     """Points in touch with one obstacle, and what acts on them.
@@ -42,8 +59,7 @@ class Touch:
         energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.
         potential: J, of which both are minus the derivatives.
         make_parts: gives `exact` and `stick`, once they are asked for.
-        between: points (k, c) and what gives (k, c d, c d) of the same between them, positive together (joined);
-            None: it does not act between points.
+        between: what acts between them, its forces being among `normal` (joined); None: nothing does.
     """
 
     points: Ints
@@ -52,7 +68,7 @@ class Touch:
     friction: Values
     potential: float
     make_parts: Callable[[], tuple[Values, Values]]
-    between: tuple[Ints, Callable[[], Values]] | None = None
+    between: Jointly | None = None
 
     @cached_property
     def _parts(self) -> tuple[Values, Values]:

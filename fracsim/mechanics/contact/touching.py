@@ -58,12 +58,8 @@ class Touching:
 
     def _felt_between(self) -> list[int]:
         """Numbers of those that facets feel between their corners (collective)."""
-        edge, width, convex = (
-            self.skin.edge,
-            self.law.barrier.width,
-            [each.shape.least_radius for each in self.obstacles],
-        )
-        return [number for number in self._course.led if matters(convex[number], edge, width)]
+        edge, width, every = self.skin.edge, self.law.barrier.width, enumerate(self.obstacles)
+        return [number for number, each in every if matters(each.shape.least_radius, edge, width)]
 
     @property
     def edge(self) -> float:
@@ -200,11 +196,6 @@ class Touching:
         """Work of friction on the body in the step, and what of it an obstacle does by its own way, this rank's share,
         J (collective); the rest is lost."""
         found, held = self.touching()[number], self._grips[number]
-        if held is not None and number in self._sharp:  # which does not turn: facets rub at their corners, too
-            moved, force = self.x[found.points] - self._began[found.points], found.friction.sum(axis=0)
-            return float(np.vdot(found.friction, moved)), float(
-                force @ self._under(number, self._course.placed[number])
-            )
         if held is None or not len(held.points):
             return 0.0, 0.0
         force = found.friction[np.searchsorted(found.points, held.points)]

@@ -21,7 +21,7 @@ from .fragments import Fragments, PieceNames, fragments, sums, volumes
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Arrays = dict[str, npt.NDArray[np.generic]]
-type Apart = Callable[[Places, Values, float], Places]  # of where points are, u and t
+type Apart = Callable[[Places, Ints, Values, float], Places]  # of where points are, their elements, u and t
 FARTHEST = float(np.finfo(np.float32).max)  # viewers draw in single precision
 
 
@@ -152,7 +152,7 @@ class Surface:
             self._linear = whole(made, self.skeleton, self._pattern, made.points)
         at = self._linear
         for each in apart:
-            at = each(at, u, t)
+            at = each(at, made.elements, u, t)
         return at(u) - made.points
 
     def _elements(self) -> tuple[Ints, Ints, Ints, Arrays]:

@@ -34,6 +34,7 @@ from .refined import refined
 from .solid import Solid
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 
 class Solids(SelfContact):
@@ -89,7 +90,7 @@ class Solids(SelfContact):
         self._x = self._start = self._tangent_at = self._rubbing = None
         self._moved = True
 
-    def apart(self, at: Places, u: Values, t: float) -> Places:
+    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Drawn in as the walls are that touch."""
         assert self._surface is not None
         return at.drawn_in(np.minimum(self._surface.at.share, at.share))
