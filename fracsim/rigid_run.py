@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")
-LONGEST = 2000  # steps to go on after a signal, until no blow is under way: a checkpoint has none
 
 
 class RigidRun:
@@ -105,14 +104,9 @@ class RigidRun:
         self._clock.wrote(state)  # type: ignore[arg-type]
 
     def checkpoint(self) -> Path:
-        """Go on until no blow is under way, and write a checkpoint; returns its path. Raises CannotWrite."""
-        stepper, path = self.scene.stepper, checkpoint_path(self.folder)
-        for _ in range(LONGEST):
-            if not stepper.blows.under_way:
-                break
-            self.step()
-        state = self.state
-        arrays = stepper.saved(state) | {"broken_at": self.frames.broken_at}
+        """Write one; returns its path. Raises CannotWrite."""
+        state, path = self.state, checkpoint_path(self.folder)
+        arrays = self.scene.stepper.saved(state) | {"broken_at": self.frames.broken_at}
         arrays["worked"] = np.array([*self.history.worked.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         notes = Notes(self.text, {"blows": self.blows, "loads": self.loads})

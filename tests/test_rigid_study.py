@@ -34,7 +34,7 @@ def tables(**changed: Any) -> dict[str, Any]:
         "title": "dropped",
         "mesh": {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1},
         "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
-        "fracture": {"strength": 1e6, "kernel": "neighbours"},
+        "fracture": {"strength": 3e5, "kernel": "neighbours"},
         "brittle": {"surfaces": 4},
         "body": [{"position": [0.0, 0.0, 0.05], "rotation": [0.0, -0.1, 0.0], "velocity": [0.0, 0.0, -4.0]}],
         "obstacle": [FLOOR],
@@ -87,7 +87,7 @@ def test_a_run_writes_what_every_run_writes(done: Path) -> None:
     assert not (done / "fields.xdmf").exists()
     last = pieces["time"] == pieces["time"][-1]
     assert last.sum() == summary["pieces"] == frames(done)[-1].pieces
-    assert pieces["mass"][last].sum() == pytest.approx(0.6 * 0.2 * 0.2 * 2000.0, rel=1e-12)
+    assert pieces["mass"][last].sum() == pytest.approx(0.6 * 0.2 * 0.2 * 2000.0, rel=1e-11)
     assert np.abs([pieces[f"turn_{axis}"][last] for axis in "xyz"]).max() > 0.01
     energy = 0.5 * pieces["mass"] * sum(pieces[f"velocity_{axis}"] ** 2 for axis in "xyz")
     assert energy[0] == pytest.approx(history["kinetic"][0], rel=0.02)
@@ -95,13 +95,12 @@ def test_a_run_writes_what_every_run_writes(done: Path) -> None:
 
 
 def test_drawn_pieces_are_rigid_and_stay_above_the_floor(done: Path) -> None:
-    """Distances between points of the one body of the first frame are those at rest, and nothing is in the floor by
-    more than a contact of that speed is for a moment."""
+    """Distances between points of the one body of the first frame are those at rest, and nothing is in the floor."""
     drawn = frames(done)
     sides = np.ptp(drawn[0].points, axis=0)
     cos, sin = np.cos(0.1), np.sin(0.1)
     assert np.allclose(sides, [0.6 * cos + 0.2 * sin, 0.2, 0.6 * sin + 0.2 * cos], atol=1e-6)
-    assert min(frame.points[:, 2].min() for frame in drawn) > -0.01
+    assert min(frame.points[:, 2].min() for frame in drawn) > -1e-4
     assert np.isfinite(drawn[-1].points).all() and drawn[-1].pieces > drawn[0].pieces == 1
 
 

@@ -14,7 +14,12 @@ bodies       mass, place and motion of pieces, and of what they break into
 geometry     what pieces weigh and which shapes they have, from the split surface
 hulls        unions of convex parts
 primitives   shapes of obstacles
-engine       MuJoCo: contacts and friction; alone imports it
+model        the scene as MuJoCo has it; this and the engine alone import it
+engine       MuJoCo: finds contacts, and solves for what they give
+contacts     where they are, and how fast things come together there
+planes       those of hulls with planes
+meeting      the law that they follow
+siblings     pieces that lie in one another from birth
 tumbling     how bodies turn, by their angular momentum
 touches      what touched in a step
 blows        which contacts are blows, and which are loads

@@ -1,19 +1,18 @@
 """What of contact is a blow, and what a load (METHOD section 10).
 
-A blow: two things come together faster than resting contact explains, 2 g dt. Its impulse J, however many steps the
-engine takes for it, acts over a time tau (Hertz's, or what the study says), as the force J / tau. It is passed on: what
-a struck body then pushes harder than it did, it strikes. What a struck body was pushed by before, f, goes on pushing,
+A blow: two things meet faster than resting contact explains, 2 g dt. Its impulse J, which falls into one step, acts
+over a time tau (Hertz's, or what the study says), as the force J / tau. It is passed on: what a struck body then pushes
+harder than it did, it strikes. What a struck body was pushed by before, f, goes on pushing,
 
-    force = (sum over the blow of dt f_k - T f) / tau + f,   T = sum over the blow of dt,
+    force = (J - dt f) / tau + f,   J = all that it received in the step,
 
-so that the step does not matter. It is over where the two that met no longer come together and hardly push one another
-any more. A load: any other contact, with the force that it has.
+so that the step does not matter. A load: any other contact, with the force that it has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,44 +24,14 @@ from .touches import Touches
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-Pair = tuple[int, int]  # of things, the lower first
 
-SLOW = 1e-3  # m/s: what comes together slower than this strikes nothing, whatever the step
 HARDER = 2.0  # times the push before, that a struck body gives on as a blow
-SPENT = 0.1  # of its hardest push in a step: what the two that met still give one another where a blow is over
-LONGEST = 100  # steps of a blow, at most
 SETTLED = 5  # steps after a blow from which on contact is a load again
 GROWN = 1.1  # times the greatest load so far: it is looked at again
+STANDS = 2**30  # above all names of bodies: what stands in their way is known by its number beyond
+NEVER = 2**30  # steps since a body was struck that never was
 
-Time = Callable[[int, int, float], float]  # of two things that meet at a speed (m/s), s
-
-
-@dataclass
-class _Meeting:
-    """Two things that came together fast: who they are, how long the blow lasts, s, how fast they were, m/s, the
-    hardest push in a step so far, N s, and whether it is over."""
-
-    pair: tuple[int, int]
-    time: float
-    speed: float
-    hardest: float = 0.0
-    over: bool = False
-
-    def look(self, closing: float, push: float, fast: float) -> None:
-        """After a step in which the two had this approach and push; `fast`: what is."""
-        self.hardest = max(self.hardest, push)
-        self.over = closing <= fast and push <= SPENT * self.hardest
-
-
-@dataclass
-class _Struck:
-    """A body under a blow: what struck it, what pushed it before, and impulses since, at points of the body at rest."""
-
-    meeting: _Meeting
-    before: tuple[Values, Values]
-    points: list[Values] = field(default_factory=list)
-    impulses: list[Values] = field(default_factory=list)
-    steps: int = 0
+Time = Callable[[Ints, Ints, Values], Values]  # s of things (k,) and (k,) that meet at speeds (k,), m/s
 
 
 @dataclass(frozen=True)
@@ -81,168 +50,169 @@ class Strain:
     time: float = 0.0
 
 
+@dataclass
+class _Known:
+    """Of bodies by their names (n,), ascending: steps that they were not struck for, the greatest load that was looked
+    at, N; of the last step, by the codes of pairs of things (k,), ascending, what they gave one another, N s, and what
+    the bodies `on` (m,) received, `gave` (m, 3) N s at points `where` (m, 3), m, in their axes at rest."""
+
+    names: Ints
+    quiet: Ints
+    borne: Values
+    pairs: Ints
+    pushed: Values
+    on: Ints
+    where: Values
+    gave: Values
+
+    @classmethod
+    def nothing(cls) -> _Known:
+        """Before the first step."""
+        none, no = np.empty(0, np.int64), np.empty(0)
+        return cls(none, none, no, none, no, none, *np.empty((2, 0, 3)))
+
+
 class Blows:
     """Watches contacts from step to step; bodies are known by names that stay with them."""
 
-    def __init__(self, step: float, gravity: float, time: Time) -> None:
-        """`step`: s; `gravity`: its size, m/s^2."""
-        self._step, self._time = step, time
-        self._fast = max(2 * gravity * step, SLOW)
-        self._struck: dict[int, _Struck] = {}
-        self._quiet: dict[int, int] = {}  # steps since a body was struck last
-        self._borne: dict[int, float] = {}  # greatest load that was looked at, N
-        self._last: tuple[Touches, Bodies, Ints] | None = None  # of the step before
-        self._pushed: dict[tuple[int, int], float] = {}  # what pairs gave one another before, N s
+    def __init__(self, step: float, fast: float, time: Time) -> None:
+        """`step`: s; `fast`: what pushes by less, times the mass of the lighter thing, passes no blow on, m/s."""
+        self._step, self._fast, self._time = step, fast, time
+        self._known = _Known.nothing()
 
     def look(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
-        """The strains that are due after a step that began with these bodies, by their names (n,)."""
-        n, mass = len(bodies), np.append(bodies.mass, np.inf)
-        pairs, closing, push = _by_pairs(touches)
-        light = mass[np.minimum(np.array(pairs, np.int64).reshape(-1, 2), n)].min(axis=1)
-        before = np.array([self._pushed.get(self._key(pair, names), 0.0) for pair in pairs])
-        fast, hard = closing > self._fast, push > HARDER * before + light * self._fast
-        self._strike(pairs, closing, fast, hard, names)
-        seen = {self._key(pair, names): each for pair, *each in zip(pairs, closing, push, strict=True)}
-        for blow in self._struck.values():
-            found = seen.get(blow.meeting.pair, [-np.inf, 0.0])
-            blow.meeting.look(float(found[0]), float(found[1]), self._fast)
-        due = self._go_on(touches, bodies, names)
-        due += self._loads(touches, bodies, names)
-        for pair, much in zip(pairs, push, strict=True):
-            if not any(self._name(thing, names) in self._struck for thing in pair):
-                self._pushed[self._key(pair, names)] = float(much)
-        self._last = touches, bodies, names
-        return due
+        """The strains of a step that began with these bodies, by their names (n,), ascending."""
+        self._align(names)
+        speed, time = self._struck(touches, bodies, names)
+        known, n = self._known, len(names)
+        known.quiet = np.where(speed > 0, 0, np.minimum(known.quiet + 1, NEVER))
+        body, points, impulses = _at_rest(touches, bodies)
+        received = _Received(body, points, impulses)
+        due = [self._blow(received, int(each), int(names[each]), float(speed[each]), float(time[each]))
+               for each in np.flatnonzero(speed)]  # fmt: skip
+        size = np.linalg.norm(impulses, axis=1) / self._step
+        borne = np.bincount(body, size, n)
+        loaded = (known.quiet > SETTLED) & (borne > GROWN * known.borne)
+        known.borne[loaded] = borne[loaded]
+        return due + [self._load(received, int(each)) for each in np.flatnonzero(loaded)]
 
-    @property
-    def under_way(self) -> bool:
-        """Whether a body is under a blow now."""
-        return bool(self._struck)
+    def keep(self, touches: Touches, bodies: Bodies, names: Ints) -> None:
+        """What a step came to in the end, for the next one to compare with."""
+        self._align(names)
+        known = self._known
+        known.pairs, _, known.pushed = self._by_pairs(touches, names)
+        body, known.where, known.gave = _at_rest(touches, bodies)
+        known.on = names[body]
+
+    def forget(self, names: Ints) -> None:
+        """Bodies of these names are no more."""
+        gone = np.isin(self._known.names, names)
+        self._known.quiet[gone], self._known.borne[gone] = 0, 0.0
+
+    def _align(self, names: Ints) -> None:
+        """Know the bodies that there are; a new one has just been struck."""
+        known = self._known
+        if np.array_equal(known.names, names):
+            return
+        first = not len(known.names)
+        _, new, old = np.intersect1d(names, known.names, assume_unique=True, return_indices=True)
+        quiet, borne = np.full(len(names), NEVER if first else 0), np.zeros(len(names))
+        quiet[new], borne[new] = known.quiet[old], known.borne[old]
+        known.names, known.quiet, known.borne = names.copy(), quiet, borne
+
+    # --- a checkpoint ---
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """What a checkpoint keeps, where no blow is under way: loads that were borne, and what pairs give."""
-        pairs = np.array([*self._pushed], np.int64).reshape(-1, 2)
-        names = np.array([*self._quiet], np.int64)
-        quiet, borne = [*self._quiet.values()], [self._borne.get(int(name), 0.0) for name in names]
-        return {"pairs": pairs, "pushed": np.array([*self._pushed.values()], float), "rested": names,
-                "quiet": np.array(quiet, np.int64), "borne": np.array(borne, float)}  # fmt: skip
+        """What a checkpoint keeps."""
+        return {f"known.{name}": values for name, values in vars(self._known).items()}
 
     def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
         """Be as `saved` said."""
-        each = zip(saved["pairs"], saved["pushed"], strict=True)
-        self._pushed = {(int(a), int(b)): float(push) for (a, b), push in each}
-        names = [int(name) for name in saved["rested"]]
-        self._quiet = dict(zip(names, map(int, saved["quiet"]), strict=True))
-        self._borne = dict(zip(names, map(float, saved["borne"]), strict=True))
+        self._known = _Known(**{name: saved[f"known.{name}"] for name in vars(self._known)})
 
-    def forget(self, names: set[int]) -> None:
-        """Bodies of these names are no more."""
-        kept: tuple[dict[int, Any], ...] = (self._struck, self._quiet, self._borne)
-        for each in kept:
-            for name in names:
-                each.pop(name, None)
-        self._pushed = {pair: push for pair, push in self._pushed.items() if not names & {*pair}}
+    # --- who is struck ---
 
-    def _name(self, thing: int, names: Ints) -> int:
-        """Of a body; below 0 of what stands in its way."""
-        return int(names[thing]) if thing < len(names) else len(names) - 1 - thing
+    def _by_pairs(self, touches: Touches, names: Ints) -> tuple[Ints, Values, Values]:
+        """Codes (p,) of pairs that touch, ascending; the fastest meeting of each in m/s, and what it gave in N s."""
+        both = np.stack([touches.first, touches.second], axis=1)
+        known = np.concatenate([names, STANDS + np.arange(int(both.max(initial=0)) + 1)])
+        both = np.sort(known[both], axis=1)
+        code, place = np.unique(both @ np.array([2 * STANDS, 1]), return_inverse=True)
+        closing: Values = np.zeros(len(code))
+        np.maximum.at(closing, place, touches.closing)
+        push = np.bincount(place, np.linalg.norm(touches.impulse, axis=1), len(code))
+        return code, closing, push.astype(float)
 
-    def _key(self, pair: Pair, names: Ints) -> tuple[int, int]:
-        first, second = (self._name(thing, names) for thing in pair)
-        return min(first, second), max(first, second)
+    def _struck(self, touches: Touches, bodies: Bodies, names: Ints) -> tuple[Values, Values]:
+        """(n + 1,) speed of the blow that bodies are under, m/s, 0 of none, and (n + 1,) its time, s."""
+        n, known = len(names), self._known
+        code, closing, push = self._by_pairs(touches, names)
+        pairs = np.stack([code // (2 * STANDS), code % (2 * STANDS)], axis=1)
+        things = np.where(pairs < STANDS, np.searchsorted(names, pairs), n + pairs - STANDS)
+        at = np.minimum(np.searchsorted(known.pairs, code), max(len(known.pairs) - 1, 0))
+        before = np.where(known.pairs[at] == code, known.pushed[at], 0.0) if len(known.pairs) else np.zeros(len(code))
+        light = np.append(bodies.mass, np.inf)[np.minimum(things, n)].min(axis=1)
+        hard = push > HARDER * before + light * self._fast
+        speed, time = np.zeros((2, n + 1))
+        fast = closing > 0
+        self._hit(things[fast], closing[fast], speed, time)
+        links = np.minimum(things[hard], n)
+        while True:
+            under = (speed > 0)[links]
+            news = under[:, 0] != under[:, 1]
+            news &= np.where(under[:, 0], links[:, 1], links[:, 0]) < n
+            if not news.any():
+                return speed[:n], time[:n]
+            source = np.where(under[news, 0], *links[news].T)
+            target = links[news].sum(axis=1) - source
+            order = np.argsort(speed[source], kind="stable")
+            speed[target[order]], time[target[order]] = speed[source[order]], time[source[order]]
 
-    def _strike(self, pairs: list[Pair], closing: Values, fast: Flags, hard: Flags, names: Ints) -> None:
-        """Bodies that meet something fast are struck, and so is what they push harder than before."""
-        for row in np.flatnonzero(fast):
-            speed, pair = float(closing[row]), pairs[row]
-            meeting = _Meeting(self._key(pair, names), self._time(pair[0], pair[1], speed), speed)
-            for thing in pair:
-                self._hit(thing, meeting, names)
-        changed = bool(self._struck)
-        while changed:
-            changed = any([self._pass_on(pairs[row], names) for row in np.flatnonzero(hard)])
+    def _hit(self, things: Ints, closing: Values, speed: Values, time: Values) -> None:
+        """Bodies of pairs (k, 2) that meet are under the fastest of their blows."""
+        n = len(speed) - 1
+        order = np.argsort(closing, kind="stable")
+        things, closing = things[order], closing[order]
+        lasting = self._time(things[:, 0], things[:, 1], closing)
+        for body in np.minimum(things, n).T:
+            harder = closing >= speed[body]
+            speed[body[harder]], time[body[harder]] = closing[harder], lasting[harder]
+        speed[n] = 0.0
 
-    def _pass_on(self, pair: Pair, names: Ints) -> bool:
-        """Where one of a pair is struck the other is, too; whether that is news."""
-        struck = [self._struck.get(self._name(thing, names)) for thing in pair]
-        for blow, other in ((struck[0], 1), (struck[1], 0)):
-            if blow is not None and struck[other] is None and pair[other] < len(names):
-                self._hit(pair[other], blow.meeting, names)
-                return True
-        return False
+    # --- strains ---
 
-    def _hit(self, thing: int, meeting: _Meeting, names: Ints) -> None:
-        """A body is under a blow, or under a harder one."""
-        if thing >= len(names):
-            return
-        blow = self._struck.setdefault(int(names[thing]), _Struck(meeting, self._pushing(int(names[thing]))))
-        if meeting.speed > blow.meeting.speed:
-            blow.meeting = meeting
+    def _blow(self, received: _Received, body: int, name: int, speed: float, time: float) -> Strain:
+        points, impulses = received.by(body)
+        before = self._known.on == name
+        still = self._known.gave[before] * (1 / self._step - 1 / time)
+        force = np.concatenate([impulses / time, still])
+        return Strain(body, np.concatenate([points, self._known.where[before]]), force, speed, time)
 
-    def _pushing(self, name: int) -> tuple[Values, Values]:
-        """(k, 3) points at rest and (k, 3) impulses of the last step of a body."""
-        none = np.empty((0, 3)), np.empty((0, 3))
-        if self._last is None:
-            return none
-        touches, bodies, names = self._last
-        at = np.flatnonzero(names == name)
-        return _at_rest(touches, bodies, int(at[0])) if len(at) else none
-
-    def _go_on(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
-        """Sum up what struck bodies received; those whose blow is over are due."""
-        if not self._struck:
-            return []
-        number = {int(name): at for at, name in enumerate(names)}
-        due = []
-        for name in sorted(self._struck):
-            blow = self._struck[name]
-            points, impulses = _at_rest(touches, bodies, number[name])
-            blow.points.append(points)
-            blow.impulses.append(impulses)
-            blow.steps += 1
-            self._quiet[name] = 0
-            if blow.meeting.over or blow.steps >= LONGEST:
-                due.append(self._strain(blow, number[name]))
-                del self._struck[name]
-        return due
-
-    def _strain(self, blow: _Struck, body: int) -> Strain:
-        (points, before), time = blow.before, blow.meeting.time
-        force = np.concatenate([*blow.impulses]) / time
-        still = before * (1 / self._step - blow.steps / time)
-        where = np.concatenate([*blow.points, points])
-        return Strain(body, where, np.concatenate([force, still]), blow.meeting.speed, time)
-
-    def _loads(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
-        """Bodies that have settled and bear more than they ever did."""
-        due, size = [], np.linalg.norm(touches.impulse, axis=1) / self._step
-        things, n = np.concatenate([touches.first, touches.second]), len(bodies)
-        borne = np.bincount(np.minimum(things, n), np.tile(size, 2), n + 1)[:n]
-        for body in np.flatnonzero(borne):
-            name = int(names[body])
-            if name in self._struck:
-                continue
-            self._quiet[name] = self._quiet.get(name, 0) + 1
-            if self._quiet[name] > SETTLED and borne[body] > GROWN * self._borne.get(name, 0.0):
-                self._borne[name] = float(borne[body])
-                points, impulses = _at_rest(touches, bodies, int(body))
-                due.append(Strain(int(body), points, np.asarray(impulses / self._step)))
-        return due
+    def _load(self, received: _Received, body: int) -> Strain:
+        points, impulses = received.by(body)
+        return Strain(body, points, np.asarray(impulses / self._step))
 
 
-def _by_pairs(touches: Touches) -> tuple[list[Pair], Values, Values]:
-    """p pairs of things, the lower first, the fastest approach of each in m/s, and what it gave in N s."""
-    both = np.sort(np.stack([touches.first, touches.second], axis=1), axis=1)
-    count = int(both.max(initial=0)) + 1
-    keys, place = np.unique(both @ np.array([count, 1]), return_inverse=True)
-    closing = np.full(len(keys), -np.inf)
-    np.maximum.at(closing, place, touches.closing)
-    push = np.zeros(len(keys))
-    np.add.at(push, place, np.linalg.norm(touches.impulse, axis=1))
-    return [(int(key) // count, int(key) % count) for key in keys], closing, push
+@dataclass(frozen=True)
+class _Received:
+    """What bodies (m,) received in a step: impulses (m, 3) at points (m, 3) of theirs at rest, N s and m."""
+
+    body: Ints
+    points: Values
+    impulses: Values
+
+    def by(self, body: int) -> tuple[Values, Values]:
+        """(k, 3) points and (k, 3) impulses of one of them."""
+        mine = self.body == body
+        return self.points[mine], self.impulses[mine]
 
 
-def _at_rest(touches: Touches, bodies: Bodies, body: int) -> tuple[Values, Values]:
-    """(k, 3) points and (k, 3) impulses on a body, in its axes at rest."""
-    points, impulses = touches.on(body)
-    return bodies.to_rest(points, body), np.asarray(impulses @ bodies.turn[body])
+def _at_rest(touches: Touches, bodies: Bodies) -> tuple[Ints, Values, Values]:
+    """(m,) bodies, (m, 3) points and (m, 3) impulses on them, in their axes at rest."""
+    things = np.concatenate([touches.first, touches.second])
+    mine = things < len(bodies)
+    body, points = things[mine], np.tile(touches.point, (2, 1))[mine]
+    impulse = np.concatenate([-touches.impulse, touches.impulse])[mine]
+    turn = bodies.turn[body]
+    arm = np.einsum("kji,kj->ki", turn, points - bodies.place[body])
+    return body, arm + bodies.centre[body], np.einsum("kji,kj->ki", turn, impulse)

@@ -77,7 +77,11 @@ class Breakable:
         self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
         self._kept: dict[int, FreeBody] = {}  # by the lowest node of the piece
         self._node = np.argsort(self._domain.node_input)  # of each node of the input mesh
-        self.pieces: Pieces = find_pieces(graph)
+        self._find_pieces()
+
+    def _find_pieces(self) -> None:
+        self.pieces: Pieces = find_pieces(self.graph)
+        self._length: Values | None = None
 
     def damage(self) -> tuple[npt.NDArray[np.uint8], Values]:
         """Patterns (C,) of the cells and, of each edge (E,), where it is cut, in the order of the input mesh."""
@@ -105,7 +109,7 @@ class Breakable:
         self.graph.break_edges(self.graph.flags_of_keys(saved["broken"]))
         local, place = self.graph.find_keys(saved["broken"])
         self._criterion.cut[local], self._criterion.starts = saved["cut"][place, 0], saved["starts"]
-        self.pieces = find_pieces(self.graph)
+        self._find_pieces()
 
     def piece_of(self, name: int) -> int:
         """The piece that a node of the input mesh is in."""
@@ -116,10 +120,18 @@ class Breakable:
         stress; and there are surfaces left to open."""
         if self._criterion is None or not self._criterion.left:
             return False
-        X = self._domain.nodes[self.pieces.of_node == piece]
-        length = float(np.linalg.norm(np.ptp(X, axis=0)))
+        if self._length is None:
+            self._length = self._lengths()
         h = self._domain.mean_edge
-        return 2 * force * max(length, h) / h**3 >= self._criterion.strength.weakest
+        return bool(2 * force * max(float(self._length[piece]), h) / h**3 >= self._criterion.strength.weakest)
+
+    def _lengths(self) -> Values:
+        """(pieces,) diagonals of the boxes around them, m."""
+        piece, X = self.pieces.of_node, self._domain.nodes
+        order = np.argsort(piece, kind="stable")
+        start = np.searchsorted(piece[order], np.arange(int(piece.max()) + 1))
+        sides = np.maximum.reduceat(X[order], start) - np.minimum.reduceat(X[order], start)
+        return np.asarray(np.linalg.norm(sides, axis=1))
 
     def loads(self, piece: int, points: Values, force: Values) -> PointLoads:
         """Forces (k, d) at points (k, d) of a piece at rest."""
@@ -161,7 +173,7 @@ class Breakable:
             broken += count
             if count:
                 self._forget(node)
-                self.pieces = find_pieces(self.graph)
+                self._find_pieces()
                 waiting += self._lowest(mine)
         return broken
 

@@ -1,21 +1,16 @@
 """The rigid-body engine: MuJoCo finds contacts and their forces, with friction; bodies fly and turn by their momentum.
 
-    v' = v + dt (g + f / m),   x' = x + dt v',   turns: rigid.tumbling
+    v' = v + dt g + J / m,   x' = x + s dt (v + s dt g / 2) + (1 - s) dt v',   l' = l + r x J,   turns: rigid.tumbling
 
-with the contact forces f that MuJoCo finds for the start of the step (a convex problem, elliptic friction cones). Its
-own way of turning bodies loses angular momentum in flight and is not used.
-
-A contact is a spring and a dashpot that act within a few steps, whatever their size; the damping ratio z is that of a
-bounce, e = exp(-pi z / sqrt(1 - z^2)). What comes fast is in the other by up to v dt when it is first felt, and bounces
-the more for it, by 0.06 of its speed at most; where nothing shall bounce z = 2 leaves 0.05 of it.
+with impulses J that MuJoCo's solver finds (a convex problem, elliptic friction cones) for the law of rigid.meeting,
+where bodies are after the share s of the step that they fly for before they are struck. MuJoCo's own contacts are
+springs and dashpots that let things in, and its own way of turning bodies loses angular momentum: neither is used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import log, pi, sqrt
-from typing import Any
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -23,62 +18,24 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from .bodies import Bodies
-from .primitives import Primitive
+from .contacts import Contacts
+from .meeting import Meetings, flown, meetings
+from .model import Part, Rules, Stand, model_of, plane_contact
+from .siblings import Overlaps, Parting
 from .touches import Touches
-from .tumbling import tumbled
+from .tumbling import momentum_of, spin_of, tumbled
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-Part = Values | Primitive  # corners (n, 3) of a hull about the body's centre, in its axes at rest, m; or a shape
 
-RISE = 4.0  # steps: 1 / frequency of a contact that bounces
-DEAD, LEAST = 2.0, 2.0  # damping ratio of what does not bounce, and its 1 / (z frequency) in steps: MuJoCo's least
-IMPEDANCE = (0.95, 0.99, 1e-3, 0.5, 2.0)  # of contacts: near 1, they are hard
-STICKS = 10.0  # how much harder contacts are along the surface than across it: what sticks creeps the less
-HELD = 1e6  # mass of what is driven, in masses of all bodies
-LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
-SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
-
-
-@dataclass(frozen=True)
-class Rules:
-    """Of a study: `step` s, `gravity` (3,) m/s^2, `friction` of bodies with one another, `restitution` 0 to 1."""
-
-    step: float
-    gravity: Values
-    friction: float = 0.0
-    restitution: float = 0.0
-
-    @property
-    def damping(self) -> float:
-        """Damping ratio z of contacts."""
-        if self.restitution <= 0:
-            return DEAD
-        decay = -log(min(self.restitution, 0.999))
-        return decay / sqrt(pi**2 + decay**2)
-
-
-@dataclass(frozen=True)
-class Stand:
-    """Something that bodies meet and that nothing moves but its driver.
-
-    Attributes:
-        shape: about its reference point.    at: (3,) that point, m.    friction: Coulomb's coefficient with bodies.
-        driven: whether it ever moves.
-    """
-
-    shape: Primitive
-    at: Values
-    friction: float = 0.0
-    driven: bool = False
+ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farther than was thought,
+FARTHER = 1.5  # by as many times
+STAGES = (mujoco.mj_makeM, mujoco.mj_factorM, mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint,
+          mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint)  # fmt: skip
 
 
 class Engine:
-    """Bodies of fixed shapes, and what stands in their way. Another one is made where bodies break.
-
-    Attributes:
-        siblings: pairs of bodies, the lower first, that do not feel one another until they have been apart once.
-    """
+    """Bodies of fixed shapes, and what stands in their way. Another one is made where bodies break."""
 
     def __init__(
         self,
@@ -86,163 +43,167 @@ class Engine:
         parts: Sequence[Sequence[Part]],
         stands: Sequence[Stand],
         rules: Rules,
-        siblings: set[tuple[int, int]] | None = None,
+        overlaps: Overlaps | None = None,
+        names: Ints | None = None,
     ) -> None:
-        """`parts`: convex parts of each body."""
-        self._rules, self._count, self.siblings = rules, len(bodies), set(siblings or ())
-        self._mass = np.maximum(bodies.mass, LEAST_MASS)
-        self._inertia: Values = bodies.inertia + LEAST_MASS * np.eye(3)
-        spec, things = _spec(rules), []
-        for number, each in enumerate(parts):
-            body = _free(spec, float(self._mass[number]), self._inertia[number])
-            things += [number] * _add_parts(spec, body, each, rules.friction)
-        heavy = HELD * max(float(bodies.mass.sum()), 1e-9)
-        self._driven = [number for number, stand in enumerate(stands) if stand.driven]
-        for number in self._driven:
-            body, stand = _free(spec, heavy, heavy * np.eye(3), weightless=True), stands[number]
-            shape, at = _movable(stand.shape, SLAB * _spread(bodies, parts))
-            things += [self._count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at)
-        fixed = [number for number, stand in enumerate(stands) if not stand.driven]
-        for number in fixed:
-            stand = stands[number]
-            _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at)
-        self._model = spec.compile()
-        self._data = mujoco.MjData(self._model)
-        self._thing = self._things(things, fixed)
+        """`parts`: convex parts of each body; `overlaps`: of bodies by their names (n,), ascending, or numbers."""
+        self._rules, self._count = rules, len(bodies)
+        self._model = model_of(bodies, parts, stands, rules)
+        self._data = mujoco.MjData(self._model.made)
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
+        planes = self._model.planes
+        self._plane_contacts = [
+            plane_contact(planes.normal[k], float(planes.friction[k]), rules) for k in range(len(planes.stand))
+        ]
+        known = np.arange(len(bodies)) if names is None else names
+        self._parting = Parting.of(overlaps or Overlaps.none(), known, self._model.first, len(self._model.thing))
 
-    def _things(self, moving: list[int], fixed: list[int]) -> Ints:
-        """(geoms,) the thing that each geom is of; geoms of the world come first."""
-        return np.array([self._count + number for number in fixed] + moving, np.int64)
+    @property
+    def overlaps(self) -> Overlaps:
+        """Of pieces that lie in one another from birth, as they are now."""
+        return self._parting.overlaps
+
+    # --- a step ---
 
     def advance(self, bodies: Bodies, ways: Values | None = None) -> tuple[Bodies, Touches]:
         """The bodies a step later, and what touched; `ways`: (stands, 3) where the reference points of what stands are
         at the end of the step, m (None: where they were)."""
-        rules, n, data = self._rules, self._count, self._data
-        rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / rules.step)
-        self._place(bodies, rates)
-        mujoco.mj_step1(self._model, data)
-        if self.siblings:
-            self._let_pass()
-        mujoco.mj_step2(self._model, data)
-        touches = self._touches(bodies, rates)
-        force = data.qfrc_constraint.reshape(-1, 6)[:n]
-        velocity = bodies.velocity + rules.step * (rules.gravity + force[:, :3] / self._mass[:, None])
-        moment = np.einsum("nij,nj->ni", bodies.turn, force[:, 3:])
-        turn, spin = tumbled(bodies.turn, self._inertia, bodies.spin, moment, rules.step)
-        place = bodies.place + rules.step * velocity
+        rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
+        reach = self._reach(bodies)
+        for _ in range(ROUNDS):
+            moved, touches = self._moved(bodies, rates, reach)
+            farther = self._reach(moved)
+            if not np.any(farther > FARTHER * reach):
+                break
+            reach = np.maximum(reach, farther)
         if ways is not None:
             self._way = ways.copy()
-        return replace(bodies, place=place, velocity=velocity, turn=turn, spin=spin), touches
+        return moved, touches
 
-    def _place(self, bodies: Bodies, rates: Values) -> None:
-        """Tell the engine where everything is, and how fast."""
-        n, driven = self._count, self._driven
-        q, v = self._data.qpos.reshape(-1, 7), self._data.qvel.reshape(-1, 6)
-        q[:n, :3], q[n:, :3] = bodies.place, self._way[driven]
+    def _reach(self, bodies: Bodies) -> Values:
+        """(n,) how far any point of a body comes in a step, m."""
+        speed = np.linalg.norm(bodies.velocity, axis=1) + self._model.extent * np.linalg.norm(bodies.spin, axis=1)
+        return np.asarray(self._rules.step * (speed + self._rules.fast))
+
+    def _moved(self, bodies: Bodies, rates: Values, reach: Values) -> tuple[Bodies, Touches]:
+        """The bodies a step later where none of their points comes farther than a reach (n,), m."""
+        dt, n, g = self._rules.step, self._count, self._rules.gravity
+        start = bodies
+        share: Values = np.zeros(n)
+        contacts = self._find(bodies, rates, reach)
+        meeting, parting = self._meeting(contacts, bodies, rates)
+        if np.any(meeting.closing):
+            share = flown(meeting, contacts.things, n)
+            fallen = dt * share[:, None] * g
+            flying = replace(bodies, velocity=bodies.velocity + fallen / 2)
+            bodies = replace(self._flown(flying, dt * share), velocity=bodies.velocity)
+            contacts = self._find(bodies, rates, reach)
+            falling = replace(bodies, velocity=bodies.velocity + fallen)
+            meeting, parting = self._meeting(contacts, falling, rates)
+        self._parting = parting
+        force, touches = self._pushed(contacts, meeting, bodies, rates)
+        after = self._flown(self._driven_on(bodies, force), dt * (1 - share))
+        alone = ~np.any(force, axis=1)
+        after.place[alone] = start.place[alone] + dt * (start.velocity[alone] + dt * g / 2)
+        return after, touches
+
+    def _meeting(self, contacts: Contacts, bodies: Bodies, rates: Values) -> tuple[Meetings, Parting]:
+        """How contacts act in the step, and how overlaps stand then."""
+        rules = self._rules
+        gap, parting = self._parting(contacts.geoms, contacts.things, contacts.gap)
+        closing = contacts.closing(*self._motion(bodies, rates))
+        return meetings(gap, closing, rules.step, rules.fast, rules.restitution), parting
+
+    def _motion(self, bodies: Bodies, rates: Values) -> tuple[Values, Values]:
+        """(things, 3) velocities and (things, 3) spins."""
+        return np.concatenate([bodies.velocity, rates]), np.concatenate([bodies.spin, 0 * rates])
+
+    def _driven_on(self, bodies: Bodies, force: Values) -> Bodies:
+        """The bodies with the motion that forces and moments (n, 6) of a step give them."""
+        dt, inertia = self._rules.step, self._model.inertia
+        momentum = momentum_of(bodies.turn, inertia, bodies.spin)
+        momentum += dt * np.einsum("nij,nj->ni", bodies.turn, force[:, 3:])
+        velocity = bodies.velocity + dt * (self._rules.gravity + force[:, :3] / self._model.mass[:, None])
+        return replace(bodies, velocity=velocity, spin=spin_of(bodies.turn, inertia, momentum))
+
+    def _flown(self, bodies: Bodies, time: Values) -> Bodies:
+        """The bodies after times (n,) in which nothing acts, s."""
+        momentum = momentum_of(bodies.turn, self._model.inertia, bodies.spin)
+        turn = tumbled(bodies.turn, self._model.inertia, momentum, time)
+        place = bodies.place + time[:, None] * bodies.velocity
+        return replace(bodies, place=place, turn=turn, spin=spin_of(turn, self._model.inertia, momentum))
+
+    # --- MuJoCo ---
+
+    def _find(self, bodies: Bodies, rates: Values, reach: Values) -> Contacts:
+        """Contacts of what comes together within the step."""
+        model, data, n = self._model, self._data, self._count
+        q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
+        q[:n, :3], q[n:, :3] = bodies.place, self._way[model.driven]
         q[:n, 3:] = Rotation.from_matrix(bodies.turn).as_quat(scalar_first=True) if n else 1.0
         q[n:, 3:] = [1.0, 0.0, 0.0, 0.0]
-        v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates[driven], 0.0
+        v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates[model.driven], 0.0
         v[:n, 3:] = np.einsum("nji,nj->ni", bodies.turn, bodies.spin)
+        of_thing = np.concatenate([reach, self._rules.step * np.linalg.norm(rates, axis=1)])
+        model.made.geom_gap[:] = of_thing[model.thing]
+        model.made.body_margin[1:] = np.concatenate([reach, of_thing[n:][model.driven]])
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):
+            stage(model.made, data)
+        self._add_planes(bodies, reach, of_thing[n:])
+        found = data.contact
+        geoms = found.geom.astype(np.int64).reshape(-1, 2)
+        axes, places = found.frame.reshape(-1, 3, 3).copy(), np.concatenate([bodies.place, self._way])
+        return Contacts.found(
+            geoms, model.thing[geoms], found.pos.reshape(-1, 3).copy(), axes, found.dist.copy(), places
+        )
 
-    def _let_pass(self) -> None:
-        """Contacts of siblings that have not been apart yet are none; those that no longer touch are apart."""
-        data, contact = self._data, self._data.contact
-        pair = np.sort(self._thing[contact.geom], axis=1) if data.ncon else np.empty((0, 2), np.int64)
-        self.siblings &= {(int(a), int(b)) for a, b in pair[contact.dist < 0]}
-        if not self.siblings:
-            return
-        known = np.array([a * self._count + b for a, b in self.siblings])
-        passing = np.isin(pair[:, 0] * self._count + pair[:, 1], known) & (pair < self._count).all(axis=1)
-        contact.exclude[passing] = 1
-        mujoco.mj_makeConstraint(self._model, data)
-        mujoco.mj_island(self._model, data)
-        mujoco.mj_projectConstraint(self._model, data)
-        mujoco.mj_fwdVelocity(self._model, data)
+    def _add_planes(self, bodies: Bodies, reach: Values, speeds: Values) -> None:
+        """Contacts of hulls with planes, after those that MuJoCo finds."""
+        planes = self._model.planes
+        for number, parts, gaps, points in planes.near(bodies, self._way, reach, speeds):
+            contact = self._plane_contacts[number]
+            for k, part in enumerate(parts):
+                contact.dist, contact.pos, contact.geom = gaps[k], points[k], [planes.geom[number], part]
+                mujoco.mj_addContact(self._model.made, self._data, contact)
 
-    def _touches(self, bodies: Bodies, rates: Values) -> Touches:
-        """Contacts of the step that were felt, with what they gave."""
-        contact = self._data.contact
-        felt = np.flatnonzero((contact.efc_address >= 0) & (contact.exclude == 0))
-        rows = contact.efc_address[felt, None] + np.arange(3)
-        axes = contact.frame[felt].reshape(-1, 3, 3)
-        impulse = self._rules.step * np.einsum("ki,kij->kj", self._data.efc_force[rows], axes)
-        first, second = self._thing[contact.geom[felt]].reshape(-1, 2).T
-        point, normal = contact.pos[felt].copy(), axes[:, 0]
-        speed = self._velocity(bodies, rates, first, point) - self._velocity(bodies, rates, second, point)
-        return Touches(first, second, point, normal, impulse, np.einsum("ki,ki->k", speed, normal))
+    def _pushed(self, contacts: Contacts, meeting: Meetings, bodies: Bodies, rates: Values) -> tuple[Values, Touches]:
+        """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched.
 
-    def _velocity(self, bodies: Bodies, rates: Values, thing: Ints, point: Values) -> Values:
-        """(k, 3) of things at points, m/s."""
-        result, moving = np.empty_like(point), thing < self._count
-        result[moving] = bodies.velocity_at(point[moving], thing[moving])
-        result[~moving] = rates[thing[~moving] - self._count]
-        return result
+        What does not come near enough to touch is left out, and looked at again with the velocities that come of it.
+        """
+        data, n, kept = self._data, self._count, meeting.near
+        if not np.any(kept):
+            return np.zeros((n, 6)), Touches.none()
+        data.contact.dist[:] = meeting.aim
+        for _ in range(ROUNDS):
+            data.contact.exclude[:] = ~kept
+            for stage in STAGES:
+                stage(self._model.made, data)
+            data.qacc_warmstart[:] = data.qacc
+            force = data.qfrc_constraint.reshape(-1, 6)[:n].copy()
+            closing = contacts.closing(*self._motion(self._driven_on(bodies, force), rates))
+            missed = ~kept & (meeting.gap < self._rules.step * closing)
+            if not np.any(missed):
+                break
+            kept = kept | missed
+        return force, self._touches(contacts, meeting.closing)
+
+    def _touches(self, contacts: Contacts, closing: Values) -> Touches:
+        """Contacts of the step that gave something, which met at these speeds (k,), m/s."""
+        rows = self._data.contact.efc_address
+        felt = np.flatnonzero((rows >= 0) & (self._data.contact.exclude == 0))
+        force = self._data.efc_force[rows[felt, None] + np.arange(3)]
+        pressed = force[:, 0] > 0
+        felt = felt[pressed]
+        axes, (first, second) = contacts.axes[felt], contacts.things[felt].T
+        impulse = self._rules.step * np.einsum("ki,kij->kj", force[pressed], axes)
+        return Touches(first, second, contacts.point[felt], axes[:, 0], impulse, closing[felt])
 
     def depth(self, bodies: Bodies) -> list[tuple[int, int, float]]:
         """(thing, thing, depth in m) of what is in one another, the deepest place of each pair."""
-        self._place(bodies, np.zeros_like(self._way))
-        mujoco.mj_fwdPosition(self._model, self._data)
-        contact = self._data.contact
-        found: dict[tuple[int, int], float] = {}
-        for (a, b), distance in zip(self._thing[contact.geom].reshape(-1, 2).tolist(), contact.dist, strict=True):
-            key = min(a, b), max(a, b)
-            found[key] = max(found.get(key, 0.0), -float(distance))
-        return [(a, b, depth) for (a, b), depth in sorted(found.items()) if depth > 0]
-
-
-def _spec(rules: Rules) -> Any:
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.gravity = rules.step, rules.gravity
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, STICKS
-    option.tolerance, option.iterations = 1e-12, 200
-    spec.compiler.balanceinertia = True  # of a sliver, which round-off has made flatter than flat
-    spec.default.geom.solref = [max(RISE / rules.damping, LEAST) * rules.step, rules.damping]
-    spec.default.geom.solimp = IMPEDANCE
-    spec.default.geom.condim = 3
-    return spec
-
-
-def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
-    """How far bodies lie apart, with their own size, m."""
-    hulls = [np.abs(each).max() for part in parts for each in part if not isinstance(each, Primitive)]
-    return float(np.ptp(bodies.place, axis=0).max() + 2 * max(hulls, default=1.0))
-
-
-def _movable(shape: Primitive, side: float) -> tuple[Primitive, Values]:
-    """A shape that may be driven and where it is on its body: of a plane the slab behind it, half as thick as wide."""
-    if shape.kind != "plane":
-        return shape, np.zeros(3)
-    return Primitive("box", (side, side, side / 2), shape.turn, side), -side / 2 * shape.turn[:, 2]
-
-
-def _free(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> Any:
-    """A body that nothing holds, about its centre of mass."""
-    body = spec.worldbody.add_body()
-    body.add_freejoint()
-    body.explicitinertial, body.mass, body.ipos = True, mass, np.zeros(3)
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body.gravcomp = 1.0 if weightless else 0.0
-    return body
-
-
-def _add_parts(
-    spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, at: Values | None = None
-) -> int:
-    """The parts of a body; returns how many. What has a priority says what friction is."""
-    for part in parts:
-        geom = body.add_geom()
-        geom.friction, geom.priority = [friction, 0.0, 0.0], priority
-        if at is not None:
-            geom.pos = at
-        if isinstance(part, Primitive):
-            geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
-            geom.size = part.size
-            geom.quat = Rotation.from_matrix(part.turn).as_quat(scalar_first=True)
-        else:
-            mesh = spec.add_mesh()
-            mesh.name = f"part{len(spec.meshes)}"
-            mesh.uservert, mesh.inertia = part.reshape(-1), mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
-    return len(parts)
+        contacts = self._find(bodies, np.zeros_like(self._way), np.zeros(self._count))
+        count = int(contacts.things.max(initial=0)) + 1
+        code, place = np.unique(np.sort(contacts.things, axis=1) @ np.array([count, 1]), return_inverse=True)
+        depth: Values = np.zeros(len(code))
+        np.maximum.at(depth, place, -contacts.gap)
+        return [(int(each) // count, int(each) % count, float(depth[k])) for k, each in enumerate(code) if depth[k] > 0]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.split.build import Split, split
+from ..mesh.split.build import split
 from ..mesh.split.moments import Moments, moments
 from ..mesh.split.skeleton import Skeleton
 from ..meshes.data import MeshData
-from ..meshes.topology import signed_measures
-from .hulls import Cells, convex_parts
+from .hulls import Solid, convex_parts
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -38,7 +37,7 @@ class Geometry:
 
     def __init__(self, mesh: MeshData) -> None:
         self.skeleton = Skeleton(mesh)
-        self._volume = signed_measures(mesh.points, mesh.cells)
+        self._edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
         self._kept: dict[int, tuple[int, list[Values]]] = {}  # by lowest node: how many nodes, and the hulls
 
     def shapes(self, pattern: npt.NDArray[np.uint8], cut: Values | None = None) -> Shapes:
@@ -50,23 +49,7 @@ class Geometry:
         kept = {int(name): self._kept[int(name)] for name, count in zip(names, size, strict=True)
                 if self._kept.get(int(name), (0,))[0] == count}  # fmt: skip
         for number in [number for number, name in enumerate(names) if int(name) not in kept]:
-            hulls = convex_parts(self._cells(made, pattern, number))
+            hulls = convex_parts(Solid.of(made.points, made.elements[piece == number]), self._edge)
             kept[int(names[number])] = int(size[number]), [each - of.centre[number] for each in hulls]
         self._kept = kept
         return Shapes(names, of, made.piece_of_node, [kept[int(name)][1] for name in names])
-
-    def _cells(self, made: Split, pattern: npt.NDArray[np.uint8], number: int) -> Cells:
-        """Cells that a piece has a part of, with its own points of each."""
-        skeleton = self.skeleton
-        own = (made.piece_of_node == number)[skeleton.cells]
-        some = np.flatnonzero(own.any(axis=1))
-        cell, corner = np.nonzero(own[some])
-        torn = np.flatnonzero((made.edge >= 0) & (made.piece_of_point[made.elements[:, 0]] == number))
-        place = np.full(len(pattern), -1)
-        place[some] = np.arange(len(some))
-        of_cell = np.concatenate([cell, np.repeat(place[made.cell[torn]], made.elements.shape[1])])
-        points = np.concatenate([skeleton.points, made.points])
-        of_point = np.concatenate([
-            skeleton.cells[some[cell], corner], len(skeleton.points) + made.elements[torn].reshape(-1)
-        ])  # fmt: skip
-        return Cells(points, of_cell, of_point, self._volume[some] * own[some].mean(axis=1))

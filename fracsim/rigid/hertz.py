@@ -9,6 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
 
 @dataclass(frozen=True)
 class Hertz:
@@ -17,12 +23,12 @@ class Hertz:
     young: float
     poisson: float
 
-    def __call__(self, mass: float, radius: float, speed: float, *, both_give: bool) -> float:
-        """s, of a reduced mass in kg, a reduced radius in m and a speed in m/s."""
-        stiff = self.young / (1 - self.poisson**2) / (2 if both_give else 1)
-        return float(2.87 * (mass**2 / (radius * stiff**2 * speed)) ** 0.2)
+    def __call__(self, mass: Values, radius: Values, speed: Values, both_give: Flags) -> Values:
+        """(k,) s, of reduced masses (k,) in kg, reduced radii (k,) in m and speeds (k,) in m/s."""
+        stiff = self.young / (1 - self.poisson**2) / np.where(both_give, 2, 1)
+        return np.asarray(2.87 * (mass**2 / (radius * stiff**2 * speed)) ** 0.2)
 
 
-def reduced(first: float, second: float) -> float:
+def reduced(first: Values, second: Values) -> Values:
     """1 / (1 / a + 1 / b), either of which may be infinite."""
-    return 1.0 / (1.0 / first + 1.0 / second)
+    return np.asarray(1.0 / (1.0 / first + 1.0 / second))

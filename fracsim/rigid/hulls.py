@@ -1,7 +1,9 @@
 """Bodies as unions of convex parts: what a rigid-body engine collides.
 
-A part is the hull of some cells. The part whose hull has most room to spare is cut in two, across the principal axis
-that leaves the least, until what all hulls have to spare is a small share of the body, or there are enough of them.
+A part is the hull of what lies between planes. The part whose hull has most room to spare is cut in two through its
+middle, across the principal axis that leaves the least, until what all hulls have to spare is a small share of the
+body, or they lie nearer to it than cracks are smooth, a share of the mesh's edges, or there are enough of them. Parts
+of one body do not lie in one another.
 """
 
 from __future__ import annotations
@@ -13,65 +15,106 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
+from ..mesh.split.moments import Moments, cones, moments
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 SPARE = 0.02  # of the body's volume: what hulls may have beyond it
+ROUGH = 0.1  # of the mean edge of the mesh: how far off they may be, in the mean
 PARTS = 32  # of a body, at most
+MANY = 1000  # points: what has more is cut across its longest axis, without a comparison
 THIN = 0.01  # of its length: no part is flatter, or it would have no hull
 
 
 @dataclass(frozen=True)
 class Hull:
-    """Of some cells: the corners (n, 3) of their convex hull, m, and the volume that it has beyond theirs, m^3."""
+    """The corners (n, 3) of a convex hull, m, its area, m^2, and the volume that it has beyond what it is of, m^3."""
 
     corners: Values
+    area: float
     spare: float
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Of one body.
+class Solid:
+    """What a closed surface encloses.
 
     Attributes:
-        points: (N, 3) m.    cell, point: (k,) which of the c cells has which of the points, by cells.
-        volume: (c,) m^3.
+        points: (n, 3) m, all of them corners of triangles.    triangles: (m, 3), their normals outwards.
     """
 
     points: Values
-    cell: Ints
-    point: Ints
-    volume: Values
+    triangles: Ints
+
+    @classmethod
+    def of(cls, points: Values, triangles: Ints) -> Solid:
+        """Of triangles (m, 3) between some of the points."""
+        used, corners = np.unique(triangles, return_inverse=True)
+        return cls(points[used], corners.reshape(-1, 3))
 
     @property
-    def middles(self) -> Values:
-        """(c, 3) mean of the points of each, m."""
-        at, count = self.points[self.point], np.bincount(self.cell, minlength=len(self.volume))
-        sums = np.stack([np.bincount(self.cell, each, len(self.volume)) for each in at.T], axis=1)
-        return np.asarray(sums / count[:, None])
+    def moments(self) -> Moments:
+        """Of volume."""
+        return moments(self.points, self.triangles, np.zeros(len(self.triangles), np.int64), 1)
 
-    def hull(self, part: Ints) -> Hull:
-        """Of some of the cells."""
-        mine = np.zeros(len(self.volume), bool)
-        mine[part] = True
-        points = self.points[np.unique(self.point[mine[self.cell]])]
+    @property
+    def hull(self) -> Hull:
+        """Of its points."""
         try:
-            made = ConvexHull(points)
-        except QhullError:  # flat: a part without volume
-            return Hull(points, 0.0)
-        return Hull(points[made.vertices], max(float(made.volume - self.volume[part].sum()), 0.0))
+            made = ConvexHull(self.points)
+        except (QhullError, ValueError):  # flat, or hardly any points: a part without volume
+            return Hull(self.points, 0.0, 0.0)
+        volume = float(cones((self.points - self.points[0])[self.triangles]).sum())
+        return Hull(self.points[made.vertices], float(made.area), max(float(made.volume) - volume, 0.0))
+
+    def halves(self, at: Values, normal: Values) -> tuple[Solid, Solid]:
+        """Above and below the plane through a point (3,) with a normal (3,).
+
+        Each is closed by a cone over the section from its middle: where the section is not convex, triangles of that
+        cone overlap with opposite signs, and volumes are exact even so.
+        """
+        above = (self.points - at) @ normal >= 0
+        count = above[self.triangles].sum(axis=1)
+        torn = self.triangles[(count == 1) | (count == 2)]
+        lone = above[torn] == (count[(count == 1) | (count == 2)] == 1)[:, None]
+        turned = (lone.argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(torn, turned, axis=1).T  # a alone on its side
+        new = np.concatenate([self._crossing(a, b, at, normal), self._crossing(a, c, at, normal)])
+        first = len(self.points)
+        p, q = first + np.arange(2 * len(a)).reshape(2, -1)
+        apex = np.full(len(a), first + len(new))
+        points = np.concatenate([self.points, new, new.mean(axis=0, keepdims=True) if len(new) else new])
+        alone = [_rows(a, p, q), _rows(q, p, apex)]
+        others = [_rows(p, b, c), _rows(p, c, q), _rows(p, q, apex)]
+        up = above[a]
+        parts = []
+        for side, whole in ((True, 3), (False, 0)):
+            kept = [rows[up == side] for rows in alone] + [rows[up != side] for rows in others]
+            parts.append(Solid.of(points, np.concatenate([self.triangles[count == whole], *kept])))
+        return parts[0], parts[1]
+
+    def _crossing(self, a: Ints, b: Ints, at: Values, normal: Values) -> Values:
+        """(k, 3) where edges meet the plane, the same from either end."""
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        start, end = ((self.points[each] - at) @ normal for each in (low, high))
+        share = (start / (start - end))[:, None]
+        return np.asarray(self.points[low] + share * (self.points[high] - self.points[low]))
 
 
-def convex_parts(body: Cells, most: int = PARTS) -> list[Values]:
-    """Corners (n, 3) of the hulls of the parts of a body, at most as many, m."""
-    whole, middles = np.arange(len(body.volume)), body.middles
-    first = body.hull(whole)
-    heap: list[tuple[float, int, Ints, Hull]] = [(-first.spare, 0, whole, first)]
-    made = 1
-    spare, enough = first.spare, SPARE * float(body.volume.sum())
+def _rows(*corners: Ints) -> Ints:
+    return np.stack(corners, axis=1)
+
+
+def convex_parts(body: Solid, edge: float = 0.0, most: int = PARTS) -> list[Values]:
+    """Corners (n, 3) of the hulls of the parts of a body, at most as many, m; `edge`: the mean one of the mesh, m."""
+    whole = body.hull
+    heap: list[tuple[float, int, Solid, Hull]] = [(-whole.spare, 0, body, whole)]
+    made, spare = 1, whole.spare
+    enough = max(SPARE * float(body.moments.volume[0]), ROUGH * edge * whole.area)
     while spare > enough and len(heap) < most:
-        _, _, part, hull = heap[0]
-        halves = _halves(body, middles, part)
+        *_, part, hull = heap[0]
+        halves = _halved(part)
         if not halves:
             break
         heapq.heappop(heap)
@@ -80,6 +123,17 @@ def convex_parts(body: Cells, most: int = PARTS) -> list[Values]:
             heapq.heappush(heap, (-half.spare, made, cut, half))
             made += 1
     return [thickened(hull.corners) for *_, hull in heap]
+
+
+def _halved(part: Solid) -> list[tuple[Solid, Hull]]:
+    """The best of the three ways of cutting it through its middle; none where it has no volume to cut."""
+    of = part.moments
+    if not of.volume[0] > 0:
+        return []
+    axes = np.linalg.eigh(of.second[0])[1].T[::-1]
+    ways = [part.halves(of.centre[0], axis) for axis in (axes[:1] if len(part.points) > MANY else axes)]
+    made = [[(half, half.hull) for half in way] for way in ways if all(len(half.points) > 3 for half in way)]
+    return min(made, key=lambda way: sum(half.spare for _, half in way), default=[])
 
 
 def thickened(corners: Values) -> Values:
@@ -91,13 +145,3 @@ def thickened(corners: Values) -> Values:
         half = THIN * float(widths.max()) / 2 * axis
         corners = np.concatenate([corners - half, corners + half])
     return corners
-
-
-def _halves(body: Cells, middles: Values, part: Ints) -> list[tuple[Ints, Hull]]:
-    """The best of the three ways of cutting a part through its middle; none where it is a single cell."""
-    weight = body.volume[part]
-    arm = middles[part] - np.average(middles[part], axis=0, weights=weight)
-    _, axes = np.linalg.eigh((weight[:, None] * arm).T @ arm)
-    sides = [side for side in (arm @ axes > 0).T if side.any() and not side.all()]
-    ways = [[(half, body.hull(half)) for half in (part[side], part[~side])] for side in sides]
-    return min(ways, key=lambda way: sum(hull.spare for _, hull in way), default=[])

@@ -14,10 +14,12 @@ from ..mechanics.contact.obstacle import Obstacle
 from .blows import Blows, Strain
 from .bodies import Bodies
 from .breakable import Breakable
-from .engine import Engine, Part, Rules, Stand
+from .engine import Engine
 from .geometry import Geometry, Shapes
 from .hertz import Hertz, reduced
+from .model import Part, Rules, Stand
 from .primitives import primitive
+from .siblings import Overlaps
 from .touches import Touches
 
 Ints = npt.NDArray[np.int64]
@@ -91,8 +93,7 @@ class RigidStepper:
         self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
         self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
         self._driven = any(each.moved is not None for each in obstacles)
-        self.blows = Blows(rules.step, float(np.linalg.norm(rules.gravity)), self._time)
-        self.phases, self.siblings = Phases(), set[tuple[int, int]]()  # by names
+        self.blows, self.phases, self.overlaps = Blows(rules.step, rules.fast, self._time), Phases(), Overlaps.none()
         self._engine: Engine | None = None
         self.look_again()
 
@@ -110,16 +111,16 @@ class RigidStepper:
     # --- a checkpoint ---
 
     def saved(self, state: RigidState) -> dict[str, npt.NDArray[Any]]:
-        """Arrays that `restore` goes on from, where no blow is under way."""
+        """Arrays that `restore` goes on from."""
         bodies = {f"body.{name}": values for name, values in vars(state.bodies).items()}
-        siblings = np.array(sorted(self.siblings), np.int64).reshape(-1, 2)
-        return {**bodies, "siblings": siblings, **self.breakable.saved(), **self.blows.saved()}
+        overlaps = {f"overlap.{name}": values for name, values in vars(self.overlaps).items()}
+        return {**bodies, **overlaps, **self.breakable.saved(), **self.blows.saved()}
 
     def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
         """The state that `saved` was of, with the mesh as broken as then."""
         self.breakable.restore(saved)
         self.look_again()
-        self.siblings = {(int(a), int(b)) for a, b in saved["siblings"]}
+        self.overlaps = Overlaps(**{name: saved[f"overlap.{name}"] for name in vars(self.overlaps)})
         self.blows.restore(saved)
         bodies = {name.removeprefix("body."): values for name, values in saved.items() if name.startswith("body.")}
         return RigidState(t, step, Bodies(**bodies), work)
@@ -127,44 +128,53 @@ class RigidStepper:
     # --- a step ---
 
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
-        """The state a step later. Raises NotConverged where an analysis fails."""
+        """The state a step later. Raises NotConverged where an analysis fails.
+
+        Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
+        """
         began = clock = time.perf_counter()
-        iterations = self.breakable.iterations
-        rules, engine = self._rules, self._engine or self._made(state)
-        ways = np.array([self._way(each, state.t + rules.step) for each in self._obstacles]) if self._driven else None
-        moved, touches = engine.advance(state.bodies, ways)
-        self.siblings = {(int(self.shapes.names[a]), int(self.shapes.names[b])) for a, b in engine.siblings}
-        pushed, worked = self._given_by(touches, state.t)
-        gained = float(moved.mass @ ((moved.place - state.bodies.place) @ rules.gravity))
-        due = self.blows.look(touches, state.bodies, self.shapes.names)
+        iterations, bodies = self.breakable.iterations, state.bodies
+        moved, touches = self._moved(state, bodies)
+        due = self.blows.look(touches, bodies, self.shapes.names)
         clock = self.phases.add("motion", clock)
         names = self.shapes.names
         struck = [(int(names[each.body]), self._strike(int(names[each.body]), each)) for each in due]
         clock = self.phases.add("analysis", clock)
         broken = sum(count for _, count in struck)
         if broken:
-            moved = self._divided(moved, {name for name, count in struck if count})
-            self.phases.add("pieces", clock)
+            bodies = self._divided(bodies, {name for name, count in struck if count})
+            clock = self.phases.add("pieces", clock)
+            moved, touches = self._moved(state, bodies)
+            self.phases.add("motion", clock)
+        self.blows.keep(touches, bodies, self.shapes.names)
+        pushed, worked = self._given_by(touches, state.t)
+        gained = float(moved.mass @ ((moved.place - bodies.place) @ self._rules.gravity))
         work = state.work + gained + float(worked.sum())
-        after = RigidState(state.t + rules.step, state.step + 1, moved, work)
+        after = RigidState(state.t + self._rules.step, state.step + 1, moved, work)
         blows = sum(each.speed > 0 for each in due)
         krylov, seconds = self.breakable.iterations - iterations, time.perf_counter() - began
         return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, krylov, seconds)
 
-    def _made(self, state: RigidState) -> Engine:
+    def _moved(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, Touches]:
+        """The bodies of a state, or the pieces that they are now, a step later, and what touched."""
+        engine, end = self._engine or self._made(state.t, bodies), state.t + self._rules.step
+        ways = np.array([self._way(each, end) for each in self._obstacles]) if self._driven else None
+        moved, touches = engine.advance(bodies, ways)
+        self.overlaps = engine.overlaps
+        return moved, touches
+
+    def _made(self, t: float, bodies: Bodies) -> Engine:
         """The engine for the bodies as they are now."""
-        at = [self._way(each, state.t) for each in self._obstacles]
+        at = [self._way(each, t) for each in self._obstacles]
         stands = [Stand(shape, where, each.friction, each.moved is not None)
                   for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
-        number = {int(name): place for place, name in enumerate(self.shapes.names)}
-        siblings = {(number[a], number[b]) for a, b in self.siblings}
         parts: list[list[Part]] = [[*each] for each in self.shapes.parts]
-        self._engine = Engine(state.bodies, parts, stands, self._rules, siblings)
+        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.shapes.names)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
         """(thing, thing, depth in m) of what is in one another."""
-        return (self._engine or self._made(state)).depth(state.bodies)
+        return (self._engine or self._made(state.t, state.bodies)).depth(state.bodies)
 
     def _way(self, obstacle: Obstacle, t: float) -> Values:
         return np.asarray(obstacle.at + obstacle.displacement(t), float)
@@ -192,38 +202,29 @@ class RigidStepper:
         after = self.shapes
         parent = np.searchsorted(before.names, before.names[before.piece_of_node[after.names]])
         parts = bodies.divided(self._densities(), after.moments, parent)
-        self.blows.forget(names)
+        self.blows.forget(np.array([*names], np.int64))
         whole = ~np.isin(before.names[parent], list(names))  # not even by round-off are these other bodies now
         kept = {key: np.array(values) for key, values in vars(parts).items()}
         for key, values in kept.items():
             values[whole] = getattr(bodies, key)[parent[whole]]
-        self.siblings = self._family(before.names[parent], after.names)
+        self.overlaps = self.overlaps.divided(after.names, before.names[parent])
         return replace(parts, **kept)
-
-    def _family(self, parents: Ints, names: Ints) -> set[tuple[int, int]]:
-        """Pairs of names of pieces of one body, and of pieces of two bodies that let one another pass."""
-        children: dict[int, list[int]] = {}
-        for parent, name in zip(parents, names, strict=True):
-            children.setdefault(int(parent), []).append(int(name))
-        pairs = {(a, b) for each in children.values() for a in each for b in each if a < b}
-        for first, second in self.siblings:
-            pairs |= {(min(a, b), max(a, b)) for a in children[first] for b in children[second]}
-        return pairs
 
     # --- how long a blow lasts ---
 
-    def _time(self, first: int, second: int, speed: float) -> float:
-        """s, of two things that meet."""
+    def _time(self, first: Ints, second: Ints, speed: Values) -> Values:
+        """s, of things (k,) that meet others (k,) at speeds (k,), m/s."""
         if self._given is not None:
-            return self._given
-        mass, size = zip(self._weight(first), self._weight(second), strict=True)
-        both = max(first, second) < len(self.shapes.names)
-        return self._hertz(reduced(*mass), reduced(*size), speed, both_give=both)
+            return np.full(len(first), self._given)
+        mass, size = self._weights()
+        both = np.maximum(first, second) < len(self.shapes.names)
+        return self._hertz(reduced(mass[first], mass[second]), reduced(size[first], size[second]), speed, both)
 
-    def _weight(self, thing: int) -> tuple[float, float]:
-        """Mass in kg and half the size in m: half the side of a cube as large."""
-        count = len(self.shapes.names)
-        if thing >= count:
-            return np.inf, self._shapes[thing - count].extent
-        volume = float(self.shapes.moments.volume[thing])
-        return self._density * volume, volume ** (1 / 3) / 2
+    def _weights(self) -> tuple[Values, Values]:
+        """Masses of all things in kg and half their sizes in m: half the side of a cube as large."""
+        volume = self.shapes.moments.volume
+        stands = np.array([each.extent for each in self._shapes])
+        return (
+            np.concatenate([self._density * volume, np.full(len(stands), np.inf)]),
+            np.concatenate([np.cbrt(volume) / 2, stands]),
+        )

@@ -13,13 +13,13 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Touches:
-    """k contact points at the start of a step.
+    """k contact points of a step that gave something.
 
     Attributes:
         first, second: (k,) the two things: bodies by their numbers, then what stands in their way.
         point: (k, 3) m.    normal: (k, 3) from the first to the second.
         impulse: (k, 3) that the second received from the first in the step, N s.
-        closing: (k,) how fast the two came together there at the start of the step, along the normal, m/s.
+        closing: (k,) how fast the two met there, along the normal, m/s; 0 of what does not meet but rests.
     """
 
     first: Ints
@@ -28,6 +28,12 @@ class Touches:
     normal: Values
     impulse: Values
     closing: Values
+
+    @classmethod
+    def none(cls) -> Touches:
+        """Nothing touched."""
+        none, nowhere = np.empty(0, np.int64), np.empty((0, 3))
+        return cls(none, none, nowhere, nowhere, nowhere, np.empty(0))
 
     def __len__(self) -> int:
         return len(self.first)

@@ -1,6 +1,6 @@
-"""How a rigid body turns in a step: by its angular momentum, which stays to round-off where nothing acts.
+"""How a rigid body turns where nothing acts: its angular momentum stays, to round-off.
 
-    l' = l + dt m,    R' = exp(dt w_m) R,   w_m = (R_m I R_m^T)^-1 (l + l') / 2,   R_m = exp(dt w_m / 2) R
+    R' = exp(dt w_m) R,   w_m = (R_m I R_m^T)^-1 l,   R_m = exp(dt w_m / 2) R
 
 the implicit midpoint rule, of second order and without a drift of the energy, found by fixed points: it converges where
 a body turns by less than about a radian a step.
@@ -18,24 +18,31 @@ ROUNDS = 30
 SAME = 1e-14  # change of the turn in a step, rad, that is none
 
 
-def tumbled(turn: Values, inertia: Values, spin: Values, moment: Values, dt: float) -> tuple[Values, Values]:
-    """(n, 3, 3) rotations and (n, 3) spins after a step of dt (s), from those before.
+def tumbled(turn: Values, inertia: Values, momentum: Values, dt: Values) -> Values:
+    """(n, 3, 3) rotations after times dt (n,) s, from those before and angular momenta (n, 3), N m s.
 
-    `inertia`: (n, 3, 3) in the axes of the bodies, kg m^2.    `moment`: (n, 3) in the axes of space, N m.
+    `inertia`: (n, 3, 3) in the axes of the bodies, kg m^2.
     """
     if not len(turn):
-        return turn, spin
-    momentum = np.einsum("nij,nj->ni", _in_space(inertia, turn), spin)
-    after = momentum + dt * moment
-    middle, angle = (momentum + after) / 2, dt * spin
+        return turn
+    angle = dt[:, None] * spin_of(turn, inertia, momentum)
     for _ in range(ROUNDS):
         halfway = Rotation.from_rotvec(angle / 2).as_matrix() @ turn
-        found = dt * np.linalg.solve(_in_space(inertia, halfway), middle[:, :, None])[:, :, 0]
+        found = dt[:, None] * spin_of(halfway, inertia, momentum)
         change, angle = float(np.abs(found - angle).max()), found
         if change < SAME:
             break
-    turned = (Rotation.from_rotvec(angle) * Rotation.from_matrix(turn)).as_matrix()
-    return turned, np.linalg.solve(_in_space(inertia, turned), after[:, :, None])[:, :, 0]
+    return np.asarray((Rotation.from_rotvec(angle) * Rotation.from_matrix(turn)).as_matrix())
+
+
+def spin_of(turn: Values, inertia: Values, momentum: Values) -> Values:
+    """(n, 3) rad/s of bodies with angular momenta (n, 3), N m s."""
+    return np.asarray(np.linalg.solve(_in_space(inertia, turn), momentum[:, :, None])[:, :, 0])
+
+
+def momentum_of(turn: Values, inertia: Values, spin: Values) -> Values:
+    """(n, 3) R I R^T w, N m s."""
+    return np.einsum("nij,nj->ni", _in_space(inertia, turn), spin)
 
 
 def _in_space(inertia: Values, turn: Values) -> Values:

@@ -30,7 +30,7 @@ from .contact import obstacle_entries
 from .material import material_of
 
 try:
-    from ..rigid.engine import Rules
+    from ..rigid.model import Rules
     from ..rigid.stepper import RigidState, RigidStepper
 except ImportError:
     raise InputError(

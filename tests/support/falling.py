@@ -11,9 +11,9 @@ from fracsim.mechanics.contact.shapes import Plane
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.engine import Rules, Stand
 from fracsim.rigid.geometry import Geometry
 from fracsim.rigid.hertz import Hertz
+from fracsim.rigid.model import Rules, Stand
 from fracsim.rigid.primitives import primitive
 from fracsim.rigid.stepper import RigidStepper
 from support.rigid import DENSITY, breakable

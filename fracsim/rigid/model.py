@@ -1,0 +1,202 @@
+"""The model of a scene that MuJoCo steps: bodies of convex parts, and what stands in their way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from ..mechanics.contact.axes import frame
+from .bodies import Bodies
+from .planes import Planes
+from .primitives import Primitive
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+Part = Values | Primitive  # corners (n, 3) of a hull about the body's centre, in its axes at rest, m; or a shape
+
+HARD = 0.9999  # impedance of contacts, which MuJoCo lets be no harder: what they give way by, in steps, is 1 - HARD
+IMPEDANCE = [HARD, HARD, 1e-3, 0.5, 2.0]
+TOLERANCE = 1e-10  # of MuJoCo's solver, to the mean inertia
+HELD = 1e6  # mass of what is driven, in masses of all bodies
+LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
+SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
+FLAT, OTHER = 1, 2  # bits of what meets what
+SLOW = 1e-3  # m/s: what comes together slower than this strikes nothing, whatever the step
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Of a study: `step` s, `gravity` (3,) m/s^2, `friction` of bodies with one another, `restitution` 0 to 1."""
+
+    step: float
+    gravity: Values
+    friction: float = 0.0
+    restitution: float = 0.0
+
+    @property
+    def fast(self) -> float:
+        """m/s: what comes together faster than resting contact explains, 2 g dt, strikes."""
+        return max(2 * float(np.linalg.norm(self.gravity)) * self.step, SLOW)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Something that bodies meet and that nothing moves but its driver.
+
+    Attributes:
+        shape: about its reference point.    at: (3,) that point, m.    friction: Coulomb's coefficient with bodies.
+        driven: whether it ever moves.
+    """
+
+    shape: Primitive
+    at: Values
+    friction: float = 0.0
+    driven: bool = False
+
+
+@dataclass(frozen=True)
+class Model:
+    """As MuJoCo has it.
+
+    Attributes:
+        made: MuJoCo's.    thing: (geoms,) bodies by their numbers, then what stands.    first: (n,) geom of each body.
+        driven: numbers of what is driven.    mass, inertia: (n,) kg and (n, 3, 3) kg m^2 of bodies, none too light.
+        extent: (n,) how far each reaches from its centre, m.    planes: of what stands, whose contacts with hulls
+        MuJoCo leaves alone.
+    """
+
+    made: Any
+    thing: Ints
+    first: Ints
+    driven: Ints
+    mass: Values
+    inertia: Values
+    extent: Values
+    planes: Planes
+
+
+def model_of(bodies: Bodies, parts: Sequence[Sequence[Part]], stands: Sequence[Stand], rules: Rules) -> Model:
+    """Of bodies of these convex parts. MuJoCo numbers the geoms of what stands still first."""
+    mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
+    spec, things = _spec(rules), []
+    for number, each in enumerate(parts):
+        body = _free(spec, float(mass[number]), inertia[number])
+        things += [number] * _add_parts(spec, body, each, rules.friction)
+    heavy, count = HELD * max(float(bodies.mass.sum()), 1e-9), len(bodies)
+    driven, fixed = ([number for number, each in enumerate(stands) if each.driven == which] for which in (True, False))
+    for number in driven:
+        body, stand = _free(spec, heavy, heavy * np.eye(3), weightless=True), stands[number]
+        shape, at = _movable(stand.shape, SLAB * _spread(bodies, parts))
+        flat = stand.shape.kind == "plane"
+        things += [count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at, flat=flat)
+    if driven:
+        spec.option.tolerance /= HELD  # of what is not driven
+    for number in fixed:
+        stand = stands[number]
+        flat = stand.shape.kind == "plane"
+        _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat)
+    first = len(fixed) + np.searchsorted(things, np.arange(count))
+    thing, extent = [count + number for number in fixed] + things, [_extent(each) for each in parts]
+    planes = _planes(parts, stands, np.array(thing, np.int64), first)
+    return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia,
+                 np.array(extent), planes)  # fmt: skip
+
+
+def _planes(parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints) -> Planes:
+    """Planes among what stands, and the corners of all hulls."""
+    stand = np.array([number for number, each in enumerate(stands) if each.shape.kind == "plane"], np.int64)
+    normal = np.array([stands[number].shape.turn[:, 2] for number in stand]).reshape(-1, 3)
+    hulls = [(number, first[number] + place, each) for number, part in enumerate(parts)
+             for place, each in enumerate(part) if not isinstance(each, Primitive)]  # fmt: skip
+    corners = np.concatenate([np.empty((0, 3)), *(each for *_, each in hulls)])
+    sizes = [len(each) for *_, each in hulls]
+    of, part = (np.repeat(np.array([each[k] for each in hulls], np.int64), sizes) for k in (0, 1))
+    geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
+    return Planes(stand, geom, normal, np.array([stands[k].friction for k in stand]), corners, of, part)
+
+
+def plane_contact(normal: Values, friction: float, rules: Rules) -> Any:
+    """A contact of a plane with a normal (3,), as MuJoCo has them, but for what it touches and where."""
+    made = mujoco.MjContact()
+    made.frame, made.dim, made.friction = frame(normal)[:, [2, 0, 1]].T.reshape(-1), 3, [friction, friction, 0, 0, 0]
+    made.flex = made.elem = made.vert = [-1, -1]
+    made.solref, made.solimp = _law(rules), IMPEDANCE
+    return made
+
+
+def _law(rules: Rules) -> list[float]:
+    """As MuJoCo has it: acceleration -(c + r / dt) / dt."""
+    return [-HARD / rules.step**2, -HARD / rules.step]
+
+
+def _spec(rules: Rules) -> Any:
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.gravity = rules.step, rules.gravity
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.tolerance, option.iterations = TOLERANCE, 200
+    spec.compiler.balanceinertia = True  # of a sliver, which round-off has made flatter than flat
+    spec.default.geom.solref, spec.default.geom.solimp = _law(rules), IMPEDANCE
+    spec.default.geom.condim = 3
+    return spec
+
+
+def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
+    """How far bodies lie apart, with their own size, m."""
+    hulls = [np.abs(each).max() for part in parts for each in part if not isinstance(each, Primitive)]
+    return float(np.ptp(bodies.place, axis=0).max() + 2 * max(hulls, default=1.0))
+
+
+def _extent(parts: Sequence[Part]) -> float:
+    """How far a body reaches from its centre, m."""
+    reach = [float(np.linalg.norm(np.atleast_2d(each.size if isinstance(each, Primitive) else each), axis=1).max())
+             for each in parts]  # fmt: skip
+    return max(reach, default=0.0)
+
+
+def _movable(shape: Primitive, side: float) -> tuple[Primitive, Values]:
+    """A shape that may be driven and where it is on its body: of a plane the slab behind it, half as thick as wide."""
+    if shape.kind != "plane":
+        return shape, np.zeros(3)
+    return Primitive("box", (side, side, side / 2), shape.turn, side), -side / 2 * shape.turn[:, 2]
+
+
+def _free(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> Any:
+    """A body that nothing holds, about its centre of mass."""
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    body.explicitinertial, body.mass, body.ipos = True, mass, np.zeros(3)
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    body.gravcomp = 1.0 if weightless else 0.0
+    return body
+
+
+def _add_parts(
+    spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, at: Values | None = None,
+    *, flat: bool = False,
+) -> int:  # fmt: skip
+    """The parts of a body; returns how many. What has a priority says what friction is. What is `flat` meets no hulls
+    as MuJoCo goes: those contacts are found by rigid.planes."""
+    for part in parts:
+        geom = body.add_geom()
+        geom.friction, geom.priority = [friction, 0.0, 0.0], priority
+        if at is not None:
+            geom.pos = at
+        if isinstance(part, Primitive):
+            geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
+            geom.size = part.size
+            geom.quat = Rotation.from_matrix(part.turn).as_quat(scalar_first=True)
+            geom.contype = geom.conaffinity = FLAT if flat else FLAT | OTHER
+        else:
+            mesh = spec.add_mesh()
+            mesh.name = f"part{len(spec.meshes)}"
+            mesh.uservert, mesh.inertia = part.reshape(-1), mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
+            geom.contype = geom.conaffinity = OTHER
+    return len(parts)
