@@ -1,4 +1,5 @@
-"""Whether strength, fracture energy, mesh and body fit together: what `fracsim check` says of their lengths."""
+"""Whether strength, mesh and body fit together: what `fracsim check` says of them beside cracks that take an energy
+(tearing)."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ from collections.abc import Iterator
 from . import Study
 from .materials import MATERIALS
 
-PROCESS = 5.0  # of the body's least side over l_ch, below which loads come out too high
 DISC = 6.0  # h that a tip needs around it
 FAR = 3.0  # times that an energy may be off without a word
 
@@ -25,17 +25,6 @@ def fits(study: Study, least: float) -> Iterator[str]:
     if table.energy is None:
         yield from _spent(study, stiff, table.radius or h)
         return
-    length = stiff * table.energy / table.strength**2
-    if h is not None and length < h:
-        yield (
-            f"note: l_ch = {length:.3g} m is below h = {h:g} m: in whole material cracks begin late; h below that, or "
-            f"strength below (E' G_c / h)^1/2 = {(stiff * table.energy / h) ** 0.5:.3g} Pa"
-        )
-    if length > least / PROCESS:
-        yield (
-            f"note: l_ch = {length:.3g} m is more than a fifth of the body's least side, {least:.3g} m: its process "
-            "zone is as large as the body, and loads come out too high (strength decides there, not G_c)"
-        )
     if h is not None and least < 2 * DISC * h:
         most = least / 2 / DISC
         yield f"note: tips need {DISC:g} h on every side, the body is {least / h:.3g} h across: h below {most:.2g} m"
