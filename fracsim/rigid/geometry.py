@@ -23,7 +23,7 @@ class Shapes:
 
     Attributes:
         names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
-        parts: corners (m, 3) of the convex parts of each about its centre, m.
+        parts: corners (m, 3) of the convex parts of each, at rest, m.
     """
 
     names: Ints
@@ -38,7 +38,8 @@ class Geometry:
     def __init__(self, mesh: MeshData) -> None:
         self.skeleton = Skeleton(mesh)
         self._edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
-        self._kept: dict[int, tuple[int, list[Values]]] = {}  # by lowest node: how many nodes, and the hulls
+        # by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as these break
+        self._kept: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
 
     def shapes(self, pattern: npt.NDArray[np.uint8], cut: Values | None = None) -> Shapes:
         """Of patterns (C,) of broken edges, cut where `cut` (E,) says."""
@@ -46,10 +47,13 @@ class Geometry:
         piece = made.piece_of_point[made.elements[:, 0]]
         of = moments(made.points, made.elements, piece, made.pieces)
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
-        kept = {int(name): self._kept[int(name)] for name, count in zip(names, size, strict=True)
-                if self._kept.get(int(name), (0,))[0] == count}  # fmt: skip
-        for number in [number for number, name in enumerate(names) if int(name) not in kept]:
-            hulls = convex_parts(Solid.of(made.points, made.elements[piece == number]), self._edge)
-            kept[int(names[number])] = int(size[number]), [each - of.centre[number] for each in hulls]
+        kept: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
+        elements = np.bincount(piece, minlength=made.pieces)
+        for number, name in enumerate(names.tolist()):
+            key = int(size[number]), int(elements[number]), float(f"{of.volume[number]:.9e}")
+            same = self._kept.get(name)
+            if same is None or same[0] != key:
+                same = key, convex_parts(Solid.of(made.points, made.elements[piece == number]), self._edge)
+            kept[name] = same
         self._kept = kept
         return Shapes(names, of, made.piece_of_node, [kept[int(name)][1] for name in names])

@@ -168,7 +168,8 @@ class RigidStepper:
         at = [self._way(each, t) for each in self._obstacles]
         stands = [Stand(shape, where, each.friction, each.moved is not None)
                   for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
-        parts: list[list[Part]] = [[*each] for each in self.shapes.parts]
+        centres = zip(self.shapes.parts, bodies.centre, strict=True)
+        parts: list[list[Part]] = [[corners - centre for corners in each] for each, centre in centres]
         self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.shapes.names)
         return self._engine
 
