@@ -77,8 +77,8 @@ def test_the_study_as_run(output: Output) -> None:
 
 def test_history_has_its_columns_and_a_row_a_step(output: Output) -> None:
     axes = "xyz" if "bar" in output.study.title else "xy"
-    probes = [f"{head}_grip_{axis}" for head in ("reaction", "motion") for axis in axes]
-    probes += [f"probe_tip_{axis}" for axis in axes] if "strip" in output.study.title else []
+    names = ["reaction_grip", *(["probe_tip"] if "strip" in output.study.title else []), "motion_grip"]
+    probes = [f"{name}_{axis}" for name in names for axis in axes]
     rows = history(output.folder)
     assert list(rows) == COLUMNS + probes
     assert np.array_equal(rows["step"], np.arange(1, output.summary["steps"] + 1))

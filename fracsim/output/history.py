@@ -57,12 +57,6 @@ class Probes:
         in 2D, whose forces and energies are of 1 m (collective)."""
         self._balance, self._domain = balance, balance.domain
         axes = AXES[: self._domain.dim]
-        heads = [(head, probe) for probe in probes for head in HEADS[probe.quantity]]
-        self.names = [f"{head}_{probe.name}_{axis}" for head, probe in heads for axis in axes]
-        self._readings = [self._reading(probe, head) for head, probe in heads]
-        for name, way in (ways or {}).items():
-            self.names += [f"motion_{name}_{axis}" for axis in axes]
-            self._readings.append(partial(self._moved, way))
         readings: dict[str, Reading] = {}
         works: dict[str, Figure] = {}
         least: dict[str, Figure] = {}
@@ -70,8 +64,14 @@ class Probes:
             readings |= term.readings()
             works |= term.works()
             least |= term.least()
-        self.names += [*readings, *works, *least]
-        self._readings += readings.values()
+        heads = [(head, probe) for probe in probes for head in HEADS[probe.quantity]]
+        vectors = {f"{head}_{probe.name}": self._reading(probe, head) for head, probe in heads}
+        vectors |= {f"motion_{name}": partial(self._moved, way) for name, way in (ways or {}).items()}
+        moved = {name: reading for name, reading in vectors.items() if name.startswith("motion_")}
+        first = {name: reading for name, reading in vectors.items() if name not in moved}
+        self.names = [f"{name}_{axis}" for name in first for axis in axes] + [*readings]
+        self.names += [f"{name}_{axis}" for name in moved for axis in axes] + [*works, *least]
+        self._readings = [*first.values(), *readings.values(), *moved.values()]
         self._works, self._least = list(works.values()), list(least.values())
         self._factor = factors(self.names, thickness)
 
