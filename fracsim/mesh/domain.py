@@ -190,6 +190,17 @@ class Domain:
         return exterior[of_geometry[geometry].all(axis=1)]
 
     @cached_property
+    def sides_outside(self) -> npt.NDArray[np.bool_]:
+        """(cells, d + 1) whether the facet opposite to each node of owned cells lies in the body's surface."""
+        topology = self.mesh.topology
+        flags = np.zeros(
+            topology.index_map(self.dim - 1).size_local + topology.index_map(self.dim - 1).num_ghosts, bool
+        )
+        flags[self._exterior] = True
+        facets = topology.connectivity(self.dim, self.dim - 1).array.reshape(-1, self.dim + 1)
+        return flags[facets[: self.cell_count]]
+
+    @cached_property
     def _exterior(self) -> Ints:
         return dolfinx.mesh.exterior_facet_indices(self.mesh.topology)
 

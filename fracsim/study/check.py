@@ -167,10 +167,6 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, anatomy, f"probe.{i}.point")
-    if dim == 3 and study.fracture is not None and study.fracture.energy is not None:
-        raise InputError(
-            "fracture.energy is for 2D meshes so far; this one has 3 dimensions: remove it, and edges break by strength"
-        )
     if dim == 3 and study.material.thickness is not None:
         raise InputError("material.thickness is that of 2D meshes; this one has 3 dimensions: remove it")
     if dim == 3 and study.material.plane == "stress":

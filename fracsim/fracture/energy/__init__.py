@@ -1,11 +1,12 @@
-"""Cracks that take an energy: their tips advance where the configurational force reaches the fracture energy (2D).
+"""Cracks that take an energy: their tips advance where the configurational force reaches the fracture energy.
 
     g = - sum_j V_j Sigma_j grad q(x_j),   Sigma = chi psi I - H^T (chi P),   H = grad u
 
 force      g, the energy that a tip's advance releases for each area of crack
 around     what lies around a place, on any rank
+front      in space: the crack that an advance makes, by which g is divided
 seen       the body as tips see it
-cutting    the line that cuts a cell, and where it leaves it
+cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
 splitting  what is left of a cell that has come apart
 

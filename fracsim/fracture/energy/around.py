@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +20,14 @@ MANY = 1000  # places from which on all cells are wanted
 
 
 def local_size(domain: Domain) -> Values:
-    """(cells,) h = sqrt(2 A) in m, A the mean area of the cells around the nodes of each cell (collective)."""
+    """(cells,) h = (d! V)^(1/d) in m, V the mean volume of the cells around the nodes of each cell (collective)."""
     volumes, nodes = domain.volumes, domain.cell_nodes
     sums = la.vector(domain.space.dofmap.index_map, 2, np.float64)
     rows = sums.array.reshape(-1, 2)
     np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
-    return np.asarray(np.sqrt(2 * (rows[:, 0] / rows[:, 1])[nodes].mean(axis=1)))
+    return np.asarray((factorial(domain.dim) * (rows[:, 0] / rows[:, 1])[nodes].mean(axis=1)) ** (1 / domain.dim))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How a line cuts a triangle: through the point where the crack came in, or through its centre."""
+"""How cracks cut cells: a line a triangle, a plane a tetrahedron, from where they came in, or through the centre."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ...mesh.simplices import local_edges
 from ..cracks import CLOSEST
+from .front import partitions
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -30,12 +31,12 @@ class Cuts:
 
 
 def line_cuts(corners: Values, through: Values, normal: Values) -> tuple[Flags, Values]:
-    """(n, 3) whether lines cross the local edges of triangles, and (n, 3) the share of each edge nearest to its line.
+    """(n, k) whether lines (planes) cross the local edges of cells, and (n, k) the share of each edge nearest to them.
 
-    `corners`: (n, 3, 2) m. `through`, `normal`: (n, 2) of the lines. An edge that is not crossed is met at the end that
-    is nearer to the line. Shares are held within 0.02 to 0.98.
+    `corners`: (n, d + 1, d) m. `through`, `normal`: (n, d). An edge that is not crossed is met at the end that is
+    nearer. Shares are held within 0.02 to 0.98.
     """
-    first, second = local_edges(2).T
+    first, second = local_edges(corners.shape[2]).T
     height = np.einsum("nci,ni->nc", corners - through[:, None], normal)
     a, b = height[:, first], height[:, second]
     crossed = (a >= 0) != (b >= 0)
@@ -67,8 +68,26 @@ def leave(corners: Values, entry: Ints, point: Values, normal: Values, ahead: Va
     return Cuts(rows, edge, share[rows, edge])
 
 
+def cleave(corners: Values, broken: Flags, point: Values, normal: Values) -> Cuts:
+    """The edges that planes through points (n, 3) cut of tetrahedra whose edges `broken` (n, 6) are cut already.
+
+    The corners are parted as the plane does it, or else so that all broken edges are cut and corners are least far on
+    the wrong side.
+    """
+    sides, cut = partitions()
+    height = np.einsum("nci,ni->nc", corners - point[:, None], normal)
+    wrong = [np.where(sides, np.maximum(sign * height, 0)[:, None], np.maximum(-sign * height, 0)[:, None]).sum(2)
+             for sign in (1, -1)]  # fmt: skip
+    left = (broken[:, None] & ~cut).sum(axis=2)
+    size = np.abs(height).sum(axis=1, keepdims=True)
+    chosen = np.argmin(np.minimum(*wrong) + 10 * left * size, axis=1)
+    _, share = line_cuts(corners, point, normal)
+    row, edge = np.nonzero(cut[chosen] & ~broken)
+    return Cuts(row, edge, share[row, edge])
+
+
 def through_centre(corners: Values, normal: Values) -> Cuts:
-    """The two edges of each triangle that a line through its centre crosses."""
+    """The edges of each cell that a line (a plane) through its centre crosses."""
     crossed, share = line_cuts(corners, corners.mean(axis=1), normal)
     row, edge = np.nonzero(crossed)
     return Cuts(row, edge, share[row, edge])

@@ -16,10 +16,16 @@ from ...mesh.small_matrices import barycentric_gradients
 from ..brittle.principal import largest, tensors
 from .around import Around, Pairs
 from .force import eshelby, first_piola, plateau, plateau_gradient, springs
+from .front import WIDTH, Front, advance
 
 Flags = npt.NDArray[np.bool_]
+Cells = npt.NDArray[np.integer]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+
+LEAST = 0.05  # of R: a shorter advance is that of no front
+FACED = 0.1  # of R^2: area of the body's surface within a disc from which on it is there
+LEAST_DISC = 3.0  # R over h is more: polygons reach as far as a cell beyond their cell's centre
 
 
 @dataclass(frozen=True)
@@ -27,10 +33,11 @@ class Seen:
     """The body as it is: rows of the cells of this rank and those near them, in the order of `around`.
 
     Attributes:
-        stress: (near, 2, 2) Cauchy stress of the undamaged material, Pa; 0 far from where anybody looks.
-        sigma: (near, 2, 2) Eshelby's stress of the body as it is, Pa; 0 far from tips.
-        inertia: (near, 2) rho (H^T a - (grad v)^T v), N/m^3; 0 far from tips, and where nothing has a mass.
+        stress: (near, d, d) Cauchy stress of the undamaged material, Pa; 0 far from where anybody looks.
+        sigma: (near, d, d) Eshelby's stress of the body as it is, Pa; 0 far from tips.
+        inertia: (near, d) rho (H^T a - (grad v)^T v), N/m^3; 0 far from tips, and where nothing has a mass.
         split, damaged: (near,) come apart; with a broken edge.
+        polygons: (near, WIDTH) of split cells (front); None in the plane, where an advance makes its own length.
     """
 
     around: Around
@@ -39,25 +46,55 @@ class Seen:
     inertia: Values
     split: Flags
     damaged: Flags
+    polygons: Values | None = None
 
     @property
     def cracked(self) -> Values:
-        """(n, 2) centres of the cells with a broken edge, m."""
+        """(n, d) centres of the cells with a broken edge, m."""
         return self.around.centres[self.damaged | self.split]
 
     def forces(self, points: Values, radius: Values) -> Values:
-        """(n, 2) configurational force on places (n, 2) over discs of `radius` (n,), J/m^2.
+        """(n, d) configurational force on places (n, d) over discs of `radius` (n,), J/m^2.
 
         g = - sum V Sigma grad q + sum V q rho (H^T a - (grad v)^T v)
+
+        In space that along the advance of a crack, over the area it makes: (g . a) a / |a|^3, a of `front`.
         """
         pairs = self.around.pairs(points, radius)
         slope = plateau_gradient(pairs.apart, radius[pairs.place])
         volumes = self.around.volumes[pairs.cell]
         held = plateau(pairs.distance, radius[pairs.place])[:, None] * self.inertia[pairs.cell]
-        return pairs.sum(volumes[:, None] * (held - np.einsum("nkl,nl->nk", self.sigma[pairs.cell], slope)))
+        force = pairs.sum(volumes[:, None] * (held - np.einsum("nkl,nl->nk", self.sigma[pairs.cell], slope)))
+        if self.polygons is None:
+            return force
+        ahead = self._advance(points, radius, pairs.sum(volumes[:, None] * slope))
+        length = np.linalg.norm(ahead, axis=1)
+        along = np.einsum("nk,nk->n", force, ahead)
+        share = np.divide(along, length**3, out=np.zeros(len(points)), where=length > LEAST * radius)
+        return share[:, None] * ahead
+
+    def _advance(self, points: Values, radius: Values, surface: Values) -> Values:
+        """(n, 3) the crack that an advance of places makes, m; along the body's `surface` where it ends there.
+
+        `surface`: (n, 3) int q n dA of the body, m^2: an advance across it would move the body's own surface. A front
+        that has the surface ahead goes for it.
+        """
+        assert self.polygons is not None
+        pairs = self.around.pairs(points, radius * (1 + 1 / LEAST_DISC))
+        rows = np.flatnonzero(self.split[pairs.cell])
+        place, cell = pairs.place[rows], pairs.cell[rows]
+        ahead = np.zeros((len(points), 3))
+        np.add.at(ahead, place, advance(self.polygons[cell], points[place], radius[place]))
+        size = np.linalg.norm(surface, axis=1)
+        normal = np.divide(
+            surface, size[:, None], out=np.zeros_like(surface), where=size[:, None] > FACED * radius[:, None] ** 2
+        )
+        along = ahead - np.einsum("nk,nk->n", ahead, normal)[:, None] * normal
+        turned = np.einsum("nk,nk->n", along, along) >= np.einsum("nk,nk->n", ahead, ahead) / 2
+        return np.where(turned[:, None], along, ahead)
 
     def averages(self, places: Values, radius: Values) -> tuple[Values, Values]:
-        """Over cells around places that have not come apart: (n, 2, 2) mean stress in Pa, weighted by 1 - r / radius,
+        """Over cells around places that have not come apart: (n, d, d) mean stress in Pa, weighted by 1 - r / radius,
         and (n,) mean square of the positive first principal stress in Pa^2, all alike."""
         pairs = self.around.pairs(places, radius)
         volumes = np.where(self.split[pairs.cell], 0.0, self.around.volumes[pairs.cell])
@@ -68,7 +105,7 @@ class Seen:
         return mean, square
 
     def behind(self, point: Values, radius: Values, beyond: Values) -> tuple[Values, Flags]:
-        """(n, 2) the mean of the split cells nearer than R, and whether there are any from R to R + `beyond`."""
+        """(n, d) the mean of the split cells nearer than R, and whether there are any from R to R + `beyond`."""
         pairs = self.around.pairs(point, radius + beyond)
         split, far = self.split[pairs.cell], pairs.distance >= radius[pairs.place]
         weight = (split & ~far).astype(float)
@@ -80,7 +117,7 @@ class Sight:
     """What makes a `Seen` of the body.
 
     Attributes:
-        centres: (cells, 2) of the cells of this rank, m.
+        centres: (cells, d) of the cells of this rank, m.
         motion: (owned dofs,) velocity in m/s and acceleration in m/s^2; None where nothing moves.
     """
 
@@ -94,29 +131,47 @@ class Sight:
         farthest = float(np.max(disc + beyond, initial=0.0))
         self.around = Around(domain, float(domain.comm.allreduce(farthest, op=MPI.MAX)))
         self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))
+        self._front = Front(domain, graph)
 
-    def look(self, stress: Values, psi: Values, points: Values, others: Values) -> Seen:
-        """What is around the tips at `points` (n, 2), and `others` (m, 2) where cracks may begin (collective)."""
-        graph, count = self._graph, len(stress)
-        rows = np.zeros((count, 12))
+    def places(self, edges: Cells, cut: Values) -> Values:
+        """(..., d) where local edges are cut, m, by their share `cut` (edges,)."""
+        return self._front.places(edges, cut)
+
+    def look(self, stress: Values, psi: Values, points: Values, others: Values, cut: Values) -> Seen:
+        """What is around the tips at `points` (n, d), and `others` (m, d) where cracks may begin (collective).
+
+        `cut`: (edges,) where cracks cut local edges.
+        """
+        graph, count, d = self._graph, len(stress), self._domain.dim
+        rows = np.zeros((count, 2 * d * d + d + 2))
+        tensor, sigma, inertia = np.split(rows[:, :-2], [d * d, 2 * d * d], axis=1)  # views
         cells = self.around.wanted(np.concatenate([points, others]))
-        rows[cells, :4] = tensors(stress[cells], 2).reshape(-1, 4)
-        rows[cells, 10], rows[cells, 11] = graph.split[cells], graph.damaged[cells]
+        tensor[cells] = tensors(stress[cells], d).reshape(-1, d * d)
+        rows[cells, -2], rows[cells, -1] = graph.split[cells], graph.damaged[cells]
         assert self._stress.chi is not None
         cells = self.around.wanted(points)
         cells = cells if self._stress.closes else cells[self._stress.chi.x.array[cells] > 0]
         H = self.gradients(cells, self._stress.u.x.array)
-        sigma = self._eshelby(cells, tensors(stress[cells], 2), psi[cells], H)
+        sigma[cells] = self._eshelby(cells, tensors(stress[cells], d), psi[cells], H).reshape(-1, d * d)
         if self.motion is not None:
-            kinetic, rows[cells, 8:10] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
-            sigma += kinetic[:, None, None] * np.eye(2)
-        rows[cells, 4:8] = sigma.reshape(-1, 4)
+            kinetic, inertia[cells] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
+            sigma[cells] += kinetic[:, None] * np.eye(d).ravel()
         seen = self.around.exchange(rows)
-        stress, sigma = (seen[:, k : k + 4].reshape(-1, 2, 2) for k in (0, 4))
-        return Seen(self.around, stress, sigma, seen[:, 8:10], seen[:, 10] > 0, seen[:, 11] > 0)
+        tensor, sigma, inertia = np.split(seen[:, :-2], [d * d, 2 * d * d], axis=1)
+        tensor, sigma = tensor.reshape(-1, d, d), sigma.reshape(-1, d, d)
+        polygons = self._polygons(points, cut) if d == 3 else None
+        return Seen(self.around, tensor, sigma, inertia, seen[:, -2] > 0, seen[:, -1] > 0, polygons)
+
+    def _polygons(self, points: Values, cut: Values) -> Values:
+        """(near, WIDTH) of the split cells around tips (collective)."""
+        rows = np.zeros((len(self.centres), WIDTH))
+        cells = self.around.wanted(points)
+        cells = cells[self._graph.split[cells]]
+        rows[cells] = self._front.rows(cells, cut)
+        return self.around.exchange(rows)
 
     def _eshelby(self, cells: Ints, stress: Values, psi: Values, H: Values) -> Values:
-        """(n, 2, 2) Pa."""
+        """(n, d, d) Pa."""
         P = first_piola(stress, H, linear=self._stress.energy.linear)
         assert self._stress.chi is not None
         chi = self._stress.chi.x.array[cells]
@@ -130,22 +185,23 @@ class Sight:
         """psi (n,) in J/m^3 and P (n, d, d) in Pa of the broken edges of cells, with `share` of their springs."""
         graph, material = self._graph, self._stress.material
         nodes = self._domain.nodes[self._domain.cell_nodes[cells]]
-        first, second = local_edges(2).T
-        stiff = np.broadcast_to(spring_modulus(material, 2, len(first)), (len(self.centres),))[cells]
+        first, second = local_edges(self._domain.dim).T
+        stiff = np.broadcast_to(spring_modulus(material, self._domain.dim, len(first)), (len(self.centres),))[cells]
         modulus = (share * stiff)[:, None] * ~graph.intact(cells)
         return springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
 
     def _moved(self, cells: Ints, H: Values, v: Values, a: Values) -> tuple[Values, Values]:
-        """(n,) rho v^2 / 2 in J/m^3, and (n, 2) rho (H^T a - (grad v)^T v) in N/m^3, in the middles of cells."""
+        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) in N/m^3, in the middles of cells."""
         nodes, density = self._domain.cell_nodes[cells], self._density[cells]
-        speed, push = (field.reshape(-1, 2)[nodes].mean(axis=1) for field in (v, a))
+        speed, push = (field.reshape(-1, self._domain.dim)[nodes].mean(axis=1) for field in (v, a))
         carried = np.einsum("nik,ni->nk", H, push) - np.einsum("nik,ni->nk", self.gradients(cells, v), speed)
         return density * np.einsum("ni,ni->n", speed, speed) / 2, density[:, None] * carried
 
     def gradients(self, cells: Ints, field: Values) -> Values:
-        """(n, 2, 2) gradients of a field of nodes (nodes * 2,), H_ij = du_i / dX_j of the displacement."""
+        """(n, d, d) gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
         nodes = self._domain.cell_nodes[cells]
-        return np.einsum("nai,naj->nij", field.reshape(-1, 2)[nodes], barycentric_gradients(self._domain.nodes[nodes]))
+        values = field.reshape(-1, self._domain.dim)[nodes]
+        return np.einsum("nai,naj->nij", values, barycentric_gradients(self._domain.nodes[nodes]))
 
 
 def _ratio(pairs: Pairs, values: Values, weight: Values) -> Values:

@@ -1,8 +1,8 @@
 """Which crack tips advance, and where cracks begin: the criterion of a body with a fracture energy G_c (METHOD 12).
 
-A tip advances by a cell where the configurational force over a disc of 5 h reaches G_c, once the crack behind it is as
-long as the disc (mature). Younger tips and whole material go by stress: its average reaches the strength f_t, or, at a
-tip, the mean square over 3 h that of a crack at G_c.
+A tip advances by a cell where the configurational force over a disc of 5 h (a ball of 4 h) reaches G_c, once the crack
+behind it is as long as the disc (mature). Younger tips and whole material go by stress: its average reaches the
+strength f_t, or, at a tip, the mean square over 3 h that of a crack at G_c.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from ...mesh.edges import EdgeGraph
 from ...mesh.ranks import total
 from ...mesh.simplices import local_edges
 from ..brittle.principal import directions, largest, material_normals, tensors, upper_bound
-from ..cracks import ends_in_order
 from ..criterion import Edges
 from ..edge_stress import frobenius_norm
 from ..strength import Strength, hashed
 from .around import local_size
-from .cutting import Cuts, leave, through_centre
+from .cutting import Cuts, cleave, leave, through_centre
 from .seen import Seen, Sight
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-DISC = 5.0  # R over h: the radius of the disc on which a tip's force is summed
+DISC = {2: 5.0, 3: 4.0}  # R over h: the radius of the disc (ball) on which a tip's force is summed
 AVERAGE = 3.0  # radius over h on which stress is averaged
-CELLS = 2.5  # cells that a crack cuts over a length h
+CELLS = {2: 2.5, 3: 5.0}  # passes in which a crack gets on by h
+APART = {2: 5.0, 3: 0.5}  # h between tips that advance at once
 FULL = 1.5  # h beyond R within which there is a split cell once a tip is mature
 # mean square of the first principal stress over a disc of radius rho about a tip, in E' G / rho:
 # sigma_1 = K / sqrt(2 pi r) cos(t/2) (1 + |sin(t/2)|), (1 / 2 pi^2) int cos^2 (1 + |sin|)^2 dt = 0.334
-NEAR_TIP = 0.334
+# and over a ball 3 pi / 8 of that: (3 / 4 rho^3) int rho_z dz rho, rho_z^2 = rho^2 - z^2
+NEAR_TIP = {2: 0.334, 3: 0.334 * 3 * np.pi / 8}
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,10 @@ class Proposal:
     """Cells of this rank that cracks would cut: those of tips, or those where cracks would begin.
 
     Attributes:
-        rank: (n, 6): 0 for a tip and 1 for a new crack, - sigma_1 in Pa, a hash, the place (x, y) and R in m.
-        cells: (n,) local.    stress: (n, 2, 2) averaged, Pa.
-        entry, ahead: (n,) local edge where the crack came in, and (n, 2) whither it goes; None of new cracks.
+        rank: (n, d + 4): 0 for a tip and 1 for a new crack, - sigma_1 in Pa, a hash, the place, and how near no other
+            may be, m.
+        cells: (n,) local.    stress: (n, d, d) averaged, Pa.
+        entry, ahead: (n,) local edge where the crack came in, and (n, d) whither it goes; None of new cracks.
     """
 
     rank: Values
@@ -56,6 +58,11 @@ class Proposal:
     stress: Values
     entry: Ints | None = None
     ahead: Values | None = None
+
+    @property
+    def place(self) -> Values:
+        """(n, d) m."""
+        return self.rank[:, 3:-1]
 
     def taken(self, rows: Flags) -> Proposal:
         """Some of them."""
@@ -80,8 +87,8 @@ class CrackTips:
         domain = self._domain = stress.domain
         self.cut: Values = np.full(len(graph.broken), np.nan) if opened is None else opened.copy()
         self._h = local_size(domain)
-        self._ends = ends_in_order(graph)
-        self.sight = Sight(stress, graph, DISC * self._h, FULL * self._h)
+        self.disc = DISC[domain.dim]
+        self.sight = Sight(stress, graph, self.disc * self._h, FULL * self._h)
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
@@ -91,12 +98,14 @@ class CrackTips:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
         graph = self._graph
         tips = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        weak = np.flatnonzero(~graph.damaged & (frobenius_norm(stress, 2) >= self.strength.weakest)).astype(np.int64)
-        weak = weak[upper_bound(tensors(stress[weak], 2)) >= self.strength.weakest]
+        weak = np.flatnonzero(
+            ~graph.damaged & (frobenius_norm(stress, self._domain.dim) >= self.strength.weakest)
+        ).astype(np.int64)
+        weak = weak[upper_bound(tensors(stress[weak], self._domain.dim)) >= self.strength.weakest]
         if not total(self._domain.comm, len(tips) + len(weak))[0]:
             return np.empty(0, np.int64), np.empty(0)
         entry, point = self._entries(tips)
-        seen = self.sight.look(stress, psi, point, self.sight.centres[weak])
+        seen = self.sight.look(stress, psi, point, self.sight.centres[weak], self.cut)
         edges = self._cut(*self._chosen(self._grown(seen, tips, entry, point), self._begun(seen, weak)))
         return edges, np.ones(len(edges))
 
@@ -118,46 +127,46 @@ class CrackTips:
         mu, lmbda = np.asarray(self._stress.material.mu), np.asarray(self._stress.material.lmbda)
         poisson = lmbda / (2 * (lmbda + mu))
         shear = np.sqrt(mu / np.asarray(self._stress.material.density))
-        return np.asarray(shear * (0.862 + 1.14 * poisson) / (1 + poisson) / (DISC * self._h))  # c_R: Viktorov (1967)
+        return np.asarray(
+            shear * (0.862 + 1.14 * poisson) / (1 + poisson) / (self.disc * self._h)
+        )  # c_R: Viktorov (1967)
 
     def pace(self) -> float:
         """Passes a second in which a tip, cell by cell, keeps up with a Rayleigh wave and no more (collective)."""
         fastest = float(np.max(self.release_rate(), initial=0.0))
-        return CELLS * DISC * float(self._domain.comm.allreduce(fastest, op=MPI.MAX))
+        return CELLS[self._domain.dim] * self.disc * float(self._domain.comm.allreduce(fastest, op=MPI.MAX))
 
     # --- what is active ---
 
     def _entries(self, tips: Ints) -> tuple[Ints, Values]:
-        """(n,) local edge at which the crack came into each tip cell, and (n, 2) where, m."""
-        graph = self._graph
-        entry = np.argmin(graph.intact(tips), axis=1)
-        edges = graph.cell_edges[tips, entry]
-        share = np.where(np.isnan(self.cut[edges]), 0.5, self.cut[edges])
-        ends = self._domain.nodes[self._ends[edges]]
-        return entry, ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
+        """(n,) a local edge at which the crack came into each tip cell, and (n, d) where, m: the mean of all."""
+        broken = ~self._graph.intact(tips)
+        places = self.sight.places(self._graph.cell_edges[tips], self.cut)
+        point = np.einsum("nk,nki->ni", broken, places) / broken.sum(axis=1, keepdims=True)
+        return np.argmax(broken, axis=1), point
 
     def _grown(self, seen: Seen, tips: Ints, entry: Ints, point: Values) -> Proposal:
         """Tips that advance."""
-        h = self._h[tips]
-        radius = DISC * h
+        h, d = self._h[tips], self._domain.dim
+        radius = self.disc * h
         force = seen.forces(point, radius)
         mean, square = seen.averages(point, AVERAGE * h)
         sigma = largest(mean)
         behind, mature = seen.behind(point, radius, FULL * h)
         size = np.linalg.norm(force, axis=1)
         toughness = np.broadcast_to(self.toughness, len(self._h))[tips]
-        strained = np.sqrt(NEAR_TIP * self._modulus[tips] * toughness / (AVERAGE * h))
+        strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips] * toughness / (AVERAGE * h))
         young = (sigma >= self._strength_of(tips)) | (np.sqrt(square) >= strained)
         active = np.flatnonzero(np.where(mature, size >= toughness, young) & (sigma > 0))
         ahead = np.where(mature[:, None], force, point - behind)[active]
-        rank = self._ranked(0, sigma[active], point[active], radius[active])
+        rank = self._ranked(0, sigma[active], point[active], APART[d] * h[active])
         return Proposal(rank, tips[active], mean[active], entry[active], ahead)
 
     def _begun(self, seen: Seen, weak: Ints) -> Proposal:
         """Whole cells, farther than R from any crack, whose averaged stress reaches the strength."""
-        radius = DISC * self._h[weak]
+        radius, d = self.disc * self._h[weak], self._domain.dim
         if not len(weak):
-            return Proposal(np.empty((0, 6)), weak, np.empty((0, 2, 2)))
+            return Proposal(np.empty((0, d + 4)), weak, np.empty((0, d, d)))
         cracked = seen.cracked
         if len(cracked):
             far = cKDTree(cracked).query(self.sight.centres[weak])[0] > radius
@@ -173,11 +182,13 @@ class CrackTips:
         return np.asarray(self.strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
 
     def _normals(self, stress: Values, cells: Ints) -> Values:
-        """(n, 2) unit normals, in the body at rest, of cracks across the first principal stress (n, 2, 2)."""
+        """(n, d) unit normals, in the body at rest, of cracks across the first principal stress (n, d, d)."""
         direction = directions(stress, self.sight.centres[cells], 0)
         if self._stress.energy.linear:
             return direction
-        return material_normals(direction, np.eye(2) + self.sight.gradients(cells, self._stress.u.x.array))
+        return material_normals(
+            direction, np.eye(stress.shape[1]) + self.sight.gradients(cells, self._stress.u.x.array)
+        )
 
     def _torn(self) -> Flags:
         """(edges,) edges of cells, on any rank, that have come apart (collective)."""
@@ -188,11 +199,11 @@ class CrackTips:
     # --- what is chosen, and cut ---
 
     @staticmethod
-    def _ranked(kind: int, sigma: Values, places: Values, radius: Values) -> Values:
-        return np.column_stack([np.full(len(sigma), float(kind)), -sigma, hashed(places), places, radius])
+    def _ranked(kind: int, sigma: Values, places: Values, apart: Values) -> Values:
+        return np.column_stack([np.full(len(sigma), float(kind)), -sigma, hashed(places), places, apart])
 
     def _chosen(self, *proposals: Proposal) -> list[Proposal]:
-        """Those that are the first within R: tips before new cracks, then by sigma_1 (collective)."""
+        """The first of those too near to one another: tips before new cracks, then by sigma_1 (collective)."""
         comm, rank = self._domain.comm, np.concatenate([each.rank for each in proposals])
         parts = comm.allgather(rank)
         every = np.concatenate(parts)
@@ -201,8 +212,8 @@ class CrackTips:
         while left:
             first = left[0]
             keep[first] = True
-            apart = np.linalg.norm(every[left, 3:5] - every[first, 3:5], axis=1)
-            left = [row for row, far in zip(left, apart > every[first, 5], strict=True) if far]
+            apart = np.linalg.norm(every[left, 3:-1] - every[first, 3:-1], axis=1)
+            left = [row for row, far in zip(left, apart > every[first, -1], strict=True) if far]
         start = sum(len(part) for part in parts[: comm.rank])
         own = np.split(keep[start : start + len(rank)], np.cumsum([len(each.rank) for each in proposals])[:-1])
         self._idle = not keep.any()
@@ -213,8 +224,9 @@ class CrackTips:
         if self._idle:
             return np.empty(0, np.int64)
         graph = self._graph
-        grows, begins = self._rows(grown.cells, self._way_out(grown)), self._rows(begun.cells, self._through(begun))
+        grows, begins = self._rows(grown, self._way_out(grown)), self._rows(begun, self._through(begun))
         every = np.concatenate(self._domain.comm.allgather(np.concatenate([grows, begins])))
+        every = every[np.lexsort(every[:, 5:2:-1].T)]  # neighbours cut the same edge where the first of them does
         keys, first = np.unique(every[:, :2].astype(np.int64), axis=0, return_index=True)
         local, place = graph.find_keys(keys)
         new = ~graph.broken[local]
@@ -224,9 +236,11 @@ class CrackTips:
     def _way_out(self, grown: Proposal) -> Cuts:
         """Where the cells of tips are left (collective)."""
         assert grown.entry is not None and grown.ahead is not None
+        corners, normals = self._corners(grown.cells), self._normals(grown.stress, grown.cells)
+        if self._domain.dim == 3:
+            return cleave(corners, ~self._graph.intact(grown.cells), grown.place, normals)
         torn = self._torn()[self._graph.cell_edges[grown.cells]]
-        normals = self._normals(grown.stress, grown.cells)
-        return leave(self._corners(grown.cells), grown.entry, grown.rank[:, 3:5], normals, grown.ahead, torn)
+        return leave(corners, grown.entry, grown.place, normals, grown.ahead, torn)
 
     def _through(self, begun: Proposal) -> Cuts:
         return through_centre(self._corners(begun.cells), self._normals(begun.stress, begun.cells))
@@ -234,9 +248,11 @@ class CrackTips:
     def _corners(self, cells: Ints) -> Values:
         return self._domain.nodes[self._domain.cell_nodes[cells]]
 
-    def _rows(self, cells: Ints, cuts: Cuts) -> Values:
-        """(n, 3) key of each edge that is cut and where, from the end that comes first in the input mesh."""
-        cells = cells[cuts.row]
-        ends = self._domain.node_input[self._domain.cell_nodes[cells[:, None], local_edges(2)[cuts.edge]]]
+    def _rows(self, cracks: Proposal, cuts: Cuts) -> Values:
+        """(n, 6) key of each edge that is cut, where, from the end that comes first in the input mesh, and its rank."""
+        cells = cracks.cells[cuts.row]
+        ends = self._domain.node_input[
+            self._domain.cell_nodes[cells[:, None], local_edges(self._domain.dim)[cuts.edge]]
+        ]
         share = np.where(ends[:, 0] > ends[:, 1], 1 - cuts.share, cuts.share)
-        return np.column_stack([np.sort(ends, axis=1), share])
+        return np.column_stack([np.sort(ends, axis=1), share, cracks.rank[cuts.row, :3]])
