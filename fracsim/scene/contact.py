@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -64,19 +67,24 @@ def explicit_obstacles_of(
     """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
     from ..mechanics.contact.explicit_obstacles import ExplicitObstacles
     from ..mechanics.contact.penalty import Penalty
-    from ..stepping.frequencies import cell_frequencies
 
     entries = obstacle_entries(study, domain.dim)
     contact = study.contact or Contact()
-    law = _law(contact, domain, stress.material, Penalty)
-    most = np.inf
-    if contact.stiffness is None:
-        most = ADDED * domain.comm.allreduce(float(np.max(cell_frequencies(stress), initial=0.0)), op=MPI.MAX)
+    law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
     if not any(each.free for each in study.obstacle):
         return ExplicitObstacles(domain, u, entries, law, mass, most)
     from ..mechanics.contact.explicit_free import ExplicitFreeObstacles
 
     return ExplicitFreeObstacles(domain, u, entries, law, mass, most)
+
+
+def _most_added(contact: Contact, domain: Domain, stress: Stress) -> float:
+    """What a penalty may add to the square of the highest frequency, 1/s^2 (collective)."""
+    from ..stepping.frequencies import cell_frequencies
+
+    if contact.stiffness is not None:
+        return float("inf")
+    return float(ADDED * domain.comm.allreduce(float(np.max(cell_frequencies(stress), initial=0.0)), op=MPI.MAX))
 
 
 def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
@@ -108,17 +116,38 @@ def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
 
 def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
     """The term of a body that touches itself (collective). InputError without ipctk."""
+    itself = _by_ipctk("itself")
+    return _self_contact(contact, domain, material, DISTANCE_ITSELF, partial(itself.SelfContact, domain, u))
+
+
+def explicit_self_contact_of(contact: Contact, domain: Domain, u: fem.Function, stress: Stress, mass: Values) -> Term:
+    """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
+    most, itself = _most_added(contact, domain, stress), _by_ipctk("explicit_itself")
+    made = partial(itself.ExplicitSelfContact, domain, u, mass=mass, most=most)
+    return _self_contact(contact, domain, stress.material, DISTANCE, made)
+
+
+def _by_ipctk(name: str) -> Any:
+    """A module of contact that imports ipctk."""
     try:
-        from ..mechanics.contact import crowd, itself
+        return import_module(f"..mechanics.contact.{name}", __package__)
     except ImportError:
         raise InputError(
             "[contact] needs ipctk, which this environment lacks: pip install fracsim[contact], or itself = false"
         ) from None
-    distance = contact.distance or DISTANCE_ITSELF * domain.mean_edge
+
+
+def _self_contact(
+    contact: Contact, domain: Domain, material: MaterialFields, share: float, made: Callable[[Any], Any]
+) -> Term:
+    """A term that begins at this `share` of an edge, `made` for a law."""
+    from ..mechanics.contact import crowd
+
+    distance = contact.distance or share * domain.mean_edge
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
     law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, contact.itself == "pieces")
-    term = itself.SelfContact(domain, u, law)
+    term = made(law)
     if (gap := term.least_gap()) == np.inf:
         return term
     term.destroy()  # thin walls would push each other apart from the start
@@ -127,7 +156,7 @@ def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material:
             f"contact.distance = {distance:g} m is more than what lies between parts of the body at rest, {gap:.3g} m; "
             f"give at most {0.5 * gap:.2g}, or leave it out"
         )
-    return itself.SelfContact(domain, u, replace(law, distance=0.5 * gap))
+    return made(replace(law, distance=0.5 * gap))
 
 
 def obstacle_entries(study: Study, dim: int) -> list[Obstacle]:

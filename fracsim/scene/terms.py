@@ -107,8 +107,10 @@ def _solids(parts: Parts) -> Term | None:
 def _contact(parts: Parts) -> Term | None:
     if parts.study.contact is None or not parts.study.contact.itself:
         return None
-    from .contact import self_contact_of
+    from .contact import explicit_self_contact_of, self_contact_of
 
+    if not parts.scheme.implicit:
+        return explicit_self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress, parts.mass.lumped)
     return self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress.material)
 
 

@@ -185,10 +185,10 @@ class Study(Table):
     def _contact_fits_the_scheme(self) -> Study:
         scheme = f'time.scheme = "{self.time.scheme}"'
         if self.contact is not None and not self.time.kind.implicit:
-            if self.contact.itself:
+            if self.contact.itself and self.contact.friction:
                 raise ValueError(
-                    f"[contact] of the body with itself needs an implicit scheme, not {scheme}; choose "
-                    '"backward-euler", or contact.itself = false for obstacles alone'
+                    f"contact.friction of the body with itself needs an implicit scheme, not {scheme}; choose "
+                    '"backward-euler", or leave it out'
                 )
             if self.contact.creep is not None:
                 raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")

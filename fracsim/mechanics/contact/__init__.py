@@ -45,6 +45,7 @@ near, slip        which elements are near each other; friction between them
 room, crowd       walls that come to light where there is no room: before obstacles; before the body itself
 recede            new walls of a crack, drawn back so that nothing acts as they come to light
 crossings         elements that cut each other
+explicit_itself   the term in explicit steps; pushing: a penalty on points before facets
 
 solids            obstacles whose surface is read from a file, by the same
 

@@ -62,9 +62,11 @@ class Surface:
     Attributes:
         made: the surface.    at: where its points are, new walls drawn back.    pairs: what may touch.
         gap: between the sides of a new crack, in distances of the barrier.
+        close: pressure, in stiffnesses, of walls as good as closed.
     """
 
     gap: ClassVar[float] = GAP
+    close: ClassVar[float] = NEAR
 
     def __init__(
         self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
@@ -124,8 +126,8 @@ class Surface:
 
     # --- what is crowded ---
 
-    def _identity(self) -> Values:
-        return identity(self.made, self.at.copies, np.arange(self._nodes), self._size)
+    def _identity(self, points: Ints | None = None) -> Values:
+        return identity(self.made, self.at.copies if points is None else points, np.arange(self._nodes), self._size)
 
     def _known(self, before: Surface, u: Values) -> tuple[Values, Values]:
         """(n,) shares and pressures, Pa, that points had before; of new ones 1 and 0. Nodes have kept their numbers."""
@@ -169,7 +171,7 @@ class Surface:
         start = self.at.share
         while self._shorten(u, self._pressed(u, load)) or self._shorten(u, cut := self._cutting(u)):
             pass
-        crowded = np.union1d(self._pressed(u, np.maximum(load, NEAR * self._how["stiffness"])), cut)
+        crowded = np.union1d(self._pressed(u, np.maximum(load, self.close * self._how["stiffness"])), cut)
         self._leave_out(crowded)
         if len(crowded):  # what is out is to come back as it was, not smaller each time
             gone = np.ones(len(start), bool)

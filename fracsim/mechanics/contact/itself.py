@@ -56,8 +56,8 @@ class SelfContact(Term):
         pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
 
         def made() -> Surface:
-            assert self._skeleton is not None and pattern is not None and u is not None
-            return Surface(self._skeleton, pattern, self.law, u, self._surface)
+            assert pattern is not None and u is not None
+            return self._made(pattern, u)
 
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
@@ -65,6 +65,11 @@ class SelfContact(Term):
         self._tangent_at: Values | None = None
         self._rubbing: Friction | None = None
         self._moved = True
+
+    def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
+        """On rank 0."""
+        assert self._skeleton is not None
+        return Surface(self._skeleton, pattern, self.law, u, self._surface)
 
     def _gathered(self, u: Values) -> Values | None:
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""

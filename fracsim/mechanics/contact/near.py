@@ -52,12 +52,16 @@ class Near:
     def touching(self, x: Values) -> list[tuple[Kind, ipctk.NormalCollisions]]:
         """The pairs of each kind on which its barrier acts; those of the last x are kept."""
         if not np.array_equal(x, self._found_at):
-            if not self._holds(x):
-                self._look(x, x)
-            each = zip(self._kinds, self._candidates, strict=True)
+            each = zip(self._kinds, self.candidates(x), strict=True)
             self._found = [(kind, kind.touching(candidates, self._mesh, x)) for kind, candidates in each]
             self._found_at = x.copy()
         return self._found
+
+    def candidates(self, x: Values) -> list[ipctk.Candidates]:
+        """Of each kind; the same ones while they hold."""
+        if not self._holds(x):
+            self._look(x, x)
+        return self._candidates
 
     def free(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the way from x to `to` on which nothing meets: KEPT of each gap is left."""

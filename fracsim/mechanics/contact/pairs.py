@@ -59,7 +59,7 @@ class Pairs:
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction = friction
-        self._area = _areas(rest, elements)
+        self._area = areas(rest, elements)
 
     # --- the barrier ---
 
@@ -141,7 +141,7 @@ class Pairs:
         return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
 
 
-def _areas(x: Values, elements: Ints) -> Values:
+def areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
     side, d = x[elements[:, 1:]] - x[elements[:, :1]], x.shape[1]
     spanned = side[:, 0] if d == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])

@@ -39,13 +39,13 @@ def receded(made: Split, gap: float) -> Values:
 def _least_cosine(made: Split, outward: Values) -> Values:
     """(n,) the least cosine between `outward` (n, d) and the normals of the crack's walls at each point; inf: none."""
     corners = made.elements[made.origin == CRACK]
-    cosine = np.einsum("ekj,ej->ek", outward[corners], _normals(made.points[corners]))
+    cosine = np.einsum("ekj,ej->ek", outward[corners], normals(made.points[corners]))
     least = np.full(len(outward), np.inf)
     np.minimum.at(least, corners, cosine)
     return least
 
 
-def _normals(corners: Values) -> Values:
+def normals(corners: Values) -> Values:
     """(m, d) unit normals, outwards, of segments or triangles (m, d, d)."""
     side = corners[:, 1:] - corners[:, :1]
     normal = np.cross(side[:, 0], side[:, 1]) if side.shape[1] == 2 else side[:, 0, ::-1] * [1.0, -1.0]

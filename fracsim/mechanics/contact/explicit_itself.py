@@ -1,0 +1,136 @@
+"""Contact of a body with itself, and of its pieces, in explicit steps: the same term with a penalty (pushing).
+
+k_p = kappa A_p / (2 D), but no more than what leaves the stable step as it is (pushing.rates); what points that are
+near each other add to the square of the highest frequency sets the step.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, cast
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ...mesh.domain import Domain
+from ...mesh.ranks import from_root, on_root
+from ...mesh.split.identity import found_again
+from ...mesh.split.skeleton import Skeleton
+from .crowd import Law, Surface
+from .itself import SelfContact
+from .pairs import areas
+from .pushing import NONE, Pushing, rates
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Pushes(Surface):
+    """The surface of a body that a penalty keeps apart (rank 0)."""
+
+    pairs: Pushing
+    close: ClassVar[float] = 0.0  # what presses at all has no room
+
+    def __init__(
+        self,
+        skeleton: Skeleton,
+        pattern: npt.NDArray[np.uint8],
+        law: Law,
+        u: Values,
+        before: Pushes | None,
+        mass: Values,
+        most: float,
+    ) -> None:
+        """`mass`: (nodes,) kg; `most`: 1/s^2 (pushing.rates); the others as for Surface."""
+        self._law, self.mass, self._most, self._earlier = law, mass, most, before
+        self._rates: Values | None = None
+        super().__init__(skeleton, pattern, law, u, before)
+        self._earlier = None
+
+    def _pairs_of(self, elements: Ints) -> Pushing:
+        if self._rates is None:  # by all elements, and whole arms: they stay as they are while a surface lasts
+            pressure, area = self._law.stiffness / self._law.distance, areas(self._rest, self.made.elements)
+            self._rates = rates(self.at.weights, area, self.mass, pressure, self._most)
+        pairs = Pushing(self._rest, elements, self._rates, distance=self._law.distance)
+        if (last := getattr(self, "pairs", None)) is not None:
+            pairs.by, pairs.held = last.by, last.held
+        elif self._earlier is not None:
+            pairs.by, pairs.held = self._pushed_before(self._earlier, self._rates)
+        return pairs
+
+    def _pushed_before(self, before: Pushes, most: Values) -> tuple[Ints, Values]:
+        """What is pushed still is, and no harder: corners (n, d) and k_p (n,) of `before` for the points of now."""
+        old, new, pairs = before.at.copies, self.at.copies, before.pairs
+        nodes = min(old.min(initial=len(pairs.by)), new.min(initial=len(most)))  # have kept their numbers
+        now = np.full(len(pairs.by), NONE)
+        now[:nodes] = np.arange(nodes)
+        again = found_again(before._identity(), self._identity())
+        now[old[again >= 0]] = new[again[again >= 0]]
+        held, by = np.zeros(len(most)), np.full((len(most), pairs.by.shape[1]), NONE)
+        which = np.flatnonzero((now >= 0) & (pairs.held > 0))
+        corners = pairs.by[which]
+        by[now[which]], held[now[which]] = np.where(corners >= 0, now[corners], NONE), pairs.held[which]
+        return by, np.minimum(held, most)
+
+
+class ExplicitSelfContact(SelfContact):
+    """A body that explicit steps keep apart from itself."""
+
+    _surface: Pushes | None
+
+    def __init__(self, domain: Domain, u: fem.Function, law: Law, mass: Values, most: float) -> None:
+        """`mass`: (owned dofs,) lumped, kg; `most`: what contact may add to the square of the highest frequency, 1/s^2.
+
+        InputError where the surface at rest cuts itself (collective).
+        """
+        gathered = domain.gather_nodes(mass.reshape(-1, domain.dim))
+        self._mass, self._most = None if gathered is None else gathered[:, 0].copy(), most
+        super().__init__(domain, u, law)
+
+    def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
+        assert self._skeleton is not None and self._mass is not None
+        return Pushes(self._skeleton, pattern, self.law, u, self._surface, self._mass, self._most)
+
+    def frequency(self) -> float:
+        """What contact adds at most, were all points in touch that are near, 1/s^2 (collective)."""
+        x = self._places()
+
+        def found() -> float:
+            assert self._surface is not None and x is not None
+            return self._surface.pairs.fastest(x, self._surface.at.weights, self._surface.mass)
+
+        return from_root(self.comm, found)
+
+    def arrive(self) -> None:
+        """The step is over: what is pushed is known from here on (collective)."""
+        x = self._places()
+
+        def noted() -> None:
+            assert self._surface is not None and x is not None
+            self._surface.pairs.arrive(x)
+
+        on_root(self.comm, noted)
+
+    def memory(self) -> object:
+        """With what is pushed."""
+        return super().memory(), self._surface and (self._surface.pairs.by, self._surface.pairs.held)
+
+    def recall(self, memory: object) -> None:
+        """Be again what `memory` gave of this surface (not collective)."""
+        surface, pushed = cast("tuple[object, tuple[Ints, Values] | None]", memory)
+        super().recall(surface)
+        if self._surface is not None and pushed is not None:
+            self._surface.pairs.by, self._surface.pairs.held = pushed
+
+    def saved(self) -> dict[str, Values]:
+        """With the facets that push points."""
+        if self._surface is None:
+            return super().saved() | {"by": np.empty((0, 0)), "held": np.empty(0)}
+        pairs = self._surface.pairs
+        return super().saved() | {"by": pairs.by.astype(float), "held": pairs.held}
+
+    def restore(self, saved: dict[str, Values]) -> None:
+        """Be again what `saved` gave."""
+        super().restore(saved)
+        if self._surface is not None and "by" in saved:
+            self._surface.pairs.by, self._surface.pairs.held = saved["by"].astype(np.int64), saved["held"]

@@ -1,0 +1,190 @@
+"""What pushes a surface apart from itself in explicit steps: a penalty on points before facets, on one rank.
+
+    E(x) = sum over points p of  k_p (D - g_p)^2 / 2    where g_p < D
+
+g_p the distance, m, to that facet of the surface which is nearest among those that p is before, outwards; D the gap
+from which on it acts. A point that was pushed as the last step ended may lie behind the facet that pushed it, or one
+beside that: g_p < 0. All others behind a facet are on the far side of what they belong to. Facets that a point is a
+corner of do not push it, nor do edges push one another.
+
+k_p is what the point takes as it comes to be pushed, or a corner of the facet before it if that takes less, and stays
+so while it is pushed. With l the shares of the place on the facet and n its direction, dE/dx_p = -k (D - g) n and
+dE/dx_c = k l_c (D - g) n: forces sum to nothing, and their moments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ipctk
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+
+from .near import Kind, Near
+from .pairs import Pairs
+from .recede import normals
+from .shares import least_over_shares
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+DEEPEST = 3.0  # distances D: what is deeper has gone through
+MARGIN = 1.0  # distances D: how far points may go before candidates are looked for again
+ALIKE = 1e-9  # of the mean edge: distances to the same place, by several facets
+LITTLE = 1e-3  # share of a corner that takes nothing worth speaking of
+AHEAD = 2.0  # distances D: gaps of points that may be pushed a step later
+NONE = -1  # corners of facets that push nothing
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """Points (k,) that are before facets, corners (k, d), with shares (k, d) of the places there, signed gaps (k,), m,
+    normals (k, d) and k_p (k,), N/m."""
+
+    points: Ints
+    corners: Ints
+    share: Values
+    gap: Values
+    normal: Values
+    rate: Values
+
+    def some(self, which: npt.NDArray[np.bool_]) -> Pushed:
+        """Some of them."""
+        places = self.points[which], self.corners[which], self.share[which]
+        return Pushed(*places, self.gap[which], self.normal[which], self.rate[which])
+
+
+class Pushing(Pairs):
+    """A penalty between the points and facets of a surface.
+
+    Attributes:
+        by: (n, d) corners of the facets that pushed points as the last step ended, or NONE.
+        held: (n,) k_p of these, N/m; 0 of others.
+    """
+
+    def __init__(self, rest: Values, elements: Ints, rate: Values, *, distance: float) -> None:
+        """`rate`: (n,) k_p, N/m; the others as for Pairs."""
+        super().__init__(rest, elements, distance=distance, stiffness=1.0)
+        self.by: Ints = np.full((len(rest), rest.shape[1]), NONE, np.int64)
+        self.held: Values = np.zeros(len(rest))
+        self._rate, self._width, self._elements = rate, distance, elements
+        self._used = np.unique(elements)  # ipctk's points
+        self._candidates: Ints = np.empty((0, 2), np.int64)
+        kind = Kind(ipctk.BarrierPotential(distance, 1.0, True), "ee_candidates")
+        self._near = Near(self._mesh, [kind], max(AHEAD, DEEPEST) * distance, MARGIN * distance)
+        self._found: ipctk.Candidates | None = None  # that these are of
+        self._last: tuple[Values, Ints, Pushed] | None = None
+
+    def energy(self, x: Values) -> float:
+        """E(x), J."""
+        met = self._met(x)
+        return 0.5 * float(met.rate @ (self._width - met.gap) ** 2)
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) dE/dx, N: the force on the points is its negative."""
+        met, found = self._met(x), np.zeros_like(x)
+        force = (met.rate * (self._width - met.gap))[:, None] * met.normal
+        np.add.at(found, met.points, -force)
+        np.add.at(found, met.corners, met.share[:, :, None] * force[:, None])
+        return found
+
+    def least_gap(self, x: Values) -> float:
+        """The least gap that is below D, m; infinite where there is none."""
+        return float(self._met(x).gap.min(initial=np.inf))
+
+    def arrive(self, x: Values) -> None:
+        """A step is over with points at x (n, d)."""
+        met = self._met(x)
+        self.by = np.full_like(self.by, NONE)
+        self.by[met.points] = met.corners
+        self.held = np.zeros(len(x))
+        self.held[met.points] = met.rate
+
+    def fastest(self, x: Values, weights: csr_matrix, mass: Values) -> float:
+        """What it adds at most to the square of a frequency (carried), 1/s^2, with points near x (n, d) that follow
+        nodes of `mass` (nodes,), kg, by `weights` (n, nodes)."""
+        near = self._before(x, AHEAD * self._width)
+        k, d = near.corners.shape
+        if not k:
+            return 0.0
+        rows = np.repeat(np.arange(k), d)
+        of_facets = csr_matrix((near.share.reshape(-1), (rows, near.corners.reshape(-1))), shape=(k, len(x)))
+        size = abs(weights[near.points] - of_facets @ weights)
+        load = size.T @ (near.rate * np.asarray(size.sum(axis=1)).ravel())
+        return float((load / mass).max(initial=0.0))
+
+    def _met(self, x: Values) -> Pushed:
+        """What is pushed; that of the last x is kept."""
+        if self._last is None or self._last[1] is not self.by or not np.array_equal(x, self._last[0]):
+            self._last = x.copy(), self.by, self._before(x, self._width)
+        return self._last[2]
+
+    def _before(self, x: Values, reach: float) -> Pushed:
+        """The nearest facet of each point that has one within `reach`, m."""
+        every = self._facing(x, reach)
+        known = self.by[every.points]
+        again = (known[:, :, None] == every.corners[:, None]).any(axis=(1, 2))
+        some = every.some((every.gap > 0) | again)
+        order = np.lexsort((abs(some.gap), some.points))
+        which = np.zeros(len(order), bool)
+        which[order[np.unique(some.points[order], return_index=True)[1]]] = True
+        return some.some(which & (some.gap < reach))
+
+    def _facing(self, x: Values, reach: float) -> Pushed:
+        """Points before facets, or behind, one facet for each place: of those that share it the one that looks most
+        towards the point, or away."""
+        points, facets = self._may_meet(x).T
+        corners = self._elements[facets]
+        at, d = x[corners], x.shape[1]
+        arms = at - x[points][:, None]
+        middle = np.full((len(points), d), 1 / d)
+        away = np.einsum("kcd,kc->kd", arms, middle)
+        share = least_over_shares(arms @ arms.transpose(0, 2, 1), np.einsum("kcd,kd->kc", arms, away), middle)
+        way = -np.einsum("kcd,kc->kd", arms, share)
+        distance = np.linalg.norm(way, axis=1)
+        close = np.flatnonzero(distance < max(reach, DEEPEST * self._width))
+        normal = normals(at[close])
+        along = np.einsum("kd,kd->k", way[close], normal)
+        order = np.lexsort((distance[close], points[close]))
+        point, far = points[close][order], distance[close][order]
+        group = np.cumsum(np.r_[False, (np.diff(point) > 0) | (np.diff(far) > ALIKE * self._edge)][: len(order)])
+        best = order[np.lexsort((-abs(along[order]), group))]
+        which = best[np.unique(group, return_index=True)[1]]
+        sign, far = np.where(along[which] < 0, -1.0, 1.0), distance[close][which]
+        clear = far > ALIKE * self._edge
+        ways = sign[:, None] * way[close][which] / np.where(clear, far, 1.0)[:, None]
+        ways = np.where(clear[:, None], ways, normal[which])
+        which_pairs = close[which]
+        rate = self._rates_of(points[which_pairs], corners[which_pairs], share[which_pairs])
+        return Pushed(points[which_pairs], corners[which_pairs], share[which_pairs], sign * far, ways, rate)
+
+    def _rates_of(self, points: Ints, corners: Ints, share: Values) -> Values:
+        """(k,) k_p: no more than a corner of the facet takes; while a point is pushed it stays as it was."""
+        takes = (self._rate[corners] / np.maximum(share, LITTLE)).min(axis=1, initial=np.inf)
+        held = self.held[points]
+        return np.where(held > 0, held, np.minimum(self._rate[points], takes))
+
+    def _may_meet(self, x: Values) -> Ints:
+        """(k, 2) points and facets that may be as near, or as deep, as counts."""
+        (found,) = self._near.candidates(self._mesh.vertices(x))
+        if found is not self._found:
+            solid = x.shape[1] == 3
+            ids = [(each.vertex_id, each.face_id) for each in found.fv_candidates] if solid else \
+                  [(each.vertex_id, each.edge_id) for each in found.ev_candidates]  # fmt: skip
+            pairs = np.array(ids, np.int64).reshape(-1, 2)
+            self._found, self._candidates = found, np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
+        return self._candidates
+
+
+def rates(weights: csr_matrix, area: Values, mass: Values, pressure: float, most: float) -> Values:
+    """(n,) k_p, N/m: `pressure` (Pa/m) on half the area of each point, as the other side pushes too, but no more than
+    what adds `most` (1/s^2) to the square of a frequency where each node is met by as many points as it carries."""
+    size = abs(weights)
+    spread = np.asarray(size.sum(axis=1)).ravel()
+    rate = (size.T @ (area * spread)) / mass
+    held = size.tocoo()
+    fastest = np.zeros(len(area))
+    np.maximum.at(fastest, held.row, np.where(held.data > 0, rate[held.col], 0.0))
+    own = np.where(fastest > 0, area / np.where(fastest > 0, fastest, 1.0), 0.0)
+    return np.minimum(0.5 * pressure * area, 0.25 * most * own)

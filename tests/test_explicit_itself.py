@@ -1,0 +1,179 @@
+"""A body that touches itself in explicit steps: against differences, dense matrices and conservation laws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.sparse import eye
+
+from fracsim.mechanics.contact.explicit_itself import ExplicitSelfContact, Pushes
+from fracsim.mechanics.contact.pushing import Pushing, rates
+from fracsim.scene import Scene
+from support.resumed import assert_alike, going_stopped_resumed
+from support.scenes import each_step, make_scene, march, positions
+from support.torn import RUNS
+from test_itself import SOFT, two_blocks
+
+Values = npt.NDArray[np.float64]
+
+
+def contact_of(scene: Scene) -> tuple[ExplicitSelfContact, Pushes]:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, ExplicitSelfContact)]
+    assert found._surface is not None
+    return found, found._surface
+
+
+def pushed(dim: int) -> tuple[Pushing, Values]:
+    """A rough sheet over another one, turned outwards, some points of it through: nearer than 0.1 or 0.05 deep."""
+    rng, n = np.random.default_rng(3), 5
+    grid = np.stack(np.meshgrid(*[np.arange(n) / (n - 1)] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
+    rise = 0.03 * rng.normal(size=(2, len(grid)))
+    low, high = np.c_[grid, rise[0]], np.c_[0.9 * grid + 0.03, rise[1]]
+    number = np.arange(len(grid)).reshape((n,) * (dim - 1))
+    if dim == 2:
+        up = np.stack([number[1:], number[:-1]], axis=1)
+    else:
+        a, b, c, d = (each.ravel() for each in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+        up = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    elements = np.concatenate([up, up[:, ::-1] + len(grid)])
+    x, offset = np.concatenate([low, high]), np.zeros(dim)
+    offset[-1] = 0.09
+    pairs = Pushing(x, elements, rng.uniform(1.0, 2.0, size=len(x)), distance=0.12)
+    x[len(grid) :] += offset
+    pairs.arrive(x)
+    x[len(grid) :] -= 0.06 / 0.09 * offset
+    pairs.arrive(x)
+    return pairs, x
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_forces_are_a_derivative_and_sum_to_nothing(dim: int) -> None:
+    """Of points before facets and of some that are through: against differences; force and moment vanish."""
+    pairs, x = pushed(dim)
+    met, gradient, h = pairs._met(x), pairs.gradient(x), 1e-7
+    assert (met.gap < 0).sum() > 1 and (met.gap > 0).sum() > 3
+    assert ((met.share > 0).all(axis=1)).any()
+    way = np.random.default_rng(1).normal(size=(6, *x.shape))
+    for each in way:
+        slope = (pairs.energy(x + h * each) - pairs.energy(x - h * each)) / (2 * h)
+        assert np.vdot(gradient, each) == pytest.approx(slope, abs=1e-5 * np.linalg.norm(gradient))
+    size = np.linalg.norm(gradient)
+    np.testing.assert_allclose(gradient.sum(axis=0), 0.0, atol=1e-13 * size)
+    moment = np.cross(x, gradient) if dim == 3 else x[:, 0] * gradient[:, 1] - x[:, 1] * gradient[:, 0]
+    np.testing.assert_allclose(moment.sum(axis=0), 0.0, atol=1e-13 * size)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_it_is_no_faster_than_said(dim: int) -> None:
+    """omega^2 of M^-1 times the stiffness along the normals, dense; and with k_p that bodies of the same mesh on both
+    sides have, no more than was asked for."""
+    pairs, x = pushed(dim)
+    n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs._met(x)
+    K = np.zeros((n * dim, n * dim))
+    for p, corners, share, normal, rate in zip(met.points, met.corners, met.share, met.normal, met.rate, strict=True):
+        row = np.zeros((n, dim))
+        row[p] = normal
+        row[corners] -= share[:, None] * normal
+        K += rate * np.outer(row.reshape(-1), row.reshape(-1))
+    m = np.repeat(mass, dim)
+    fastest = float(np.linalg.eigvalsh(K / np.sqrt(m[:, None] * m)).max())
+    bound = pairs.fastest(x, eye(n, format="csr"), mass)
+    assert 0.3 * bound < fastest <= bound
+    own = rates(eye(n, format="csr"), np.ones(n), mass, np.inf, 4.0)
+    np.testing.assert_allclose(own, mass, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
+    """Thrown at each other at a twentieth of the speed of sound: momentum to round-off, energy to 2 %; nodes are within
+    each other by less than a thirtieth of an edge, and steps are 0.75 of what they were before they met."""
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, dim, 0.03)}, material=SOFT, contact={},
+        time={"scheme": "explicit", "step": 0.02, "end": 0.32},
+    )  # fmt: skip
+    contact, surface = contact_of(scene)
+    X, m = positions(scene), scene.balance.mass.lumped.reshape(-1, dim)
+    v = np.zeros_like(X)
+    v[X[:, 0] < 1.01, 0] = 0.5
+    state.v = v.reshape(-1)
+    state.settle()
+    before, touched, steps = (m * v).sum(axis=0), 0, []
+    for report in each_step(scene, state):
+        steps.append(report.dt)
+        assert report.kinetic + report.elastic == pytest.approx(0.25 * before[0], rel=0.02)
+        after = (m * state.v.reshape(-1, dim)).sum(axis=0)
+        np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
+        x = contact._places()
+        assert x is not None
+        touched += contact.stored() > 0
+        assert surface.pairs._met(x).gap.min(initial=1.0) > -0.01
+    right = X[:, 0] > 1.01
+    assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
+    assert min(steps) > 0.75 * max(steps)
+
+
+def test_a_cracked_column_carries_its_upper_half() -> None:
+    """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
+    reads nothing. So it is with contact between pieces alone."""
+    carried = []
+    for contact in ({"contact": {}}, {}, {"contact": {"itself": "pieces"}}):
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [0.5, 1.0], "h": 0.25}, material=SOFT, fracture={"strength": 1e9},
+            boundary=[{"on": "bottom", "fix": "xy"},
+                      {"on": "top", "displacement": {"time": [0.0, 0.5], "value": [[0.0, 0.0], [0.0, -0.08]]}}],
+            probe=[{"name": "base", "on": "bottom"}], damping={"mass": 20.0},
+            time={"scheme": "explicit", "step": 0.02, "end": 1.0}, **contact,
+        )  # fmt: skip
+        graph = scene.fracture.graph
+        y = scene.domain.nodes[graph.edge_nodes][:, :, 1]
+        graph.break_edges((y.min(axis=1) < 0.45) & (y.max(axis=1) > 0.45))
+        scene.fracture.restored()
+        scene.balance.damage_changed()
+        scene.balance.edges_broke(graph.pattern)
+        if contact:
+            assert contact_of(scene)[0].stored() == 0
+        state.remember()
+        march(scene, state)
+        carried.append(scene.probes()[1])
+    # 0.08 m less the gap of the crack over a column of 1 m: E A strain, about
+    assert 0.3 * 1e4 * 0.5 * 0.08 < carried[0] < 1.2 * 1e4 * 0.5 * 0.08 / (1 - 0.3**2)
+    assert abs(carried[1]) < 1e-2 * carried[0]
+    assert abs(carried[2] - carried[0]) < 0.02 * carried[0]
+
+
+def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
+    """Edges of two blocks that press each other break: no more is stored than before, and points that were pushed are
+    pushed on."""
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, 2, 0.03)}, material=SOFT, contact={}, fracture={"strength": 1e9},
+        time={"scheme": "explicit", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    contact, surface = contact_of(scene)
+    v = np.zeros_like(X := positions(scene))
+    v[X[:, 0] < 1.01, 0] = 0.5
+    state.v = v.reshape(-1)
+    state.settle()
+    while contact.stored() < 0.5:
+        march(scene, state, 1)
+    before, graph, nodes = contact.stored(), scene.fracture.graph, np.flatnonzero(surface.pairs.by[:, 0] >= 0)
+    graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
+    scene.fracture.changed()
+    scene.balance.edges_broke(graph.pattern)
+    _, again = contact_of(scene)
+    assert again is not surface and len(again.made.points) > len(surface.made.points)
+    assert (again.pairs.by[np.intersect1d(nodes, np.arange(len(X)))] >= 0).any()
+    assert 0.1 * before < contact.stored() <= before * (1 + 1e-6)
+
+
+@pytest.mark.slow
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """A plate that is crushed and breaks, its pieces in touch: stopped and resumed, the same but for round-off."""
+    time = {"scheme": "explicit", "step": 0.05, "end": 1.0}
+    tables: dict[str, Any] = RUNS["rammed"] | {"output": {"picture": False, "interval": 1.0}, "time": time}
+    going, stopped, again = going_stopped_resumed(tables, tmp_path, 20, 4)
+    assert stopped.breaks.figures[0] > 0
+    assert_alike(again, going, 1e-9)
