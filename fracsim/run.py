@@ -372,14 +372,14 @@ def _run_rigid(
     wall_limit: float | None,
     source: Path | None,
 ) -> dict[str, Any]:
-    """Rigid bodies move on rank 0, and are the same on any number of ranks (collective)."""
+    """Rigid bodies move on rank 0, and are the same on any number of ranks, which analyse them (collective)."""
+    from .scene.rigid import build_rigid_scene, help_rigid
 
     def work() -> dict[str, Any]:
         _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         from .rigid_run import RigidRun, notes_of
-        from .scene.rigid import build_rigid_scene
 
-        scene = build_rigid_scene(study)
+        scene = build_rigid_scene(study, comm)
         notes_of(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
         frames = study.output.interval or study.time.end / FRAMES
@@ -388,8 +388,17 @@ def _run_rigid(
             _draw(folder)
         return summary
 
+    def first() -> dict[str, Any]:
+        try:
+            return work()
+        finally:
+            if comm.size > 1:
+                comm.bcast(None)
+
     with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt:
-        return from_root(comm, work)
+        if comm.rank:
+            help_rigid(comm)
+        return from_root(comm, first)
 
 
 def _check(

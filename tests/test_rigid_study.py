@@ -16,10 +16,15 @@ from mpi4py import MPI
 
 from cases import fracsim_here
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
+from fracsim.fracture.brittle.rules import SurfaceRules
+from fracsim.rigid.analyses import Analyses, Strike, opened_by
+from fracsim.rigid.breakable import Breakable
 from fracsim.run import run_study
 from fracsim.study import Study
 from fracsim.study.check import check_study
 from fracsim.study.file import study_text
+from support.rigid import breakable
+from support.solids import copies, lattice
 from support.vtu import frames
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
@@ -217,12 +222,59 @@ def test_bad_input_ends_the_program_with_exit_code_2(tmp_path: Path) -> None:
 
 
 @pytest.mark.ranks
-def test_two_ranks_give_the_same_run(done: Path, tmp_path: Path) -> None:
-    """Bodies move on the first of them."""
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_ranks_share_analyses_and_give_the_same_run(ranks: int, tmp_path: Path) -> None:
+    """Three bars that come down at once, with fewer surfaces than they would open: bodies move on the first rank, and
+    are analysed on all."""
+    bars = [{**tables()["body"][0], "copies": [1, 3, 1], "spacing": [1.0, 0.5, 1.0]}]
+    several = study(body=bars, brittle={"surfaces": 5}, time={"scheme": "rigid", "step": 2e-3, "end": 0.03})
+    expected = run_study(MPI.COMM_SELF, several, tmp_path / "alone")
+    assert expected["broken_edges"] and expected["pieces"] > 4
     path = tmp_path / "study.toml"
-    path.write_text(study_text(study()))
-    command = ["timeout", "120", "mpirun", "--oversubscribe", "-n", "2", "fracsim", "run", str(path), "-o"]
+    path.write_text(study_text(several))
+    command = ["timeout", "120", "mpirun", "--oversubscribe", "-n", str(ranks), "fracsim", "run", str(path), "-o"]
     ended = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     for name in ("history.csv", "pieces.csv"):
-        assert_same(rows(tmp_path / "out" / name), rows(done / name))
+        assert_same(rows(tmp_path / "out" / name), rows(tmp_path / "alone" / name))
+
+
+class OtherRank:
+    """A communicator of two, the second of which analyses with a mesh of its own when it is told to."""
+
+    size, rank = 2, 0
+
+    def __init__(self, other: Breakable) -> None:
+        self.other, self.asked = other, 0
+        self._strikes: list[Strike] = []
+
+    def bcast(self, message: object) -> object:
+        if not isinstance(message, str):
+            self.other.take(message.news)  # type: ignore[attr-defined]
+            self._strikes = message.strikes  # type: ignore[attr-defined]
+        return message
+
+    def gather(self, mine: object) -> list[object]:
+        self.asked += len(self._strikes[1::2])
+        return [mine, [opened_by(self.other, each) for each in self._strikes[1::2]]]
+
+
+def test_strikes_on_several_ranks_open_what_they_open_on_one() -> None:
+    """Three bars bent one after the other and at once, with surfaces for two of them: the same edges, cuts, starts, and
+    numbers of analyses; what one rank opens the other knows when it is asked again."""
+    mesh = copies(lattice(6, 2, 2, size=0.25), 3)
+    length = len(mesh.points) // 3
+    alone, first, second = (breakable(mesh, 2e4, SurfaceRules(5)) for _ in range(3))
+    points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
+    comm = OtherRank(second)
+    serial, spread = Analyses(alone), Analyses(first, comm, "begin")  # type: ignore[arg-type]
+    for size in (1e4, 3e4):
+        force = size * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
+        strikes = [Strike(k * length, points + mesh.points[k * length] - mesh.points[0], force) for k in range(3)]
+        broken = serial(strikes)
+        assert spread(strikes) == broken
+    assert comm.asked and alone.left == 0 and alone.pieces.count > 3
+    assert np.array_equal(alone.graph.broken, first.graph.broken)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(alone.damage(), first.damage(), strict=True))
+    assert (alone.passes, alone.iterations) == (first.passes, first.iterations)
+    assert np.array_equal(alone.saved()["starts"], first.saved()["starts"])

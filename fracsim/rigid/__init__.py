@@ -6,6 +6,7 @@ relief       what a load accelerates a free body with is taken off it
 free_body    the quasi-static analysis of one body, or of one piece of a broken one
 pinned       B07's three pinned points, to compare with
 point_loads  forces at points of a surface, handed to the nodes of the cells behind
+analyses     of several bodies at once, spread over ranks
 breakable    a struck piece breaks, and its pieces in turn
 
 Motion:

@@ -6,6 +6,7 @@ that come of it are analysed in turn under what of the blow falls on them, until
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,19 @@ class Within:
 
     def _both(self, active: Flags | None) -> Flags:
         return self.cells if active is None else self.cells & active
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a strike on the body of a name opened: keys (n, 2) of edges and where they are cut, (n,), starts (k, 3) of
+    surfaces, m; analyses, and iterations of CG in them."""
+
+    name: int
+    keys: Ints
+    cut: Values
+    starts: Values
+    passes: int
+    iterations: int
 
 
 class Breakable:
@@ -156,6 +170,49 @@ class Breakable:
         u = body(loads.nodal(len(self._domain.nodes)))
         self.iterations += body.iterations
         return self._stiffness.tensor(u, body.share)
+
+    @property
+    def left(self) -> int:
+        """Surfaces that may still open."""
+        return 0 if self._criterion is None else self._criterion.left
+
+    def opened(self, name: int, loads: PointLoads, share: int) -> Opened:
+        """What a strike opens that may start `share` surfaces; whether they count is up to `take`. Raises
+        NotConverged."""
+        criterion = self._criterion
+        assert criterion is not None
+        before, starts, passes, iterations = self.graph.broken.copy(), criterion.starts, self.passes, self.iterations
+        criterion.kept_back = criterion.left - share
+        try:
+            self.strike(self.piece_of(name), loads)
+        finally:
+            more, criterion.starts, criterion.kept_back = criterion.starts[len(starts) :], starts, 0
+        edges = np.flatnonzero(self.graph.broken & ~before)
+        done = self.passes - passes, self.iterations - iterations
+        self.passes, self.iterations = passes, iterations
+        return Opened(name, self.graph.edge_keys(edges), criterion.cut[edges], more, *done)
+
+    def take(self, every: list[Opened]) -> None:
+        """Have all of that open, whichever rank found it."""
+        criterion = self._criterion
+        if criterion is None or not every:
+            return
+        keys, cut = (np.concatenate([getattr(each, name) for each in every]) for name in ("keys", "cut"))
+        order = np.lexsort(keys.T[::-1])
+        local, place = self.graph.find_keys(keys[order])
+        new = ~self.graph.broken[local]
+        if np.any(new):
+            pieces = np.unique(self.pieces.of_node[self.graph.edge_nodes[local[new]]])
+            for piece in pieces:
+                self._forget(int(np.flatnonzero(self.pieces.of_node == piece)[0]))
+            criterion.cut[local] = cut[order][place]
+            flags = np.zeros(len(self.graph.broken), bool)
+            flags[local] = True
+            self.graph.break_edges(flags)
+            self._find_pieces()
+        criterion.starts = np.concatenate([criterion.starts, *(each.starts for each in every)])
+        self.passes += sum(each.passes for each in every)
+        self.iterations += sum(each.iterations for each in every)
 
     def strike(self, piece: int, loads: PointLoads) -> int:
         """Break a piece, and what it breaks into, until nothing more does; returns how many edges broke."""

@@ -49,7 +49,7 @@ class Geometry:
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
         kept: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
         elements = np.bincount(piece, minlength=made.pieces)
-        for number, name in enumerate(names.tolist()):
+        for number, name in enumerate(map(int, names)):
             key = int(size[number]), int(elements[number]), float(f"{of.volume[number]:.9e}")
             same = self._kept.get(name)
             if same is None or same[0] != key:

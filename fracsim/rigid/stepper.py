@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.contact.obstacle import Obstacle
+from .analyses import Analyses, Strike
 from .blows import Blows, Strain
 from .bodies import Bodies
 from .breakable import Breakable
@@ -87,8 +88,10 @@ class RigidStepper:
         rules: Rules,
         hertz: Hertz,
         contact_time: float | None = None,
+        analyses: Analyses | None = None,
     ) -> None:
-        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's."""
+        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh."""
+        self.analyses = analyses or Analyses(breakable)
         self.breakable, self._geometry, self._density = breakable, geometry, density
         self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
         self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
@@ -119,6 +122,7 @@ class RigidStepper:
     def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
         """The state that `saved` was of, with the mesh as broken as then."""
         self.breakable.restore(saved)
+        self.analyses.restored()
         self.look_again()
         self.overlaps = Overlaps(**{name: saved[f"overlap.{name}"] for name in vars(self.overlaps)})
         self.blows.restore(saved)
@@ -137,12 +141,11 @@ class RigidStepper:
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.shapes.names)
         clock = self.phases.add("motion", clock)
-        names = self.shapes.names
-        struck = [(int(names[each.body]), self._strike(int(names[each.body]), each)) for each in due]
+        struck = self.analyses(self._strikes(due))
         clock = self.phases.add("analysis", clock)
-        broken = sum(count for _, count in struck)
+        broken = sum(struck.values())
         if broken:
-            bodies = self._divided(bodies, {name for name, count in struck if count})
+            bodies = self._divided(bodies, {name for name, count in struck.items() if count})
             clock = self.phases.add("pieces", clock)
             moved, touches = self._moved(state, bodies)
             self.phases.add("motion", clock)
@@ -190,11 +193,13 @@ class RigidStepper:
         moved = [self._way(each, t + dt) - self._way(each, t) for each in self._obstacles]
         return pushed, -np.einsum("mi,mi->m", pushed, np.array(moved).reshape(-1, 3))
 
-    def _strike(self, name: int, strain: Strain) -> int:
-        piece = self.breakable.piece_of(name)
-        if not self.breakable.may_break(piece, float(np.linalg.norm(strain.force, axis=1).sum())):
-            return 0
-        return self.breakable.strike(piece, self.breakable.loads(piece, strain.points, strain.force))
+    def _strikes(self, due: list[Strain]) -> list[Strike]:
+        """Those that might break a body."""
+        breakable = self.breakable
+        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force) for each in due]
+        sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
+        may = [breakable.may_break(breakable.piece_of(each.name), much) for each, much in zip(every, sums, strict=True)]
+        return [each for each, yes in zip(every, may, strict=True) if yes]
 
     def _divided(self, bodies: Bodies, names: set[int]) -> Bodies:
         """The pieces that bodies of these names broke into, among those that did not."""

@@ -17,6 +17,7 @@ from ..mesh.domain import Domain, distribute
 from ..mesh.edges import EdgeGraph
 from ..meshes.data import MeshData
 from ..meshes.words import format_point
+from ..rigid.analyses import Analyses, serve
 from ..rigid.breakable import Breakable, Within
 from ..rigid.free_body import Stiffness
 from ..rigid.geometry import Geometry
@@ -67,8 +68,8 @@ class RigidScene:
         return state.t >= self.study.time.end * (1 - 1e-12)
 
 
-def build_rigid_scene(study: Study) -> RigidScene:
-    """Mesh, bodies, obstacles and engine. InputError where they do not fit."""
+def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScene:
+    """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit."""
     single = checked_mesh(study)
     places = _places(study)
     domain = distribute(MPI.COMM_SELF, placed(single, places))
@@ -80,7 +81,8 @@ def build_rigid_scene(study: Study) -> RigidScene:
     assert domain.source is not None
     geometry = Geometry(domain.source)
     hertz = Hertz(study.material.young, study.material.poisson)
-    stepper = RigidStepper(breakable, geometry, density, obstacles, rules, hertz, contact.contact_time)
+    analyses = Analyses(breakable, comm, (study, domain.source))
+    stepper = RigidStepper(breakable, geometry, density, obstacles, rules, hertz, contact.contact_time, analyses)
     first = stepper.start()
     _check_masses(first)
     at_rest = first.bodies
@@ -88,6 +90,16 @@ def build_rigid_scene(study: Study) -> RigidScene:
     first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin))
     _check_room(stepper, first, obstacles, domain)
     return RigidScene(study, domain, stepper, obstacles, first)
+
+
+def help_rigid(comm: MPI.Comm) -> None:
+    """On all ranks but the first: analyse bodies, until it lets go."""
+
+    def made(begin: tuple[Study, MeshData]) -> Breakable:
+        study, mesh = begin
+        return _breakable(study, distribute(MPI.COMM_SELF, mesh))
+
+    serve(comm, made)
 
 
 def _places(study: Study) -> list[Place]:

@@ -41,12 +41,13 @@ class BrittleSurfaces:
         self.spacing = rules.spacing if rules.spacing is not None else SPACING * self._domain.mean_edge
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut: Values = np.full(len(graph.broken), np.nan)
+        self.kept_back = 0  # surfaces that may not start now
         self._pattern: Pattern | None = None
 
     @property
     def left(self) -> int:
         """Surfaces that may still start."""
-        return self._rules.surfaces - len(self.starts)
+        return self._rules.surfaces - len(self.starts) - self.kept_back
 
     def __call__(self, stress: Values, psi: Values | None = None) -> tuple[Edges, Values]:
         """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""

@@ -1,0 +1,118 @@
+"""Analyses of bodies that were struck in one step, spread over ranks; the engine is on the first of them.
+
+Every rank has the whole mesh. Strikes of a step do not feel one another: each sees the surfaces that there were before,
+and may open its share of those that are left, so that what comes of it is the same on any number of ranks. Those that
+have used theirs up share what the others left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from .breakable import Breakable, Opened
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Strike:
+    """On the body of a name: forces (k, 3) at points (k, 3) at rest, N and m; at most `share` surfaces may open."""
+
+    name: int
+    points: Values
+    force: Values
+    share: int = 0
+
+
+@dataclass(frozen=True)
+class _Message:
+    """To the other ranks: what to begin with, what opened since, what to analyse."""
+
+    saved: dict[str, Any] | None
+    news: list[Opened]
+    strikes: list[Strike]
+
+
+class Analyses:
+    """Of one mesh (rank 0 of a communicator)."""
+
+    def __init__(self, breakable: Breakable, comm: MPI.Comm = MPI.COMM_SELF, begin: Any = None) -> None:
+        """`begin`: what other ranks make their `Breakable` of, see `serve`."""
+        self._breakable, self._comm, self._begin = breakable, comm, begin
+        self._saved: dict[str, Any] | None = None
+        self._news: list[Opened] = []
+
+    def restored(self) -> None:
+        """The mesh is as a checkpoint said."""
+        self._saved, self._news = self._breakable.saved(), []
+
+    def __call__(self, strikes: list[Strike]) -> dict[int, int]:
+        """How many edges broke, by the names of bodies. Raises NotConverged."""
+        breakable, broken = self._breakable, {each.name: 0 for each in strikes}
+        waiting = strikes
+        while waiting and breakable.left:
+            few, more = divmod(breakable.left, len(waiting))
+            tasks = [Strike(each.name, each.points, each.force, few + (k < more)) for k, each in enumerate(waiting)]
+            found = self._spread([each for each in tasks if each.share])
+            breakable.take(found)
+            for opened in found:
+                broken[opened.name] += len(opened.keys)
+            spent = {
+                opened.name for opened, task in zip(found, tasks, strict=False) if len(opened.starts) == task.share
+            }
+            waiting = [each for each in waiting if each.name in spent] + waiting[len(found) :]
+        return broken
+
+    def _spread(self, strikes: list[Strike]) -> list[Opened]:
+        """What opened, in their order."""
+        comm = self._comm
+        if comm.size == 1 or len(strikes) == 1:
+            found = [opened_by(self._breakable, each) for each in strikes]
+            self._news += found if comm.size > 1 else []
+            return found
+        if self._begin is not None:
+            comm.bcast(self._begin)
+            self._begin = None
+        comm.bcast(_Message(self._saved, self._news, strikes))
+        parts = _gathered(comm, self._breakable, strikes)
+        assert parts is not None
+        for part in parts:
+            if isinstance(part, Exception):
+                raise part
+        found = [parts[k % comm.size][k // comm.size] for k in range(len(strikes))]
+        self._saved, self._news = None, found
+        return found
+
+
+def serve(comm: MPI.Comm, make: Callable[[Any], Breakable]) -> None:
+    """On all other ranks: analyse what rank 0 says, until it sends None; `make`: of what `begin` is."""
+    if (begin := comm.bcast(None)) is None:
+        return
+    breakable = make(begin)
+    while (message := comm.bcast(None)) is not None:
+        if message.saved is not None:
+            breakable.restore(message.saved)
+        breakable.take(message.news)
+        _gathered(comm, breakable, message.strikes)
+
+
+def _gathered(comm: MPI.Comm, breakable: Breakable, strikes: list[Strike]) -> list[Any] | None:
+    """On rank 0 what opened on each rank, or why it failed."""
+    result: Any
+    try:
+        result = [opened_by(breakable, each) for each in strikes[comm.rank :: comm.size]]
+    except Exception as error:
+        result = error
+    return comm.gather(result)
+
+
+def opened_by(breakable: Breakable, strike: Strike) -> Opened:
+    """What a strike opens. Raises NotConverged."""
+    piece = breakable.piece_of(strike.name)
+    return breakable.opened(strike.name, breakable.loads(piece, strike.points, strike.force), strike.share)
