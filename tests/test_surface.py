@@ -234,11 +234,12 @@ def test_a_node_without_a_whole_cell_does_not_turn() -> None:
 
 
 def test_a_rebuild_is_array_code() -> None:
-    """As many calls for 24,000 cells as for 81,000, 5 % of them damaged: no loop over cells, edges or nodes."""
+    """As many calls for 24,000 cells as for 81,000, 5 % of them damaged, but for a round more of joining pieces: no
+    loop over cells, edges or nodes."""
     rebuilt(4)  # imports, and what is made once
     made, calls = zip(*(rebuilt(n) for n in (10, 15)), strict=True)
     assert made[1] > 2 * made[0]
-    assert calls[0] == calls[1]
+    assert calls[1] < 1.05 * calls[0]
 
 
 def rebuilt(n: int) -> tuple[int, int]:

@@ -79,6 +79,7 @@ class Balance:
         self._positive: Positive | None = None
         self.low_rank: list[tuple[Values, Values]] = []
         self.springs: list[Stiff] = []
+        self._assembled: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
         self.moves = 0
         self.vector = assembler.vector()
         self._kept = assembler.vector()
@@ -253,7 +254,12 @@ class Balance:
 
     def assemble_tangent(self, K: PETSc.Mat, *, small: float | None = None) -> None:
         """K at the current u, rows and columns of prescribed dofs replaced by the identity's; `small`: with moduli
-        made positive to within that share of them (collective)."""
+        made positive to within that share of them (collective).
+
+        A linear one is kept while damage and rates are what they were.
+        """
+        if self.linear and self._is_assembled(K, small):
+            return
         if self._coupled:
             K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
         self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
@@ -278,6 +284,14 @@ class Balance:
             self._leave_out_dead(self._positive.form)
         self._positive.update(small)
         return self._positive.form
+
+    def _is_assembled(self, K: PETSc.Mat, small: float | None) -> bool:
+        """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
+        fields = [field.x.array for field in self.stress.fields]
+        rates = K.handle, small, sum(term.mass_factor for term in self.terms), self.c_v
+        was, self._assembled = self._assembled, (rates, [field.copy() for field in fields])
+        same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
+        return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
 
     @contextmanager
     def untouched(self) -> Iterator[None]:
@@ -366,6 +380,11 @@ class Balance:
         """Y V, J (collective)."""
         domain = self.domain
         return float(total(domain.comm, np.sum(self.stress.material.young * domain.volumes))[0])
+
+    @cached_property
+    def linear(self) -> bool:
+        """Whether K depends on damage and on the rates of the scheme alone."""
+        return all(term.linear for term in self.terms)
 
     @cached_property
     def conservative(self) -> bool:

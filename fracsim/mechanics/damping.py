@@ -22,6 +22,7 @@ class Drag(Term):
     """a M v, a in 1/s."""
 
     name = "drag"
+    linear = True
 
     def __init__(self, u: fem.Function, mass: Mass, a: float) -> None:
         self.a = a
@@ -64,7 +65,7 @@ class Viscosity(Term):
     def __init__(self, assembler: Assembler, u: fem.Function, stress: Stress, b: float) -> None:
         domain = assembler.domain
         self.b = b
-        self._assembler, self._u, self._stress = assembler, u, stress
+        self._assembler, self._u, self._stress, self.linear = assembler, u, stress, stress.linear
         self._u_n, self._u_v = fem.Function(domain.space), fem.Function(domain.space)
         self._c_v = fem.Constant(domain.mesh, np.float64(0.0))
         self._form = CellForm(self.work(ufl.TestFunction(domain.space), cells_measure(domain)))

@@ -47,6 +47,7 @@ class Inertia(Term):
     """M a, a the acceleration c_a (u - u_a) of the scheme."""
 
     name = "inertia"
+    linear = True
 
     def __init__(self, u: fem.Function, mass: Mass) -> None:
         self._u, self._mass = u, mass

@@ -53,6 +53,7 @@ class DeadLoads(Term):
     """
 
     name = "dead loads"
+    linear = True
 
     def __init__(
         self,
@@ -110,7 +111,7 @@ class Pressure(Term):
 
     def __init__(self, assembler: Assembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
         domain = assembler.domain
-        self._assembler, self._u, self.symmetric = assembler, u, linear
+        self._assembler, self._u, self.symmetric, self.linear = assembler, u, linear, linear
         self._moving = _Moving(domain)
         works = [
             (self._moving.constant(function, 1), ds)

@@ -84,6 +84,7 @@ class Stress(Term):
         self.energy: Energy = material.energy if weakening is None else self._weakened(weakening)
         self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
         self.symmetric = material.plastic is None or not material.plastic.frobenius
+        self.linear = self.energy.linear and not self.closes and material.plastic is None
         whole = cells_measure(domain)
         self._energy_form = compile_form(self._stored_energy(whole))
         self._alone = CellForm(self.work(ufl.TestFunction(domain.space), whole))

@@ -71,6 +71,7 @@ class Term:
 
     name: ClassVar[str] = ""
     symmetric: bool = True  # whether its share of the tangent is
+    linear: bool = False  # whether that share depends on damage and on the rates of the scheme alone, not on u and t
     keeps_apart: ClassVar[bool] = False  # whether it has a say in where the points of the split surface are: `apart`
     visible: ClassVar[bool] = False  # whether it is `drawn`
 

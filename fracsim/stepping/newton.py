@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
+from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
 from .rigid_modes import rigid_modes
@@ -44,6 +46,7 @@ FACTORISED = 100_000
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
+LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
 ON_THE_WAY = 1e-2  # rtol of all but the last of them
 
@@ -92,6 +95,8 @@ class Solver:
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
+        self._linearly = is_linear(balance, given, snes.ksp.getType())
+        self._ending = Ending(snes.comm, int(snes.ksp.max_it)) if self._linearly and self._iterative else None
         self._first = 0.0
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
@@ -241,6 +246,8 @@ class Solver:
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
         if self.balance.limits_steps:
             self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
+        if self._linearly and (solved := self._solve_as_linear()) is not None:
+            return replace(solved, krylov=solved.krylov + extended)
         newton, krylov, held = self._solve_in_legs()
         reason = self.snes.reason
         self.balance.displace_to(self._x)
@@ -268,6 +275,35 @@ class Solver:
                 return newton, krylov, False
             self.balance.go_on()
         return newton, krylov, True
+
+    def _solve_as_linear(self) -> SolveResult | None:
+        """From x, where the balance is linear; None: not in a few solves, and Newton's method takes over."""
+        balance, x, krylov, left = self.balance, self._x, 0, np.inf
+        for its in range(LINEAR_SOLVES + 1):
+            if not (solved := np.isfinite(left) and self._is_small(left, its)):
+                balance.free_residual(x, balance.vector)
+                solved = self._is_small(left := balance.vector.norm(), its)
+            if solved:
+                return SolveResult(True, its, krylov, "")
+            if its == LINEAR_SOLVES or (made := self._correct(self._little(left))) is None:
+                break
+            left, krylov = made[0], krylov + made[1]
+            x.axpy(-1.0, self._correction)
+            balance.displace_to(x)
+            balance.update_reactions()
+        self._preconditioner.its = None
+        return None
+
+    def _correct(self, little: float) -> tuple[float, int] | None:
+        """K correction = balance.vector, by CG down to what is `little`, N, or as the KSP does it: |r| that is left,
+        infinite where nothing is known, and iterations; None: it was not solved."""
+        if self._ending is None or self.snes.ksp.getType() != "cg":
+            return (np.inf, self.snes.ksp.its) if self._solve_linear() else None
+        ending, tangent, preconditioner = self._ending, self.balance.tangent, self._preconditioner
+        self._assemble_tangent(tangent)
+        solved = ending.solve(tangent, preconditioner.pc, self.balance.vector, self._correction, little)
+        preconditioner.its = ending.to_share(float(self.snes.ksp.rtol))
+        return (ending.left, ending.its) if solved else None
 
     # --- linear solves by themselves ---
 
@@ -301,6 +337,7 @@ class Solver:
         """K correction = balance.vector at the present u; whether it was solved."""
         tangent, ksp = self.balance.tangent, self.snes.ksp
         self._assemble_tangent(tangent)
+        self._preconditioner.its = None
         ksp.setOperators(self._operator, tangent)
         ksp.solve(self.balance.vector, self._correction)
         return bool(ksp.reason > 0)
@@ -361,16 +398,21 @@ class Solver:
         PETSc's own test against |r_0| alone asks for more and more digits as the first guess gets better.
         """
         reason = PETSc.SNES.ConvergedReason
-        norm = norms[2]
-        if not np.isfinite(norm):
+        if not np.isfinite(norms[2]):
             return int(reason.DIVERGED_FNORM_NAN)
+        return int(reason.CONVERGED_FNORM_RELATIVE if self._is_small(norms[2], its) else reason.ITERATING)
+
+    def _is_small(self, norm: float, its: int) -> bool:
+        """Whether that is so of |r| after so many iterations (collective)."""
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
             self._first = 0.0 if self.balance.limits_steps else norm
+        return norm <= self._little(self._first if its else 0.0)
+
+    def _little(self, first: float) -> float:
+        """|r| of a solution, N, where that of the guess is `first` (collective)."""
         scale, floor = self.balance.force_scale()
-        if norm <= max(self._rtol * max(self._first if its else 0.0, scale), floor):
-            return int(reason.CONVERGED_FNORM_RELATIVE)
-        return int(reason.ITERATING)
+        return max(self._rtol * max(first, scale), floor)
 
     def destroy(self) -> None:
         """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
@@ -379,6 +421,8 @@ class Solver:
             kept.destroy()
         if self._downhill is not None:
             self._downhill.destroy()
+        if self._ending is not None:
+            self._ending.destroy()
         if self._near_null is not None:
             self._near_null.destroy()
 

@@ -53,6 +53,7 @@ class Preconditioner:
     Attributes:
         due: what has to be done before the next solve.    keep: whether it serves more than one tangent.
         pc: that of the body alone, also where the KSP uses one that is made of it.
+        its: iterations of the last solve, where the KSP does not know; 0: nothing is known; None: it does.
     """
 
     def __init__(self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool) -> None:
@@ -60,6 +61,7 @@ class Preconditioner:
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
         self.due, self.keep = Due.REBUILD, keep
         self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
+        self.its: int | None = None
         self._fresh_its = self._whole_its = 0
 
     def damage_changed(self) -> None:
@@ -83,7 +85,7 @@ class Preconditioner:
 
     def look(self) -> None:
         """See from the iterations of the last solve whether a rebuild is due (more than once does no harm)."""
-        its = self._ksp.its
+        its = self._ksp.its if self.its is None else self.its
         if self.due == Due.NOTHING:
             self._look_at(its)
         # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
