@@ -55,8 +55,8 @@ def test_forces_are_a_derivative_and_sum_to_nothing(dim: int) -> None:
     """Of points before facets and of some that are through: against differences; force and moment vanish."""
     pairs, x = pushed(dim)
     met, gradient, h = pairs._met(x), pairs.gradient(x), 1e-7
-    assert (met.gap < 0).sum() > 1 and (met.gap > 0).sum() > 3
-    assert ((met.share > 0).all(axis=1)).any()
+    assert (met.at.gap < 0).sum() > 1 and (met.at.gap > 0).sum() > 3
+    assert ((met.at.share > 0).all(axis=1)).any()
     way = np.random.default_rng(1).normal(size=(6, *x.shape))
     for each in way:
         slope = (pairs.energy(x + h * each) - pairs.energy(x - h * each)) / (2 * h)
@@ -74,7 +74,9 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
     pairs, x = pushed(dim)
     n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs._met(x)
     K = np.zeros((n * dim, n * dim))
-    for p, corners, share, normal, rate in zip(met.points, met.corners, met.share, met.normal, met.rate, strict=True):
+    for p, corners, share, normal, rate in zip(
+        met.at.points, met.at.corners, met.at.share, met.at.normal, met.rate, strict=True
+    ):
         row = np.zeros((n, dim))
         row[p] = normal
         row[corners] -= share[:, None] * normal
@@ -110,7 +112,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         x = contact._places()
         assert x is not None
         touched += contact.stored() > 0
-        assert surface.pairs._met(x).gap.min(initial=1.0) > -0.01
+        assert surface.pairs._met(x).at.gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
     assert min(steps) > 0.75 * max(steps)

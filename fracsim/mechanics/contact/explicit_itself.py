@@ -53,9 +53,9 @@ class Pushes(Surface):
             self._rates = rates(self.at.weights, area, self.mass, pressure, self._most)
         pairs = Pushing(self._rest, elements, self._rates, distance=self._law.distance)
         if (last := getattr(self, "pairs", None)) is not None:
-            pairs.by, pairs.held = last.by, last.held
+            pairs.hold(last.by, last.held)
         elif self._earlier is not None:
-            pairs.by, pairs.held = self._pushed_before(self._earlier, self._rates)
+            pairs.hold(*self._pushed_before(self._earlier, self._rates))
         return pairs
 
     def _pushed_before(self, before: Pushes, most: Values) -> tuple[Ints, Values]:
@@ -120,7 +120,7 @@ class ExplicitSelfContact(SelfContact):
         surface, pushed = cast("tuple[object, tuple[Ints, Values] | None]", memory)
         super().recall(surface)
         if self._surface is not None and pushed is not None:
-            self._surface.pairs.by, self._surface.pairs.held = pushed
+            self._surface.pairs.hold(*pushed)
 
     def saved(self) -> dict[str, Values]:
         """With the facets that push points."""
@@ -133,4 +133,4 @@ class ExplicitSelfContact(SelfContact):
         """Be again what `saved` gave."""
         super().restore(saved)
         if self._surface is not None and "by" in saved:
-            self._surface.pairs.by, self._surface.pairs.held = saved["by"].astype(np.int64), saved["held"]
+            self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"])

@@ -21,15 +21,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .near import Kind, Near
+from .before import Before, before, nearer
+from .carried import SOME
+from .near import Kind, Near, centred, longest
 from .pairs import Pairs
-from .recede import normals
-from .shares import least_over_shares
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-DEEPEST = 3.0  # distances D: what is deeper has gone through
+FARTHEST = 3.0  # distances D: gaps that are looked at; what is deeper has gone through
 MARGIN = 1.0  # distances D: how far points may go before candidates are looked for again
 ALIKE = 1e-9  # of the mean edge: distances to the same place, by several facets
 LITTLE = 1e-3  # share of a corner that takes nothing worth speaking of
@@ -39,20 +39,14 @@ NONE = -1  # corners of facets that push nothing
 
 @dataclass(frozen=True)
 class Pushed:
-    """Points (k,) that are before facets, corners (k, d), with shares (k, d) of the places there, signed gaps (k,), m,
-    normals (k, d) and k_p (k,), N/m."""
+    """What is pushed.
 
-    points: Ints
-    corners: Ints
-    share: Values
-    gap: Values
-    normal: Values
+    Attributes:
+        at: points (k,) before facets.    rate: (k,) k_p, N/m.
+    """
+
+    at: Before
     rate: Values
-
-    def some(self, which: npt.NDArray[np.bool_]) -> Pushed:
-        """Some of them."""
-        places = self.points[which], self.corners[which], self.share[which]
-        return Pushed(*places, self.gap[which], self.normal[which], self.rate[which])
 
 
 class Pushing(Pairs):
@@ -70,111 +64,108 @@ class Pushing(Pairs):
         self.held: Values = np.zeros(len(rest))
         self._rate, self._width, self._elements = rate, distance, elements
         self._used = np.unique(elements)  # ipctk's points
-        self._candidates: Ints = np.empty((0, 2), np.int64)
         kind = Kind(ipctk.BarrierPotential(distance, 1.0, True), "ee_candidates")
-        self._near = Near(self._mesh, [kind], max(AHEAD, DEEPEST) * distance, MARGIN * distance)
-        self._found: ipctk.Candidates | None = None  # that these are of
-        self._last: tuple[Values, Ints, Pushed] | None = None
+        self._near = Near(self._mesh, [kind], FARTHEST * distance, MARGIN * distance)
+        self._found: ipctk.Candidates | None = None  # of which `_every` are, and `_some` near where points were then
+        self._every: Ints
+        self._some: Ints
+        self._from: Values
+        self._last: tuple[Values, Before] | None = None
+        self._met_at: tuple[Before, Pushed] | None = None
 
     def energy(self, x: Values) -> float:
         """E(x), J."""
         met = self._met(x)
-        return 0.5 * float(met.rate @ (self._width - met.gap) ** 2)
+        return 0.5 * float(met.rate @ (self._width - met.at.gap) ** 2)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
         met, found = self._met(x), np.zeros_like(x)
-        force = (met.rate * (self._width - met.gap))[:, None] * met.normal
-        np.add.at(found, met.points, -force)
-        np.add.at(found, met.corners, met.share[:, :, None] * force[:, None])
+        force = (met.rate * (self._width - met.at.gap))[:, None] * met.at.normal
+        np.add.at(found, met.at.points, -force)
+        np.add.at(found, met.at.corners, met.at.share[:, :, None] * force[:, None])
         return found
 
     def least_gap(self, x: Values) -> float:
         """The least gap that is below D, m; infinite where there is none."""
-        return float(self._met(x).gap.min(initial=np.inf))
+        return float(self._met(x).at.gap.min(initial=np.inf))
 
     def arrive(self, x: Values) -> None:
         """A step is over with points at x (n, d)."""
         met = self._met(x)
-        self.by = np.full_like(self.by, NONE)
-        self.by[met.points] = met.corners
-        self.held = np.zeros(len(x))
-        self.held[met.points] = met.rate
+        if not len(met.rate) and not self.held.any():
+            return
+        by, held = np.full_like(self.by, NONE), np.zeros(len(x))
+        by[met.at.points], held[met.at.points] = met.at.corners, met.rate
+        self.hold(by, held)
+
+    def hold(self, by: Ints, held: Values) -> None:
+        """What is pushed from here on."""
+        self.by, self.held, self._met_at = by, held, None
 
     def fastest(self, x: Values, weights: csr_matrix, mass: Values) -> float:
         """What it adds at most to the square of a frequency (carried), 1/s^2, with points near x (n, d) that follow
         nodes of `mass` (nodes,), kg, by `weights` (n, nodes)."""
         near = self._before(x, AHEAD * self._width)
-        k, d = near.corners.shape
+        k, d = near.at.corners.shape
         if not k:
             return 0.0
         rows = np.repeat(np.arange(k), d)
-        of_facets = csr_matrix((near.share.reshape(-1), (rows, near.corners.reshape(-1))), shape=(k, len(x)))
-        size = abs(weights[near.points] - of_facets @ weights)
+        of_facets = csr_matrix((near.at.share.reshape(-1), (rows, near.at.corners.reshape(-1))), shape=(k, len(x)))
+        size = abs(weights[near.at.points] - of_facets @ weights)
         load = size.T @ (near.rate * np.asarray(size.sum(axis=1)).ravel())
         return float((load / mass).max(initial=0.0))
 
     def _met(self, x: Values) -> Pushed:
-        """What is pushed; that of the last x is kept."""
-        if self._last is None or self._last[1] is not self.by or not np.array_equal(x, self._last[0]):
-            self._last = x.copy(), self.by, self._before(x, self._width)
-        return self._last[2]
+        """What is pushed."""
+        if self._met_at is None or self._met_at[0] is not self._facing(x):
+            self._met_at = self._facing(x), self._before(x, self._width)
+        return self._met_at[1]
 
     def _before(self, x: Values, reach: float) -> Pushed:
         """The nearest facet of each point that has one within `reach`, m."""
-        every = self._facing(x, reach)
+        every = self._facing(x)
         known = self.by[every.points]
         again = (known[:, :, None] == every.corners[:, None]).any(axis=(1, 2))
         some = every.some((every.gap > 0) | again)
         order = np.lexsort((abs(some.gap), some.points))
         which = np.zeros(len(order), bool)
         which[order[np.unique(some.points[order], return_index=True)[1]]] = True
-        return some.some(which & (some.gap < reach))
+        some = some.some(which & (some.gap < reach))
+        return Pushed(some, self._rates_of(some))
 
-    def _facing(self, x: Values, reach: float) -> Pushed:
-        """Points before facets, or behind, one facet for each place: of those that share it the one that looks most
-        towards the point, or away."""
-        points, facets = self._may_meet(x).T
-        corners = self._elements[facets]
-        at, d = x[corners], x.shape[1]
-        arms = at - x[points][:, None]
-        middle = np.full((len(points), d), 1 / d)
-        away = np.einsum("kcd,kc->kd", arms, middle)
-        share = least_over_shares(arms @ arms.transpose(0, 2, 1), np.einsum("kcd,kd->kc", arms, away), middle)
-        way = -np.einsum("kcd,kc->kd", arms, share)
-        distance = np.linalg.norm(way, axis=1)
-        close = np.flatnonzero(distance < max(reach, DEEPEST * self._width))
-        normal = normals(at[close])
-        along = np.einsum("kd,kd->k", way[close], normal)
-        order = np.lexsort((distance[close], points[close]))
-        point, far = points[close][order], distance[close][order]
-        group = np.cumsum(np.r_[False, (np.diff(point) > 0) | (np.diff(far) > ALIKE * self._edge)][: len(order)])
-        best = order[np.lexsort((-abs(along[order]), group))]
-        which = best[np.unique(group, return_index=True)[1]]
-        sign, far = np.where(along[which] < 0, -1.0, 1.0), distance[close][which]
-        clear = far > ALIKE * self._edge
-        ways = sign[:, None] * way[close][which] / np.where(clear, far, 1.0)[:, None]
-        ways = np.where(clear[:, None], ways, normal[which])
-        which_pairs = close[which]
-        rate = self._rates_of(points[which_pairs], corners[which_pairs], share[which_pairs])
-        return Pushed(points[which_pairs], corners[which_pairs], share[which_pairs], sign * far, ways, rate)
+    def _facing(self, x: Values) -> Before:
+        """What points are before, or behind; that of the last x is kept."""
+        if self._last is None or not np.array_equal(x, self._last[0]):
+            points, facets = self._may_meet(x).T
+            found = before(x, points, self._elements[facets], FARTHEST * self._width, ALIKE * self._edge)
+            self._last = x.copy(), found
+        return self._last[1]
 
-    def _rates_of(self, points: Ints, corners: Ints, share: Values) -> Values:
+    def _rates_of(self, at: Before) -> Values:
         """(k,) k_p: no more than a corner of the facet takes; while a point is pushed it stays as it was."""
-        takes = (self._rate[corners] / np.maximum(share, LITTLE)).min(axis=1, initial=np.inf)
-        held = self.held[points]
-        return np.where(held > 0, held, np.minimum(self._rate[points], takes))
+        takes = (self._rate[at.corners] / np.maximum(at.share, LITTLE)).min(axis=1, initial=np.inf)
+        held = self.held[at.points]
+        return np.where(held > 0, held, np.minimum(self._rate[at.points], takes))
 
     def _may_meet(self, x: Values) -> Ints:
-        """(k, 2) points and facets that may be as near, or as deep, as counts."""
-        (found,) = self._near.candidates(self._mesh.vertices(x))
+        """(k, 2) points and facets that may be as near, or as deep, as counts: of ipctk's candidates those that were
+        when points were last near here."""
+        on = self._mesh.vertices(x)
+        (found,) = self._near.candidates(on)
+        here = centred(on)
         if found is not self._found:
             solid = x.shape[1] == 3
             ids = [(each.vertex_id, each.face_id) for each in found.fv_candidates] if solid else \
                   [(each.vertex_id, each.edge_id) for each in found.ev_candidates]  # fmt: skip
             pairs = np.array(ids, np.int64).reshape(-1, 2)
-            self._found, self._candidates = found, np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
-        return self._candidates
+            self._found, self._every = found, np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
+        elif longest(here - self._from) <= MARGIN * self._width:
+            return self._some
+        points, facets = self._every.T
+        reach = (FARTHEST + 2 * MARGIN) * self._width
+        self._some, self._from = self._every[nearer(x, points, self._elements[facets], reach)], here
+        return self._some
 
 
 def rates(weights: csr_matrix, area: Values, mass: Values, pressure: float, most: float) -> Values:
@@ -185,6 +176,6 @@ def rates(weights: csr_matrix, area: Values, mass: Values, pressure: float, most
     rate = (size.T @ (area * spread)) / mass
     held = size.tocoo()
     fastest = np.zeros(len(area))
-    np.maximum.at(fastest, held.row, np.where(held.data > 0, rate[held.col], 0.0))
+    np.maximum.at(fastest, held.row, np.where(held.data > SOME * spread[held.row], rate[held.col], 0.0))
     own = np.where(fastest > 0, area / np.where(fastest > 0, fastest, 1.0), 0.0)
     return np.minimum(0.5 * pressure * area, 0.25 * most * own)

@@ -1,0 +1,73 @@
+"""Points before facets: the nearest place on each, and the distance to it, signed by the side that a point is on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .recede import normals
+from .shares import least_over_shares
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Before:
+    """Points (k,) before facets with corners (k, d).
+
+    Attributes:
+        share: (k, d) of the nearest places.    gap: (k,) m, negative behind a facet.
+        normal: (k, d) unit vectors from the places, outwards.
+    """
+
+    points: Ints
+    corners: Ints
+    share: Values
+    gap: Values
+    normal: Values
+
+    def some(self, which: Flags | Ints) -> Before:
+        """Some of them."""
+        return Before(
+            self.points[which], self.corners[which], self.share[which], self.gap[which], self.normal[which]
+        )  # fmt: skip
+
+
+def nearer(x: Values, points: Ints, corners: Ints, reach: float) -> Flags:
+    """(k,) whether points are nearer than `reach` m to facets (k, d), with points at x (n, d)."""
+    _, way = _nearest(x, points, corners)
+    return np.asarray(np.einsum("kd,kd->k", way, way) < reach**2)
+
+
+def before(x: Values, points: Ints, corners: Ints, reach: float, alike: float) -> Before:
+    """Those nearer than `reach`, m, one facet for each place: of facets that share it, at distances `alike` but
+    for so many m, the one that looks most towards the point or away from it, which tells the side."""
+    share, way = _nearest(x, points, corners)
+    distance = np.linalg.norm(way, axis=1)
+    close = np.flatnonzero(distance < reach)
+    points, corners, share, way, distance = (each[close] for each in (points, corners, share, way, distance))
+    normal = normals(x[corners])
+    along = np.einsum("kd,kd->k", way, normal)
+    order = np.lexsort((distance, points))
+    new = (np.diff(points[order]) > 0) | (np.diff(distance[order]) > alike)
+    place = np.cumsum(np.r_[False, new][: len(order)])
+    best = order[np.lexsort((-abs(along[order]), place))]
+    which = best[np.unique(place, return_index=True)[1]]
+    gap = np.where(along < 0, -1.0, 1.0) * distance
+    clear = distance > alike
+    normal = np.where(clear[:, None], way / np.where(clear, gap, 1.0)[:, None], normal)
+    return Before(points, corners, share, gap, normal).some(which)
+
+
+def _nearest(x: Values, points: Ints, corners: Ints) -> tuple[Values, Values]:
+    """(k, d) shares of the nearest places, and ways (k, d) from there to the points, m."""
+    k, d = corners.shape
+    arms = x[corners] - x[points][:, None]
+    middle = np.full((k, d), 1 / d)
+    slope = np.einsum("kcd,kd->kc", arms, arms.mean(axis=1))
+    share = least_over_shares(arms @ arms.transpose(0, 2, 1), slope, middle)
+    return share, -np.einsum("kcd,kc->kd", arms, share)
