@@ -49,7 +49,8 @@ def before(x: Values, points: Ints, corners: Ints, reach: float, alike: float) -
     share, way = _nearest(x, points, corners)
     distance = np.linalg.norm(way, axis=1)
     close = np.flatnonzero(distance < reach)
-    points, corners, share, way, distance = (each[close] for each in (points, corners, share, way, distance))
+    points, corners = points[close], corners[close]
+    share, way, distance = share[close], way[close], distance[close]
     normal = normals(x[corners])
     along = np.einsum("kd,kd->k", way, normal)
     order = np.lexsort((distance, points))
