@@ -18,7 +18,7 @@ from fracsim.rigid.model import Rules, Stand
 from fracsim.rigid.primitives import primitive
 from fracsim.rigid.siblings import Overlaps
 from fracsim.rigid.touches import Touches
-from fracsim.rigid.tumbling import momentum_of, spin_of, tumbled
+from fracsim.rigid.tumbling import rotated, tumbled
 from support.falling import CUBE, DOWN, MASS, G, cubes, floor
 
 Values = npt.NDArray[np.float64]
@@ -116,9 +116,9 @@ def tops(steps: int, turns: float) -> tuple[Values, Values, Values]:
     """Rotations (1, 3, 3), spins (1, 3) and energies (steps,) of an asymmetric top that nothing acts on."""
     turn, spin, energy = np.eye(3)[None], NEARLY, []
     for _ in range(steps):
-        momentum = momentum_of(turn, TOP, spin)
-        turn = tumbled(turn, TOP, momentum, np.array([turns / steps]))
-        spin = spin_of(turn, TOP, momentum)
+        momentum, inverse = rotated(turn, TOP, spin), np.linalg.inv(TOP)
+        turn = tumbled(turn, inverse, momentum, np.array([turns / steps]))
+        spin = rotated(turn, inverse, momentum)
         energy.append(float(np.einsum("ni,nij,nj->", spin, turn @ TOP @ np.swapaxes(turn, 1, 2), spin)) / 2)
     return turn, spin, np.array(energy)
 

@@ -23,7 +23,7 @@ from .meeting import Meetings, flown, meetings
 from .model import Part, Rules, Stand, model_of, plane_contact
 from .siblings import Overlaps, Parting
 from .touches import Touches
-from .tumbling import momentum_of, spin_of, tumbled
+from .tumbling import rotated, tumbled
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -89,11 +89,10 @@ class Engine:
         """The bodies a step later where none of their points comes farther than a reach (n,), m."""
         dt, n, g = self._rules.step, self._count, self._rules.gravity
         start = bodies
-        share: Values = np.zeros(n)
         contacts = self._find(bodies, rates, reach)
         meeting, parting = self._meeting(contacts, bodies, rates)
-        if np.any(meeting.closing):
-            share = flown(meeting, contacts.things, n)
+        share = flown(meeting, contacts.things, n)
+        if np.any(share):
             fallen = dt * share[:, None] * g
             flying = replace(bodies, velocity=bodies.velocity + fallen / 2)
             bodies = replace(self._flown(flying, dt * share), velocity=bodies.velocity)
@@ -120,18 +119,19 @@ class Engine:
 
     def _driven_on(self, bodies: Bodies, force: Values) -> Bodies:
         """The bodies with the motion that forces and moments (n, 6) of a step give them."""
-        dt, inertia = self._rules.step, self._model.inertia
-        momentum = momentum_of(bodies.turn, inertia, bodies.spin)
+        dt, model = self._rules.step, self._model
+        momentum = rotated(bodies.turn, model.inertia, bodies.spin)
         momentum += dt * np.einsum("nij,nj->ni", bodies.turn, force[:, 3:])
-        velocity = bodies.velocity + dt * (self._rules.gravity + force[:, :3] / self._model.mass[:, None])
-        return replace(bodies, velocity=velocity, spin=spin_of(bodies.turn, inertia, momentum))
+        velocity = bodies.velocity + dt * (self._rules.gravity + force[:, :3] / model.mass[:, None])
+        return replace(bodies, velocity=velocity, spin=rotated(bodies.turn, model.inverse, momentum))
 
     def _flown(self, bodies: Bodies, time: Values) -> Bodies:
         """The bodies after times (n,) in which nothing acts, s."""
-        momentum = momentum_of(bodies.turn, self._model.inertia, bodies.spin)
-        turn = tumbled(bodies.turn, self._model.inertia, momentum, time)
+        model = self._model
+        momentum = rotated(bodies.turn, model.inertia, bodies.spin)
+        turn = tumbled(bodies.turn, model.inverse, momentum, time)
         place = bodies.place + time[:, None] * bodies.velocity
-        return replace(bodies, place=place, turn=turn, spin=spin_of(turn, self._model.inertia, momentum))
+        return replace(bodies, place=place, turn=turn, spin=rotated(turn, model.inverse, momentum))
 
     # --- MuJoCo ---
 

@@ -4,9 +4,9 @@
 
 along the normal, speeds of parting; with r the distance g still between two things, so that they come no nearer than
 touching. What meets fast, c > c_0, within the step, c dt > g, bounces or stops at once, r = -e c dt, and until it
-meets, after the share g / (c dt) of the step, it flies as if there were nothing: it ends where it touches. So a blow
-gives its whole impulse in the step that it falls in. What lies in one another even so (turns are not linear) comes
-apart no faster than c_0, which hardly any energy comes of.
+meets, after the share g / (c dt) of the step, it flies as if there were nothing: it ends where it touches (to c_0 dt,
+which is not waited for). So a blow gives its whole impulse in the step that it falls in. What lies in one another even
+so (turns are not linear) comes apart no faster than c_0, which hardly any energy comes of.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def meetings(gap: Values, closing: Values, dt: float, fast: float, restitution: 
     hits = (closing > fast) & (gap < closing * dt)
     inside = np.maximum(RECOVERED * gap, -fast * dt)
     aim = np.where(hits, -restitution * closing * dt, np.where(gap < 0, inside, gap))
-    share = np.divide(gap, closing * dt, out=np.zeros_like(gap), where=hits)
+    share = np.divide(gap, closing * dt, out=np.zeros_like(gap), where=hits & (gap > fast * dt))
     near = gap < (closing + fast) * dt
     return Meetings(gap, aim, near, np.where(hits, closing, 0.0), np.clip(share, 0.0, 1.0))
 

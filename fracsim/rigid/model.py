@@ -67,6 +67,7 @@ class Model:
     Attributes:
         made: MuJoCo's.    thing: (geoms,) bodies by their numbers, then what stands.    first: (n,) geom of each body.
         driven: numbers of what is driven.    mass, inertia: (n,) kg and (n, 3, 3) kg m^2 of bodies, none too light.
+        inverse: (n, 3, 3) of the inertia.
         extent: (n,) how far each reaches from its centre, m.    planes: of what stands, whose contacts with hulls
         MuJoCo leaves alone.
     """
@@ -77,6 +78,7 @@ class Model:
     driven: Ints
     mass: Values
     inertia: Values
+    inverse: Values
     extent: Values
     planes: Planes
 
@@ -104,7 +106,8 @@ def model_of(bodies: Bodies, parts: Sequence[Sequence[Part]], stands: Sequence[S
     first = len(fixed) + np.searchsorted(things, np.arange(count))
     thing, extent = [count + number for number in fixed] + things, [_extent(each) for each in parts]
     planes = _planes(parts, stands, np.array(thing, np.int64), first)
-    return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia,
+    inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
+    return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia, inverse,
                  np.array(extent), planes)  # fmt: skip
 
 

@@ -18,32 +18,25 @@ ROUNDS = 30
 SAME = 1e-14  # change of the turn in a step, rad, that is none
 
 
-def tumbled(turn: Values, inertia: Values, momentum: Values, dt: Values) -> Values:
+def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Values:
     """(n, 3, 3) rotations after times dt (n,) s, from those before and angular momenta (n, 3), N m s.
 
-    `inertia`: (n, 3, 3) in the axes of the bodies, kg m^2.
+    `inverse`: (n, 3, 3) of the inertia in the axes of the bodies, 1 / (kg m^2).
     """
     if not len(turn):
         return turn
-    angle = dt[:, None] * spin_of(turn, inertia, momentum)
+    angle = dt[:, None] * rotated(turn, inverse, momentum)
     for _ in range(ROUNDS):
         halfway = Rotation.from_rotvec(angle / 2).as_matrix() @ turn
-        found = dt[:, None] * spin_of(halfway, inertia, momentum)
+        found = dt[:, None] * rotated(halfway, inverse, momentum)
         change, angle = float(np.abs(found - angle).max()), found
         if change < SAME:
             break
     return np.asarray((Rotation.from_rotvec(angle) * Rotation.from_matrix(turn)).as_matrix())
 
 
-def spin_of(turn: Values, inertia: Values, momentum: Values) -> Values:
-    """(n, 3) rad/s of bodies with angular momenta (n, 3), N m s."""
-    return np.asarray(np.linalg.solve(_in_space(inertia, turn), momentum[:, :, None])[:, :, 0])
-
-
-def momentum_of(turn: Values, inertia: Values, spin: Values) -> Values:
-    """(n, 3) R I R^T w, N m s."""
-    return np.einsum("nij,nj->ni", _in_space(inertia, turn), spin)
-
-
-def _in_space(inertia: Values, turn: Values) -> Values:
-    return np.asarray(turn @ inertia @ np.swapaxes(turn, 1, 2))
+def rotated(turn: Values, tensor: Values, vector: Values) -> Values:
+    """(n, 3) R T R^T v of tensors in the axes of bodies (n, 3, 3), inertia or its inverse, and vectors in space (n, 3):
+    spins, or angular momenta."""
+    across = np.swapaxes(turn, 1, 2) @ vector[:, :, None]
+    return np.asarray((turn @ (tensor @ across))[:, :, 0])
