@@ -35,6 +35,7 @@ COARSE = {
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "platens": ["mesh.h=0.01"],
     "punched-slab": ["mesh.h=0.01"],
+    "rigid-dropped-vase": ["mesh.h=0.02"],
     "rigid-figure": ["mesh.h=0.015"],
     "rigid-vase": ["mesh.h=0.015"],
     "rigid-wall": ["mesh.h=0.15"],
