@@ -17,8 +17,9 @@ from scipy.optimize import brentq
 
 from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
 from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
+from fracsim.fracture.energy.mixed import NORMAL, SHEAR, gain, kink, phase
 from fracsim.fracture.energy.seen import Seen
-from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
+from fracsim.fracture.energy.tips import AVERAGE, DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
@@ -169,6 +170,55 @@ def test_the_force_of_a_known_field(kind: str) -> None:
         )
         expected = np.array([first**2 + second**2, -2 * first * second])
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
+
+
+def test_where_a_crack_turns_in_closed_form() -> None:
+    """The greatest hoop stress over all angles, by looking at them (Erdogan and Sih 1963): 70.5 degrees in pure
+    sliding, where its K^2 is 4/3, and where the sides press on each other, too; c_1 and c_2 are means over angles of
+    the fields around a tip."""
+    psi, t = np.linspace(-2, 2, 41), np.linspace(-np.pi, np.pi, 200_001)
+    for each in psi:
+        hoop = np.cos(t / 2) * (max(np.cos(each), 0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(each) * np.sin(t))
+        best = np.argmax(hoop)
+        if each:
+            assert kink(np.array([each]))[0] == pytest.approx(t[best], abs=1e-4)
+        expected = hoop[best] ** 2 / np.sqrt(1 + np.sin(2 * each) ** 2)
+        assert gain(np.array([each]))[0] == pytest.approx(expected, rel=1e-6)
+    assert np.degrees(kink(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
+    assert gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
+    c, s = np.cos(t / 2), np.sin(t / 2) * np.sin(1.5 * t)
+    assert np.mean(c * (1 + s)) == pytest.approx(NORMAL, rel=1e-4)
+    assert np.mean(c * (1 - s)) == pytest.approx(SHEAR, rel=1e-4)
+    turned = np.array([[np.cos(0.3), np.sin(0.3)]])
+    Q = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    stress = Q @ np.array([[0.4, 0.5 * SHEAR], [0.5 * SHEAR, NORMAL]]) @ Q.T
+    assert phase(stress[None], turned)[0] == pytest.approx(np.arctan2(0.5, 1.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
+    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 12 degrees, and what the crack
+    that turns releases to a quarter, as near as a field is that no mesh made; the first principal stress of the mean
+    is 30 degrees off."""
+    study = make_study(**plate_tables(), crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
+    scene = scene_on(distribute(MPI.COMM_SELF, square(kind, 30)), study)
+    graph, criterion = scene.fracture.graph, scene.fracture.criterion
+    tips = np.flatnonzero(graph.damaged & ~graph.split)
+    _, point = criterion._entries(tips)
+    for first, second in ((1.0, 0.5), (1.0, 1.0), (0.0, 1.0)):
+        u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
+        scene.balance.displace(u.ravel())
+        seen = criterion.sight.look(*scene.fracture.evaluate(), point, point, criterion.cut)
+        radius = AVERAGE * criterion._h[tips]
+        mean, _ = seen.averages(point, radius)
+        back, _ = seen.behind(point, radius, 0 * radius)
+        size = np.linalg.norm(seen.forces(point, criterion.disc * criterion._h[tips]), axis=1)
+        released, ahead = criterion._turned(mean, point - back, size)
+        psi = np.arctan2([second], [first])
+        angle = np.arctan2(ahead[0, 1], ahead[0, 0])
+        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=12)
+        expected = (first**2 + second**2) * np.sqrt(1 + np.sin(2 * psi[0]) ** 2) * gain(psi)[0]
+        assert released[0] * STIFF == pytest.approx(expected, rel=0.25)
 
 
 # --- a notched plate -------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ force      g, the energy that a tip's advance releases for each area of crack
 around     what lies around a place, on any rank
 front      in space: the crack that an advance makes, by which g is divided
 seen       the body as tips see it
+mixed      where a crack in tension and sliding turns, and what that releases
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
 splitting  what is left of a cell that has come apart

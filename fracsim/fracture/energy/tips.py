@@ -25,6 +25,7 @@ from ..edge_stress import frobenius_norm
 from ..strength import Strength, hashed
 from .around import local_size
 from .cutting import Cuts, cleave, leave, through_centre
+from .mixed import gain, kink, phase
 from .seen import Seen, Sight
 
 Flags = npt.NDArray[np.bool_]
@@ -50,7 +51,8 @@ class Proposal:
         rank: (n, d + 4): 0 for a tip and 1 for a new crack, - sigma_1 in Pa, a hash, the place, and how near no other
             may be, m.
         cells: (n,) local.    stress: (n, d, d) averaged, Pa.
-        entry, ahead: (n,) local edge where the crack came in, and (n, d) whither it goes; None of new cracks.
+        entry, ahead, turns: (n,) local edge where the crack came in, (n, d) whither it goes, and (n,) whether it goes
+            just there, not across the first principal stress; None of new cracks.
     """
 
     rank: Values
@@ -58,6 +60,7 @@ class Proposal:
     stress: Values
     entry: Ints | None = None
     ahead: Values | None = None
+    turns: Flags | None = None
 
     @property
     def place(self) -> Values:
@@ -68,7 +71,8 @@ class Proposal:
         """Some of them."""
         entry = None if self.entry is None else self.entry[rows]
         ahead = None if self.ahead is None else self.ahead[rows]
-        return Proposal(self.rank[rows], self.cells[rows], self.stress[rows], entry, ahead)
+        turns = None if self.turns is None else self.turns[rows]
+        return Proposal(self.rank[rows], self.cells[rows], self.stress[rows], entry, ahead, turns)
 
 
 class CrackTips:
@@ -153,14 +157,29 @@ class CrackTips:
         mean, square = seen.averages(point, AVERAGE * h)
         sigma = largest(mean)
         behind, mature = seen.behind(point, radius, FULL * h)
-        size = np.linalg.norm(force, axis=1)
+        size, ahead = np.linalg.norm(force, axis=1), np.where(mature[:, None], force, point - behind)
+        turns = np.zeros(len(tips), bool)
+        if d == 2:
+            back, _ = seen.behind(point, AVERAGE * h, 0 * h)
+            size, turned = self._turned(mean, point - back, size)
+            turns = mature & np.any(turned, axis=1)
+            ahead = np.where(turns[:, None], turned, ahead)
         toughness = np.broadcast_to(self.toughness, len(self._h))[tips]
         strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips] * toughness / (AVERAGE * h))
         young = (sigma >= self._strength_of(tips)) | (np.sqrt(square) >= strained)
         active = np.flatnonzero(np.where(mature, size >= toughness, young) & (sigma > 0))
-        ahead = np.where(mature[:, None], force, point - behind)[active]
         rank = self._ranked(0, sigma[active], point[active], APART[d] * h[active])
-        return Proposal(rank, tips[active], mean[active], entry[active], ahead)
+        return Proposal(rank, tips[active], mean[active], entry[active], ahead[active], turns[active])
+
+    @staticmethod
+    def _turned(stress: Values, along: Values, size: Values) -> tuple[Values, Values]:
+        """(n,) what cracks that turn release, J/m^2, and (n, 2) whither; 0 where nothing lies behind."""
+        length = np.linalg.norm(along, axis=1)
+        tangent = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
+        psi = phase(stress, tangent)
+        c, s = np.cos(kink(psi)), np.sin(kink(psi))
+        turned = np.column_stack([c * tangent[:, 0] - s * tangent[:, 1], s * tangent[:, 0] + c * tangent[:, 1]])
+        return np.where(length > 0, size * gain(psi), size), turned
 
     def _begun(self, seen: Seen, weak: Ints) -> Proposal:
         """Whole cells, farther than R from any crack, whose averaged stress reaches the strength."""
@@ -239,6 +258,9 @@ class CrackTips:
         corners, normals = self._corners(grown.cells), self._normals(grown.stress, grown.cells)
         if self._domain.dim == 3:
             return cleave(corners, ~self._graph.intact(grown.cells), grown.place, normals)
+        assert grown.turns is not None
+        across = np.column_stack([-grown.ahead[:, 1], grown.ahead[:, 0]])
+        normals = np.where(grown.turns[:, None], across, normals)
         torn = self._torn()[self._graph.cell_edges[grown.cells]]
         return leave(corners, grown.entry, grown.place, normals, grown.ahead, torn)
 
