@@ -1,4 +1,4 @@
-"""The trials of the stability and dependence groups, what they measure, and the sections made of them."""
+"""The trials of the stability, dependence and experiments groups, what they measure, and the sections made of them."""
 
 import json
 from pathlib import Path
@@ -14,6 +14,7 @@ from fracsim.studies.evidence import (
     closed_forms,
     contacts,
     dependence,
+    experiments,
     extremes,
     failed,
     results,
@@ -337,3 +338,44 @@ def test_section_of_dependence() -> None:
     assert spread.rows == (("bar-local", 3, 1.0, 1.0, 1.0, 1.0),)
     assert len(every.rows) == 4 and every.rows[3][3] == "out of time"
     assert section.plots[0].series[0].y == (1.0, 2.0, 3.0)
+
+
+# --- experiments ----------------------------------------------------------------------------------------------------
+
+
+def test_experiments_have_three_meshes_each_and_are_valid() -> None:
+    trials = experiments.trials()
+    for case, experiment in experiments.BY_CASE.items():
+        own = [trial for trial in trials if trial.case == case]
+        assert len(own) == 3 and len({trial.name for trial in own}) == 3
+        assert callable(getattr(experiments, own[0].measure.partition(":")[2]))
+        for trial, h in zip(own, experiment.sizes[1], strict=True):
+            assert trial.study is not None and trial.study["mesh"][experiment.sizes[0]] == h
+            assert check_study(validate(trial.study, case))
+
+
+def test_the_second_peak_is_the_top_of_the_longest_rise_after_the_first() -> None:
+    load = np.array([0.0, 5.0, 10.0, 4.0, 4.5, 3.0, 7.0, 6.5, 6.9, 1.0])
+    assert experiments.second_peak(load) == 7.0
+    assert experiments.second_peak(np.array([0.0, 3.0, 2.0, 1.0])) == 3.0  # there is none
+    rows = {"contact_striker_y": -load, "motion_striker_y": -np.arange(10.0), "work_striker": load, "pieces": load}
+    found = experiments.figures(rows, "striker", "y")
+    assert (found["peak"], found["at"], found["second"], found["last"], found["travel"]) == (10.0, 1.0, 7.0, 1.0, 8.0)
+    assert found["plateau"] == 6.5  # of the ways 5 to 9: 3, 7, 6.5, 6.9, 1
+    assert max(found["curve"][1]) == 10.0 and len(found["curve"][0]) == 10
+
+
+def test_section_of_experiments() -> None:
+    """A disk 5 % off on two meshes and 20 % on the third is no claim that holds; a failed run stays in the table."""
+    exact = experiments.BY_CASE["brazilian"].peak
+    records = []
+    for h, off in ((0.01, 1.05), (0.008, 0.95), (0.0065, 1.2)):
+        figures = {"peak": off * exact, "last": 0.4 * exact, "along": 0.7, "curve": [[0.0, 1e-3], [0.0, exact]]}
+        records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
+    records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
+    (section,) = experiments.sections(records)
+    assert [claim.holds for claim in section.claims] == [False, True, True, None, None]
+    every, spreads = section.tables
+    assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
+    assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))
+    assert [series.style for series in section.plots[0].series] == ["line", "line", "line", "reference"]

@@ -203,3 +203,23 @@ def test_ends_and_steps_that_cannot_be_are_refused() -> None:
     assert "material.thickness is that of 2D meshes" in refused(
         mesh={"size": [1.0, 0.25, 0.25]}, material={"thickness": 0.1}, boundary=[], probe=[]
     )
+
+
+# --- passes beside what touches -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("itself", [False, "pieces"])
+def test_a_step_is_solved_again_with_new_walls_beside_an_obstacle(itself: bool | str) -> None:
+    """Walls that came to light in one pass of a step are there in the next: what was before knows nothing of them."""
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.36], "velocity": [0.0, -1.0]}
+    time = {"scheme": "backward-euler", "step": 5e-3, "end": 0.02}
+    breaks = {"passes": 4, "strength": 3e4}
+    struck = study(STRIP, mesh={"h": 0.0625}, fracture=breaks, obstacle=[ball], contact={"itself": itself}, time=time)
+    scene = build_scene(MPI.COMM_SELF, struck)
+    state, broken, solves = scene.start(), [], []
+    while not scene.ended(state):
+        state, report = scene.stepper.advance(state)
+        broken.append(report.broken)
+        solves.append(report.solve.newton)
+    assert sum(broken) > 0 and np.isfinite(state.u).all()
+    assert scene.fracture is not None and scene.fracture.graph.broken_count == sum(broken)

@@ -99,6 +99,25 @@ def study(specimen: Specimen, mesh: Data, radius: float) -> Data:
     }
 
 
+ENERGY = 350.0  # G_c in J/m^2: PMMA
+
+
+def torn(specimen: Specimen, pattern: str, h: float) -> Data:
+    """The same of a whole rectangle with a crack in place of the slit, which takes a fracture energy. The crack lies
+    off the rows of nodes of a lattice."""
+    at = specimen.plane + 0.2 * MM
+    low, high = specimen.slit
+    ends = [list(low), list(high)]
+    for end in ends:
+        end[specimen.axis] = at
+    mesh = {"builder": "box", "size": list(specimen.size), "h": h, "pattern": pattern}
+    data = study(specimen, mesh, 0.0)
+    data["fracture"] = {"strength": data["fracture"]["strength"], "energy": ENERGY}
+    data["crack"] = [{"segment": ends}]
+    data["time"] |= {"breaking_step": 1.0 / STEPS / 32, "until": {"drop": 0.8}}
+    return data
+
+
 def unstructured(specimen: Specimen, h: float) -> Data:
     """The [mesh] table of gmsh's mesh with cells of one size."""
     fine = "h_notch" if specimen is BAR else "h_tip"

@@ -116,8 +116,12 @@ class Surface:
         return self.at.share, self._out, self._pause
 
     def recall(self, memory: Memory) -> None:
-        """Be again what `memory` gave of this surface."""
-        share, out, self._pause = memory
+        """Be again what `memory` gave of this surface; where edges have broken since, in an earlier pass of the step,
+        it is another one and stays as those left it."""
+        share, out, pause = memory
+        if len(share) != len(self.at.share):
+            return
+        self._pause = pause
         if share is not self.at.share:
             self.at = self.at.drawn_in(share)
         if out is not self._out:

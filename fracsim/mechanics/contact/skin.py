@@ -236,8 +236,12 @@ class Skin:
         return self._surface.at.share, self.area, self._cut
 
     def recall(self, memory: object) -> None:
-        """Be again what `memory` gave of this surface (not collective)."""
-        share, area, self._cut = cast("tuple[Values, Values, Ints]", memory)
+        """Be again what `memory` gave of this surface; where edges have broken since, in an earlier pass of the step,
+        it is another one and stays as those left it (not collective)."""
+        share, area, cut = cast("tuple[Values, Values, Ints]", memory)
+        if len(share) != len(self._surface.at.share):
+            return
+        self._cut = cut
         if share is not self._surface.at.share:
             self._surface.at = self._surface.at.drawn_in(share)
         self.area = area

@@ -1,0 +1,279 @@
+"""Experiments of papers and handbooks: load over displacement and energy on three meshes, beside what is known."""
+
+from __future__ import annotations
+
+import tomllib
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import folder as packaged
+from . import results
+from .dependence import crack_faces, spread
+from .section import Cell, Claim, Picture, Plot, Section, Series, Table, folder_of
+from .trial import Trial
+
+GROUP = "experiments"
+Record = dict[str, Any]
+Values = npt.NDArray[np.float64]
+Changes = dict[str, dict[str, Any]]
+
+DUCTILE: Changes = {
+    "material": {"like": "steel NVE 36 at 23 C", "energy": "corotated"},
+    "fracture": {"energy": False, "radius": 8e-4},
+    "plasticity": {"update": "implicit"},
+    "time": {"step": 1e-5, "breaking_step": 1e-5},
+}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A packaged study on three meshes.
+
+    Attributes:
+        changes: of its tables.    sizes: (key of [mesh], values in m, the coarsest first).
+        pushed: obstacle whose force and way are the curve.    axis: along which.
+        peak: reference, N, and `source` in words.    within: how far off it may be; None: what is told, not claimed.
+    """
+
+    case: str
+    study: str
+    sizes: tuple[str, tuple[float, ...]]
+    pushed: str
+    axis: str
+    peak: float
+    source: str
+    changes: Changes
+    within: float | None = None
+
+
+NOTCHED = ("h_notch", (4e-4, 3e-4, 2.2e-4))
+EXPERIMENTS = (
+    Experiment(
+        "brazilian", "brazilian", ("h", (0.01, 0.008, 0.0065)), "upper", "y", 6.007e5, "pi D t f_t / 2", {}, within=0.1
+    ),
+    Experiment(
+        "charpy-A516", "charpy", NOTCHED, "striker", "y", 8.51e3, "static, sharp notch, ASTM E399", {}
+    ),
+    Experiment(
+        "charpy-NVE36", "charpy", NOTCHED, "striker", "y", 1.93e3,
+        "limit load in plane strain without hardening, 1.26 x 1.155 yield b^2 B / S (Green and Hundy 1956)",
+        DUCTILE | {"time": DUCTILE["time"] | {"end": 8e-4}},
+    ),
+    Experiment(
+        "izod-A516", "izod", NOTCHED, "striker", "y", 3.63e3, "static, sharp notch in bending, K_c (Tada)", {}
+    ),
+    Experiment(
+        "izod-NVE36", "izod", NOTCHED, "striker", "y", 8.8e2, "limit load, as of charpy-NVE36",
+        DUCTILE | {"time": DUCTILE["time"] | {"end": 1.2e-3, "step": 2e-5, "breaking_step": 2e-5}},
+    ),
+    Experiment(
+        "charpy-klst", "charpy-klst", ("h_notch", (1.6e-4, 1.2e-4, 0.9e-4)), "striker", "y", 2.43e3,
+        "measured: SRM 2216, NIST SP 260-180 (1.59 J absorbed)", {},
+    ),
+)  # fmt: skip
+BY_CASE = {each.case: each for each in EXPERIMENTS}
+
+
+def trials() -> list[Trial]:
+    """Each experiment on its meshes."""
+    return [_trial(each, h) for each in EXPERIMENTS for h in each.sizes[1]]
+
+
+def study_of(experiment: Experiment, h: float) -> dict[str, Any]:
+    """The packaged study with the changes of an experiment, on one of its meshes."""
+    data = tomllib.loads((packaged() / f"{experiment.study}.toml").read_text())
+    for table, values in deepcopy(experiment.changes).items():
+        data[table] = data.get(table, {}) | values
+    data["mesh"][experiment.sizes[0]] = h
+    return data
+
+
+def _trial(experiment: Experiment, h: float) -> Trial:
+    return Trial(
+        GROUP, experiment.case, f"{h * 1e3:g}-mm", study=study_of(experiment, h), settings={"h": h}, limit=600.0,
+        measure=f"experiments:measured_{experiment.study.replace('-', '_')}",
+    )  # fmt: skip
+
+
+# --- what is measured -----------------------------------------------------------------------------------------------
+
+
+def measured_brazilian(run: Path) -> Record:
+    """Figures of the disk, and how much of its loaded diameter the cracks follow within a tenth of the radius."""
+    rows = results.history(run)
+    size, centres = crack_faces(run)
+    radius = float(results.study(run)["mesh"]["radius"])
+    near = np.abs(centres[:, 0]) < 0.1 * radius
+    bins = np.unique(np.floor(20 * (centres[near, 1] / radius + 1) / 2))
+    return figures(rows, "upper", "y") | {"along": len(bins) / 20, "crack": float(size.sum() / 2)}
+
+
+def measured_charpy(run: Path) -> Record:
+    """Figures of a bar."""
+    return _of_bar(run)
+
+
+def measured_izod(run: Path) -> Record:
+    """Figures of a bar."""
+    return _of_bar(run)
+
+
+def measured_charpy_klst(run: Path) -> Record:
+    """Figures of a bar."""
+    return _of_bar(run)
+
+
+def _of_bar(run: Path) -> Record:
+    """With how high over the notch edges are broken, m."""
+    mesh = results.study(run)["mesh"]
+    size, centres = crack_faces(run)
+    top = float(centres[:, 1].max()) - float(mesh["notch_depth"]) if len(size) else 0.0
+    return figures(results.history(run), "striker", "y") | {
+        "torn": top,
+        "ligament": mesh["height"] - mesh["notch_depth"],
+    }
+
+
+def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
+    """Peak and way there; `second`: the load that the body comes up to after the first peak, which is inertia where it
+    is struck; `plateau`: the median over the second half of the way; what is left; what has been absorbed."""
+    load, way = np.abs(rows[f"contact_{pushed}_{axis}"]), np.abs(rows[f"motion_{pushed}_{axis}"])
+    touched = float(way[np.flatnonzero(load)[0]]) if load.any() else 0.0
+    return {
+        "peak": float(load.max()),
+        "at": float(way[load.argmax()]) - touched,
+        "second": second_peak(load),
+        "plateau": float(np.median(load[way >= (touched + way[-1]) / 2])),
+        "last": float(load[-1]),
+        "absorbed": float(rows[f"work_{pushed}"][-1]),
+        "travel": float(way[-1]) - touched,
+        "pieces": float(rows["pieces"][-1]),
+        "curve": [[float(value) for value in each] for each in thinned(way - way[0], load)],
+    }
+
+
+def second_peak(load: Values) -> float:
+    """The load at the top of the longest rise after the greatest one."""
+    after = load[int(load.argmax()) :]
+    return float(after[int(np.argmax(after - np.minimum.accumulate(after)))])
+
+
+def thinned(way: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
+    """A curve in so many points or a few more; its peak is among them."""
+    rows = np.unique([*np.arange(0, len(load), max(1, len(load) // most)), int(load.argmax()), len(load) - 1])
+    return way[rows], load[rows]
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+COLUMNS = (
+    "experiment", "h, m", "outcome", "first peak, N", "second, N", "plateau, N", "last, N", "over reference",
+    "absorbed, J", "way of what pushes, m", "pieces",
+)  # fmt: skip
+SPREADS = ("experiment", "meshes", "peak, N", "spread", "reference, N", "off by", "source")
+TEXT = (
+    "Each on three meshes, in 2D with the thickness of the specimen. The disk splits along its loaded diameter at"
+    " pi D t f_t / 2. Charpy and Izod bars in plane strain: A516 takes a fracture energy and snaps; its first "
+    "peak is the inertia of the bar that the striker sets in motion, so that it is the second, while the crack "
+    "begins, that compares with the static load. NVE 36 flows and bends at a load that stays: linear triangles in"
+    " plane strain lock in plastic flow, so that it lies above the limit load. KLST is of hardened steel whose "
+    "yield stress is a handbook's, not fitted. The papers' own curves are pictures and could not be laid beside "
+    "these."
+)
+
+
+def sections(records: list[Record]) -> list[Section]:
+    """Tables, claims, curves and pictures."""
+    tables = (
+        Table("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
+        Table("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", SPREADS,
+              tuple(_spreads(records))),
+    )  # fmt: skip
+    plots = tuple(_plot(records, case) for case in BY_CASE if any(record["case"] == case for record in records))
+    pictures = tuple(
+        Picture(f"{r['case']}, {r['name']}", f"{folder_of(r)}/run/last.png")
+        for r in records
+        if r["outcome"] == "done" and r["settings"]["h"] == BY_CASE[r["case"]].sizes[1][1]
+    )
+    return [Section("Experiments", TEXT, claims=_claims(records), tables=tables, plots=plots, pictures=pictures)]
+
+
+def _compared(record: Record) -> float | None:
+    """The load that the reference is of: of what snaps the one after the inertia, of what bends that which stays."""
+    key = {"A516": "second", "NVE36": "plateau"}.get(record["case"].rpartition("-")[2], "peak")
+    found: float | None = record["figures"].get(key)
+    return found
+
+
+def _row(record: Record) -> tuple[Cell, ...]:
+    found, peak = record["figures"], _compared(record)
+    over = None if peak is None else peak / BY_CASE[record["case"]].peak
+    loads, others = ("peak", "second", "plateau", "last"), ("absorbed", "travel", "pieces")
+    return (record["case"], record["settings"]["h"], record["outcome"], *(found.get(key) for key in loads), over,
+            *(found.get(key) for key in others))  # fmt: skip
+
+
+def _spreads(records: list[Record]) -> list[tuple[Cell, ...]]:
+    found: list[tuple[Cell, ...]] = []
+    for case, experiment in BY_CASE.items():
+        peaks = [p for r in records if r["case"] == case and r["outcome"] == "done" and (p := _compared(r)) is not None]
+        if peaks:
+            mean = sum(peaks) / len(peaks)
+            off = mean / experiment.peak - 1
+            found.append((case, len(peaks), mean, spread(peaks), experiment.peak, off, experiment.source))
+    return found
+
+
+def _claims(records: list[Record]) -> tuple[Claim, ...]:
+    disks = [r for r in records if r["case"] == "brazilian" and r["outcome"] == "done"]
+    bars = {steel: [r for r in records if steel in r["case"] and r["outcome"] == "done"] for steel in ("A516", "NVE36")}
+    return (*_of_disks(disks), *_of_steels(**bars))
+
+
+def _of_disks(disks: list[Record]) -> tuple[Claim, ...]:
+    limit = BY_CASE["brazilian"].within or 0.0
+    off = [record["figures"]["peak"] / BY_CASE["brazilian"].peak - 1 for record in disks]
+    left = [record["figures"]["last"] / record["figures"]["peak"] for record in disks]
+    along = [record["figures"]["along"] for record in disks]
+    many = len(disks) == 3
+    return (
+        Claim("The Brazilian peak is within 10 % of pi D t f_t / 2 on three meshes", _said(off, "{:+.1%}"),
+              all(abs(each) <= limit for each in off) if many else None),
+        Claim("Its load falls by half after the peak", _said(left, "{:.2f} left"),
+              all(each <= 0.5 for each in left) if many else None),
+        Claim("Cracks follow half of the loaded diameter, within a tenth of the radius", _said(along, "{:.0%}"),
+              all(each >= 0.5 for each in along) if many else None),
+    )  # fmt: skip
+
+
+def _of_steels(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
+    left = [record["figures"]["last"] / record["figures"]["second"] for record in A516]
+    stays = [record["figures"]["last"] / record["figures"]["plateau"] for record in NVE36]
+    both = len(A516) == 6 and len(NVE36) == 6
+    return (
+        Claim("A516 drops below 0.4 of what it has carried, Charpy and Izod", _said(left, "{:.2f}"),
+              all(each <= 0.4 for each in left) if both else None),
+        Claim("NVE 36 bends, and goes on carrying 0.8 of it and more", _said(stays, "{:.2f}"),
+              all(each > 0.8 for each in stays) if both else None),
+    )  # fmt: skip
+
+
+def _said(values: list[float], form: str) -> str:
+    return ", ".join(form.format(value) for value in values) or "not run"
+
+
+def _plot(records: list[Record], case: str) -> Plot:
+    """Load over the way of what pushes, a line a mesh, and the reference across."""
+    experiment, series, farthest = BY_CASE[case], [], 0.0
+    for record in records:
+        if record["case"] == case and record["outcome"] == "done":
+            way, load = record["figures"]["curve"]
+            series.append(Series(record["name"], tuple(way), tuple(load), style="line"))
+            farthest = max(farthest, way[-1])
+    line = Series(experiment.source, (0.0, farthest), (experiment.peak, experiment.peak), style="reference")
+    return Plot(f"{case}: load over the way of the {experiment.pushed}", "m", "N", (*series, line))
