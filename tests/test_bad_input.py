@@ -85,7 +85,10 @@ REFUSED: list[tuple[Data, str]] = [
     (without("fracture", "strength", STRIP), "fracture.strength is missing; the table [fracture] needs it"),
     (right(), "boundary.1: give exactly one of fix, displacement, velocity, traction, force, pressure; found none"),
     (right(fix="x", pressure=1.0), "found fix and pressure"),
-    (changed(BAR, mesh=None) | {"mesh": {}}, "mesh: give exactly one of builder, file, surface; found none of them"),
+    (
+        changed(BAR, mesh=None) | {"mesh": {}},
+        "mesh: give exactly one of builder, file, surface, outline; found none of them",
+    ),
     (changed(BAR, mesh={"file": "a.msh"}), "found builder and file"),
     (held_at({"point": [0, 0, 0]}), "boundary.0.on.normal is missing"),
     # wrong types; a text is not a number, and a number not a truth value

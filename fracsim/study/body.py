@@ -9,22 +9,26 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from .values import NonNegative, Poisson, Positive, Strength, Table
 
+SOURCES = ("builder", "file", "surface", "outline")
+
 
 class Mesh(BaseModel):
-    """`builder` with its own parameters, or `file` with named groups, or a closed `surface` filled at size `h`."""
+    """`builder` with its own parameters, or `file` with named groups, or a closed `surface` or a plane `outline` filled
+    at size `h`."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     builder: str | None = None
     file: Path | None = None
     surface: Path | None = None
+    outline: Path | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Mesh:
-        given = [key for key in ("builder", "file", "surface") if getattr(self, key) is not None]
+        given = [key for key in SOURCES if getattr(self, key) is not None]
         if len(given) != 1:
             found = " and ".join(given) or "none of them"
-            raise ValueError(f"give exactly one of builder, file, surface; found {found}")
+            raise ValueError(f"give exactly one of {', '.join(SOURCES)}; found {found}")
         return self
 
     @property

@@ -101,7 +101,7 @@ def _anchor(data: dict[str, Any], folder: Path) -> None:
     tables = [("mesh", data.get("mesh"))]
     tables += [(f"obstacle.{i}", each) for i, each in enumerate(obstacles if isinstance(obstacles, list) else [])]
     for name, table in tables:
-        for key in ("file", "surface"):
+        for key in ("file", "surface", "outline"):
             if isinstance(table, dict) and isinstance(table.get(key), str):
                 if not table[key].isprintable():
                     raise InputError(f"{name}.{key} = {table[key]!a}: a path has no control characters")

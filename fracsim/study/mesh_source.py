@@ -21,6 +21,7 @@ from . import Mesh
 from .explain import explain, unknown_key
 
 if TYPE_CHECKING:
+    from ..meshes.scattered.drawn import Drawn
     from ..meshes.surfaces.closed import ClosedSurface
 
 
@@ -67,11 +68,16 @@ BESIDE = {
         "scale": "metres for each unit of length of the file, a number > 0",
         "time_limit": "seconds that gmsh may take, a number > 0",
     },
+    "outline": {
+        "h": "an outline is filled with cells of size h > 0 (m)",
+        "scale": "metres for each unit of length of the file, a number > 0",
+        "seed": "of its random points, a whole number > 0",
+    },
 }
 
 
 def _check_source(mesh: Mesh) -> None:
-    key = "file" if mesh.file is not None else "surface"
+    key = next(key for key in BESIDE if getattr(mesh, key) is not None)
     for name in mesh.parameters:
         if name not in BESIDE[key]:
             known = ", ".join((key, *BESIDE[key]))
@@ -80,7 +86,8 @@ def _check_source(mesh: Mesh) -> None:
         raise InputError(f'mesh.{key} = "{getattr(mesh, key)}": there is no such file')
     for name, meaning in BESIDE[key].items():
         value: Any = mesh.parameters.get(name)
-        if (name in mesh.parameters or name == "h") and not (is_number(value) and value > 0):
+        whole = name != "seed" or isinstance(value, int)
+        if (name in mesh.parameters or name == "h") and not (is_number(value) and value > 0 and whole):
             raise InputError(f"mesh.{name} = {value}: {meaning}")
 
 
@@ -93,6 +100,17 @@ def open_surface(mesh: Mesh) -> ClosedSurface | None:
     _check_source(mesh)
     with _told():
         return read_surface(mesh.surface, float(mesh.parameters.get("scale", 1.0)))
+
+
+def open_outline(mesh: Mesh) -> Drawn | None:
+    """The outline of a [mesh] table in metres, not filled; None where it names none. InputError."""
+    if mesh.outline is None:
+        return None
+    from ..meshes.scattered.drawn import read_outline
+
+    _check_source(mesh)
+    with _told():
+        return read_outline(mesh.outline, float(mesh.parameters.get("scale", 1.0)))
 
 
 def open_solid(file: Path, scale: float, key: str) -> ClosedSurface:
@@ -125,6 +143,10 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
             data = builder.build()
         elif surface is not None:
             data = _filled(mesh, surface)
+        elif (drawn := open_outline(mesh)) is not None:
+            from ..meshes.scattered.drawn import fill_outline
+
+            data = fill_outline(drawn, float(mesh.parameters["h"]), int(mesh.parameters.get("seed", 1)))
         else:
             assert mesh.file is not None
             data = read_mesh(mesh.file)
