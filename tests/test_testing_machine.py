@@ -127,6 +127,33 @@ def test_a_step_taken_again_leaves_nothing_behind(tmp_path: Path) -> None:
         )
 
 
+def test_a_restart_knows_the_peak(tmp_path: Path) -> None:
+    """Stopped at the peak of the load: what goes on ends with its fall, and with the same rows."""
+    tables: dict[str, Any] = {
+        "time": {"step": 0.02, "breaking_step": 0.01, "until": {"drop": 0.8}},
+        "fracture": {"energy": 1e-3}, "output": {"surface": False},
+    }  # fmt: skip
+    whole = run(SMOOTH, tmp_path / "whole", **tables)
+    peak = int(np.abs(whole["reaction_grip_x"]).argmax())
+    part = Run(build_scene(MPI.COMM_SELF, study(SMOOTH, **tables)), tmp_path / "part")
+    for _ in range(peak + 1):
+        part.step()
+    part.checkpoint()
+    part.history.close()
+    Run(build_scene(MPI.COMM_SELF, study(SMOOTH, **tables)), tmp_path / "part", restart=True)()
+    again = history(tmp_path / "part")
+    for name in (
+        "time",
+        "dt",
+        "reaction_grip_x",
+    ):  # where a bar of uniform stress breaks first is a matter of round-off
+        np.testing.assert_allclose(
+            again[name], whole[name], rtol=1e-6, atol=1e-8 * np.nanmax(np.abs(whole[name])), err_msg=name
+        )
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "part")]
+    assert summaries[0]["load"]["ended_the_run"] and summaries[1]["load"] == pytest.approx(summaries[0]["load"])
+
+
 # --- how long a crack is --------------------------------------------------------------------------------------------
 
 

@@ -31,11 +31,12 @@ class LoadDrop:
 
     def monitors(self) -> dict[str, Any]:
         """What a restart goes on from, for `restore`."""
-        return {"load_peak": [self.peak, self.t]}
+        return {"load_peak": [self.peak, self.t], "load_fallen": self.reached}
 
     def restore(self, monitors: dict[str, Any]) -> None:
         """Go on from `monitors`."""
         self.peak, self.t = monitors.get("load_peak", (0.0, 0.0))
+        self.reached = monitors.get("load_fallen", False)
 
     def summary(self) -> dict[str, Any]:
         """For summary.json: the peak of the load, when, and whether its fall ended the run."""
