@@ -58,9 +58,10 @@ def meshes_built_once() -> Iterator[None]:
 
 # The longest first, so that no worker is left alone with one of them at the end.
 FIRST = (
-    "test_restart", "test_meshes_builders", "test_plasticity", "test_obstacles", "test_ranks", "test_own_files",
-    "test_fracture", "test_closing", "test_free_obstacles", "test_meshes_fill", "test_studies", "test_cannot_write",
-    "test_sweep", "test_itself", "test_apart", "test_surface_run", "test_output", "test_cracked_solver",
+    "test_restart", "test_meshes_builders", "test_studies", "test_obstacles", "test_free_obstacles", "test_plasticity",
+    "test_stops", "test_stepping", "test_blow", "test_sweep", "test_ranks", "test_own_files", "test_facets",
+    "test_closing", "test_brittle", "test_fracture", "test_meetings", "test_bad_input", "test_cannot_write",
+    "test_surface_run", "test_output", "test_itself", "test_apart",
 )  # fmt: skip
 
 
