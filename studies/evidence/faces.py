@@ -127,9 +127,10 @@ def section(records: list[dict[str, Any]]) -> Section:
     counts = ("triangles", "pairs in touch", "Newton a step", "s a step")
     columns = ("scene", *counts, *times, "outcome")
     text = (
-        "Processor time: of steps the mean from the first touch to rest, else medians. Where faces lie on each other a hundred times as many pairs touch, whose barriers "
-        "have to be summed; where bodies would meet, which parallel faces may make endless, is asked of all that is "
-        "near. In the first dozen steps, in which the bodies meet, faces take 1.8 times as long as edges."
+        "Processor time: of steps the mean from the first touch to rest, else medians. Where faces lie on each other a "
+        "hundred times as many pairs touch, whose barriers have to be summed; where bodies would meet, which parallel "
+        "faces may make endless, is asked of all that is near. In the first dozen steps, in which the bodies meet, "
+        "faces take 1.8 times as long as edges."
     )
     table = Table("faces", "Costs", columns, tuple(map(_row, records)))
     title = "Contact: flat on flat, edge on edge"
