@@ -55,7 +55,7 @@ def test_the_advance_of_a_front_is_that_of_a_smooth_one() -> None:
     np.testing.assert_allclose(around(scene, np.array([0.15, 0.3, 0.512]), 0.2), 0.0, atol=5e-3)
     angle = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     ring = np.column_stack([0.5 + 0.3 * np.cos(angle), 0.5 + 0.3 * np.sin(angle), np.full(30, 0.512)])
-    scene = cracked({"polygon": ring.tolist()}, [1.0, 1.0, 1.0], 1 / 8)
+    scene = cracked({"polygon": ring.tolist()}, [1.0, 1.0, 1.0], 1 / 6)
     np.testing.assert_allclose(around(scene, np.array([0.5, 0.5, 0.5]), 100.0), 0.0, atol=5e-3)
 
 
