@@ -139,6 +139,8 @@ def fracsim_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 def swept_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """A sweep in this process, and its runs too: for tests of what it makes of their ends, not of how they start."""
+    import h5py  # noqa: F401  # Debian's starts a process when it is first imported: a real one
+
     with mock.patch("fracsim.report.sweep.subprocess.Popen", _RunHere):
         return fracsim_here("sweep", *arguments)
 
