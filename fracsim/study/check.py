@@ -99,9 +99,10 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
 
 
 def _finest(builder: Any) -> float:
-    """The least of a builder's sizes of cells, m; h at a notch or a hole is h / 4 where it is left out."""
+    """The least of a builder's sizes of cells, m; h at a notch or a hole is h / 4 where it is left out. Infinite
+    where it has none."""
     sizes = {name: size for name, size in vars(builder).items() if name == "h" or name.startswith("h_")}
-    return float(min(builder.h / 4 if size is None else size for size in sizes.values()))
+    return float(min((builder.h / 4 if size is None else size for size in sizes.values()), default=np.inf))
 
 
 def _counted(mesh: MeshData) -> str:
