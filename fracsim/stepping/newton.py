@@ -95,6 +95,7 @@ class Solver:
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
         )
+        self._asked = float(given.get("ksp_rtol", 0.0))
         self._linearly = is_linear(balance, given, snes.ksp.getType())
         self._ending = Ending(snes.comm, int(snes.ksp.max_it)) if self._linearly and self._iterative else None
         self._first = 0.0
@@ -295,11 +296,13 @@ class Solver:
         return None
 
     def _correct(self, little: float) -> tuple[float, int] | None:
-        """K correction = balance.vector, by CG down to what is `little`, N, or as the KSP does it: |r| that is left,
-        infinite where nothing is known, and iterations; None: it was not solved."""
+        """K correction = balance.vector, by CG down to what is `little`, N, and to what the study asks of it, or as the
+        KSP does it: |r| that is left, infinite where nothing is known, and iterations; None: it was not solved."""
         if self._ending is None or self.snes.ksp.getType() != "cg":
             return (np.inf, self.snes.ksp.its) if self._solve_linear() else None
         ending, tangent, preconditioner = self._ending, self.balance.tangent, self._preconditioner
+        if self._asked:
+            little = min(little, self._asked * self.balance.vector.norm())
         self._assemble_tangent(tangent)
         solved = ending.solve(tangent, preconditioner.pc, self.balance.vector, self._correction, little)
         preconditioner.its = ending.to_share(float(self.snes.ksp.rtol))
