@@ -46,6 +46,7 @@ FULL: Data = changed(
             "hinge": {"point": [0.0, 12.0]},
         },
     ],
+    time={"until": {"drop": 0.5, "of": "bob"}},
     boundary=[
         {"on": {"box": [[0, 0], [1, 1]]}, "fix": "xy"},
         {"on": {"point": [1, 0], "normal": [1, 0]}, "pressure": {"time": [0, 1], "value": [0, 1]}},

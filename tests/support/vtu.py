@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
 LINE, TRIANGLE = 3, 5
@@ -32,11 +33,20 @@ def frames(folder: Path) -> list[Drawn]:
     return [_read(t, folder / file) for t, file in files if Path(file).name.startswith("surface_")]
 
 
-def _read(t: float, path: Path) -> Drawn:
+def points_of(path: Path) -> npt.NDArray[np.float64]:
+    """(n, 3) of a file, m."""
+    return vtk_to_numpy(_grid(path).GetPoints().GetData()).astype(float)
+
+
+def _grid(path: Path) -> vtkUnstructuredGrid:
     reader = vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     reader.Update()
-    grid = reader.GetOutput()
+    return reader.GetOutput()
+
+
+def _read(t: float, path: Path) -> Drawn:
+    grid = _grid(path)
     kind, cells = vtk_to_numpy(grid.GetCellTypesArray()), grid.GetCells()
     start, corner = vtk_to_numpy(cells.GetOffsetsArray()), vtk_to_numpy(cells.GetConnectivityArray())
 
