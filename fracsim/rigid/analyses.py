@@ -94,12 +94,17 @@ def serve(comm: MPI.Comm, make: Callable[[Any], Breakable]) -> None:
     """On all other ranks: analyse what rank 0 says, until it sends None; `make`: of what `begin` is."""
     if (begin := comm.bcast(None)) is None:
         return
-    breakable = make(begin)
+    breakable: Breakable | None = None
     while (message := comm.bcast(None)) is not None:
-        if message.saved is not None:
-            breakable.restore(message.saved)
-        breakable.take(message.news)
-        _gathered(comm, breakable, message.strikes)
+        try:
+            breakable = breakable or make(begin)
+            if message.saved is not None:
+                breakable.restore(message.saved)
+            breakable.take(message.news)
+        except Exception as error:  # told instead of what was found: rank 0 waits for it
+            comm.gather(error)
+        else:
+            _gathered(comm, breakable, message.strikes)
 
 
 def _gathered(comm: MPI.Comm, breakable: Breakable, strikes: list[Strike]) -> list[Any] | None:

@@ -228,7 +228,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
             yield "            note: obstacles that move freely do not feel those from files"
     if study.contact is not None and study.contact.itself:
         of = "of pieces alone with one another" if study.contact.itself == "pieces" else "of the body with itself"
-        yield f"contact     {of}, friction {study.contact.friction:g}; {_PRICE_OF_CONTACT}"
+        price = _PRICE_OF_CONTACT[study.time.kind.implicit]
+        yield f"contact     {of}, friction {study.contact.friction:g}; {price}"
         yield f"            its surface has {anatomy.surface()}, {_MORE}"
     steps = study.time.end / study.time.step
     halving = "halved where a step fails" if study.time.adapt else "fixed"
@@ -269,9 +270,10 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
 _MORE = "and of cracks as they open"
 _PRICE_OF_OBSTACLES = "nothing is gathered; some 2 % of a step until they touch"
 _PRICE_OF_SOLIDS = "gathered and detected on one rank, from two edges' length on"
-_PRICE_OF_CONTACT = (
-    "gathered and detected on one rank: some tenth of a step until something touches, on n ranks n times that share"
-)
+_PRICE_OF_CONTACT = {
+    implicit: f"gathered and detected on one rank: some {share} until something touches, on n ranks n times that share"
+    for implicit, share in ((True, "tenth of a step"), (False, "two fifths of an explicit step (12,000 cells)"))
+}
 
 
 def _motion(obstacle: Obstacle) -> str:
