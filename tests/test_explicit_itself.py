@@ -14,7 +14,7 @@ from fracsim.mechanics.contact.explicit_itself import ExplicitSelfContact, Pushe
 from fracsim.mechanics.contact.pushing import Pushing, rates
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
-from support.scenes import each_step, make_scene, march, positions
+from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
 from test_itself import SOFT, two_blocks
 
@@ -130,12 +130,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
             probe=[{"name": "base", "on": "bottom"}], damping={"mass": 20.0},
             time={"scheme": "explicit", "step": 0.02, "end": 1.0}, **contact,
         )  # fmt: skip
-        graph = scene.fracture.graph
-        y = scene.domain.nodes[graph.edge_nodes][:, :, 1]
-        graph.break_edges((y.min(axis=1) < 0.45) & (y.max(axis=1) > 0.45))
-        scene.fracture.restored()
-        scene.balance.damage_changed()
-        scene.balance.edges_broke(graph.pattern)
+        break_across(scene, [0.0, 1.0], 0.45)
         if contact:
             assert contact_of(scene)[0].stored() == 0
         state.remember()

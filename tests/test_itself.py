@@ -11,7 +11,7 @@ import pytest
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.itself import SelfContact
 from fracsim.meshes.builders.box import Box
-from support.scenes import each_step, make_scene, march, positions
+from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
 
 FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
@@ -93,12 +93,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
             probe=[{"name": "base", "on": "bottom"}], damping={"mass": 20.0}, solver=FINE,
             time={"scheme": "backward-euler", "step": 0.03, "end": 0.6}, **contact,
         )  # fmt: skip
-        graph = scene.fracture.graph
-        y = scene.domain.nodes[graph.edge_nodes][:, :, 1]
-        graph.break_edges((y.min(axis=1) < 0.45) & (y.max(axis=1) > 0.45))
-        scene.fracture.restored()
-        scene.balance.damage_changed()
-        scene.balance.edges_broke(graph.pattern)
+        break_across(scene, [0.0, 1.0], 0.45)
         state.remember()
         march(scene, state)
         carried.append(scene.probes()[1])

@@ -112,6 +112,16 @@ def deform(scene: Scene, F: Values) -> None:
     scene.balance.displace((X @ (F - np.eye(len(F))).T).reshape(-1))
 
 
+def break_across(scene: Scene, normal: list[float], at: float) -> None:
+    """Edges with an end on either side of normal . X = `at` break by hand, and all terms hear of it."""
+    graph = scene.fracture.graph
+    height = scene.domain.nodes[graph.edge_nodes] @ np.array(normal)
+    graph.break_edges((height.min(axis=1) < at) & (height.max(axis=1) > at))
+    scene.fracture.restored()
+    scene.balance.damage_changed()
+    scene.balance.edges_broke(graph.pattern)
+
+
 def at_nodes(points: Values, values: Values) -> list[dict[str, Any]]:
     """[[boundary]] entries that prescribe a displacement at each of the given nodes."""
     size = 1e-9

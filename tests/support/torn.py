@@ -21,7 +21,7 @@ from fracsim.mesh.ranks import total
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping.state import State
 
-from .scenes import Values, each_step, make_scene, make_study
+from .scenes import Values, break_across, each_step, make_scene, make_study
 from .surface_run import WrittenSurface
 
 Found = dict[str, npt.NDArray[Any]]
@@ -332,12 +332,7 @@ def squeezed() -> Found:
     )  # fmt: skip
     steps = each_step(scene, state)
     next(steps), next(steps)
-    graph = scene.fracture.graph
-    height = scene.domain.nodes[graph.edge_nodes] @ np.array([0.3, 1.0])
-    graph.break_edges((height.min(axis=1) < 0.4) & (height.max(axis=1) > 0.4))
-    scene.fracture.restored()
-    scene.balance.damage_changed()
-    scene.balance.edges_broke(graph.pattern)
+    break_across(scene, [0.3, 1.0], 0.4)
     state.remember()
     at_once = scene.balance.saved()
     next(steps), next(steps)
