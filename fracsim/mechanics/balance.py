@@ -289,8 +289,10 @@ class Balance:
         """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
         fields = [field.x.array for field in self.stress.fields]
         rates = K.handle, small, sum(term.mass_factor for term in self.terms), self.c_v
-        was, self._assembled = self._assembled, (rates, [field.copy() for field in fields])
+        was = self._assembled
         same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
+        if not same:
+            self._assembled = rates, [field.copy() for field in fields]
         return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
 
     @contextmanager

@@ -189,13 +189,13 @@ class Stress(Term):
         return plastic.prediction.form if plastic is not None and plastic.prediction is not None else None
 
     def _stored_energy(self, dx: ufl.Measure) -> ufl.Form:
-        return elastic_energy(self.energy, self.u, dx, chi=self._floored(self.multiplier), rotation=self.R)
+        return elastic_energy(self.energy, self.u, dx, chi=self.remaining_stiffness_of_energy, rotation=self.R)
 
     def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, as flow within the step leaves it."""
         flow = self._flow_form
         if flow is None:
-            return internal_work(self.energy, self.u, w, dx, chi=self._floored(self.multiplier), rotation=self.R)
+            return internal_work(self.energy, self.u, w, dx, chi=self.remaining_stiffness_of_energy, rotation=self.R)
         return flow.work(self.u, w, dx, chi=self.remaining_stiffness, rotation=self.R) + self._springs(w, dx)
 
     def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:

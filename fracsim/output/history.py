@@ -64,11 +64,10 @@ class Probes:
             readings |= term.readings()
             works |= term.works()
             least |= term.least()
-        heads = [(head, probe) for probe in probes for head in HEADS[probe.quantity]]
-        vectors = {f"{head}_{probe.name}": self._reading(probe, head) for head, probe in heads}
-        vectors |= {f"motion_{name}": partial(self._moved, way) for name, way in (ways or {}).items()}
-        moved = {name: reading for name, reading in vectors.items() if name.startswith("motion_")}
-        first = {name: reading for name, reading in vectors.items() if name not in moved}
+        first = {f"{HEADS[probe.quantity]}_{probe.name}": self._reading(probe) for probe in probes}
+        pulled = [probe for probe in probes if probe.quantity == "reaction"]
+        moved = {f"motion_{probe.name}": self._mean_displacement(probe) for probe in pulled}
+        moved |= {f"motion_{name}": partial(self._moved, way) for name, way in (ways or {}).items()}
         self.names = [f"{name}_{axis}" for name in first for axis in axes] + [*readings]
         self.names += [f"{name}_{axis}" for name in moved for axis in axes] + [*works, *least]
         self._readings = [*first.values(), *readings.values(), *moved.values()]
@@ -91,19 +90,22 @@ class Probes:
         """(d,) this rank's share."""
         return way(self._balance.level.t) if self._domain.comm.rank == 0 else np.zeros(self._domain.dim)
 
-    def _reading(self, probe: Probe, head: str) -> Reading:
-        owned = probe.nodes[probe.nodes < self._domain.node_count]
-        if head != "reaction":
-            return self._mean_displacement(owned)
+    def _reading(self, probe: Probe) -> Reading:
+        if probe.quantity == "displacement":
+            return self._mean_displacement(probe)
+        owned = self._owned(probe)
         return lambda: self._balance.reactions.reshape(-1, self._domain.dim)[owned].sum(axis=0)
 
-    def _mean_displacement(self, owned: Ints) -> Reading:
+    def _mean_displacement(self, probe: Probe) -> Reading:
+        owned, d = self._owned(probe), self._domain.dim
         count = total(self._domain.comm, len(owned))[0]
-        d = self._domain.dim
         return lambda: self._balance.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
 
+    def _owned(self, probe: Probe) -> Ints:
+        return probe.nodes[probe.nodes < self._domain.node_count]
 
-HEADS: dict[str, tuple[str, ...]] = {"reaction": ("reaction", "motion"), "displacement": ("probe",)}
+
+HEADS = {"reaction": "reaction", "displacement": "probe"}
 
 
 def factors(names: Sequence[str], thickness: float) -> npt.NDArray[np.float64]:

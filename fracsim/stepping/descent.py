@@ -1,4 +1,4 @@
-"""What the line search of Newton's method goes down where contact limits its steps.
+"""What the line search of Newton's method goes down where contact limits its steps, or moduli are made positive.
 
 The incremental potential: on the norm of r, which a barrier makes steep, it cuts good steps to nothing. But where no
 contact acts at either end of a step the norm tells as well, and its residual is asked for next anyway; the energy of

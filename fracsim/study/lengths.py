@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from . import Study
+from .body import Region
 from .materials import MATERIALS
+from .tearing import plane_modulus
 
 DISC = 6.0  # h that a tip needs around it
 FAR = 3.0  # times that an energy may be off without a word
@@ -14,16 +16,15 @@ FAR = 3.0  # times that an energy may be off without a word
 
 def fits(study: Study, least: float) -> Iterator[str]:
     """Notes on what does not fit together; `least`: the body's least side, m."""
-    table, material = study.fracture, study.material
+    table = study.fracture
     if table is None or study.brittle is not None:
         return
-    stiff = material.young / (1 - material.poisson**2 if material.plane == "strain" else 1.0)
     h = study.mesh.parameters.get("h")
     h = float(h) if isinstance(h, int | float) and not isinstance(h, bool) else None
-    if table.strength > 0.1 * material.young and table.strength < float("inf"):
-        yield f"note: strength is {table.strength / material.young:.2g} of young: only rubber is that strong"
+    if table.strength > 0.1 * study.material.young and table.strength < float("inf"):
+        yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
     if table.energy is None:
-        yield from _spent(study, stiff, table.radius or h)
+        yield from _spent(study, plane_modulus(study, Region()), table.radius or h)
         return
     if h is not None and least < 2 * DISC * h:
         most = least / 2 / DISC

@@ -23,15 +23,15 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
     for name, region in every:
         energy, strength = region.fracture_energy or table.energy, region.strength or table.strength
         assert energy is not None
-        length = _stiff(study, region) * energy / strength**2
+        length = plane_modulus(study, region) * energy / strength**2
         where = f"in {name}: " if name else ""
         yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa"
         yield f"{where}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
         yield from _unfit(length, strength, h, side)
 
 
-def _stiff(study: Study, region: Region) -> float:
-    """E' in Pa."""
+def plane_modulus(study: Study, region: Region) -> float:
+    """E' of a region, or of the rest of the body, Pa."""
     material = study.material
     young, poisson = region.young or material.young, material.poisson if region.poisson is None else region.poisson
     return young / (1 - poisson**2 if material.plane == "strain" else 1.0)
