@@ -51,6 +51,7 @@ class Balance:
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
         springs: the rest of what it lacks.
+        couples: whether terms coupled dofs of different cells in the last tangent.
         moves: how often u has been put elsewhere.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
@@ -79,6 +80,7 @@ class Balance:
         self._positive: Positive | None = None
         self.low_rank: list[tuple[Values, Values]] = []
         self.springs: list[Stiff] = []
+        self.couples = False
         self._assembled: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
         self.moves = 0
         self.vector = assembler.vector()
@@ -265,7 +267,7 @@ class Balance:
         self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
-        self.springs = []
+        self.springs, self.couples = [], False
         for term in self.terms:
             term.add_stiffness(K)
             if self._touches and (coupling := term.coupling()) is not None:
@@ -304,6 +306,7 @@ class Balance:
 
     def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat | Stiff) -> None:
         """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it (collective)."""
+        self.couples = True
         if isinstance(coupling, Stiff):
             coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
             coupling.directions[self.motion.owned] = 0.0
@@ -337,6 +340,11 @@ class Balance:
         """Whether a term that limits steps has a potential at the current u (collective)."""
         limiting = (term for term in self.terms if type(term).longest_step is not Term.longest_step)
         return bool(total(self.domain.comm, sum(abs(term.potential() or 0.0) for term in limiting))[0] > 0)
+
+    def set_out(self) -> None:
+        """Newton's method sets out on the step, once more where it has failed before."""
+        for term in self.terms:
+            term.set_out()
 
     def longest_step(self, change: Values) -> float:
         """Largest share of a change of u (owned dofs,) that all terms allow (collective)."""

@@ -147,6 +147,9 @@ class Term:
         explicit steps are cut to."""
         return 0.0
 
+    def set_out(self) -> None:
+        """Newton's method sets out on the step, once more where it has failed before."""
+
     def longest_step(self, change: Values) -> float:
         """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0

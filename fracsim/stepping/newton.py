@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
+from .forcing import Forcing
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
@@ -22,6 +23,8 @@ from .stepper import SolveResult
 
 if TYPE_CHECKING:
     from .downhill import Downhill
+
+Values = npt.NDArray[np.float64]
 
 DEFAULTS: Options = {
     "snes_type": "newtonls",
@@ -98,7 +101,9 @@ class Solver:
         self._asked = float(given.get("ksp_rtol", 0.0))
         self._linearly = is_linear(balance, given, snes.ksp.getType())
         self._ending = Ending(snes.comm, int(snes.ksp.max_it)) if self._linearly and self._iterative else None
-        self._first = 0.0
+        rough = balance.limits_steps and balance.conservative and not self._asked
+        self._forcing = Forcing(float(chosen["ksp_rtol"])) if rough else None
+        self._first = self._last_little = 0.0
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -110,7 +115,7 @@ class Solver:
             parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
             self._operator = Condensed(tangent, parts, springs).matrix()
         for snes in self._made:
-            snes.setJacobian(lambda _, x, A, P: self._assemble_tangent(P), self._operator, tangent)
+            snes.setJacobian(lambda _, x, A, P: self._linearise(P), self._operator, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
 
@@ -139,7 +144,7 @@ class Solver:
 
     # --- a solve, and what is tried where it fails ---
 
-    def solve(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+    def solve(self, guess: Values) -> SolveResult:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution.
 
         Where iterations fail the system is factorised. The next solves start with factors then: as many as the spell
@@ -157,23 +162,24 @@ class Solver:
                 self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
         return result
 
-    def _attempt_iteratively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+    def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)
+        start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
         if self._misled(result):
             # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
             self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
-            result = self._attempt_positively(guess) if self.balance.conservative else self._attempt(guess)
+            result = self._attempt_positively(start) if self.balance.conservative else self._attempt(start)
             self._preconditioner.keep = self._iterative
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
         if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
             self.snes.ksp.setGMRESRestart(RESTART)
-            result = self._attempt(guess)
+            result = self._attempt(start)
             self.snes.ksp.setType("cg")
         return result
 
-    def _attempt_positively(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+    def _attempt_positively(self, guess: Values | None) -> SolveResult:
         """With moduli made positive, down the incremental potential. (From the start of every attempt they would cost
         more than they save.)"""
         from .downhill import POSITIVE
@@ -206,7 +212,7 @@ class Solver:
         dofs = self.balance.vector.getSize()
         return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
-    def _attempt_directly(self, guess: npt.NDArray[np.float64]) -> SolveResult:
+    def _attempt_directly(self, guess: Values) -> SolveResult:
         with self._factors():
             return self._attempt(guess)
 
@@ -240,13 +246,12 @@ class Solver:
         line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
 
-    def _attempt(self, guess: npt.NDArray[np.float64], other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
+    def _attempt(self, guess: Values | None, other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
+        """From `guess`; None: from where the last attempt has come to."""
         self.snes, self._down = other or self._first_choice
         self._shrink()
-        self._x.array_w[:] = guess
-        extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
-        if self.balance.limits_steps:
-            self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
+        self.balance.set_out()
+        extended = 0 if guess is None else self._start_from(guess)
         if self._linearly and (solved := self._solve_as_linear()) is not None:
             return replace(solved, krylov=solved.krylov + extended)
         newton, krylov, held = self._solve_in_legs()
@@ -257,6 +262,14 @@ class Solver:
         if held:
             return SolveResult(False, newton, krylov + extended, f"Obstacles are jammed: not there in {LEGS} solves")
         return SolveResult(reason > 0, newton, krylov + extended, "" if reason > 0 else self._sentence())
+
+    def _start_from(self, guess: Values) -> int:
+        """Set x to what Newton's method may start from; returns Krylov iterations."""
+        self._x.array_w[:] = guess
+        extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
+        if self.balance.limits_steps:
+            self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
+        return extended
 
     def _solve_in_legs(self) -> tuple[int, int, bool]:
         """Newton's method from x, once more each time that what was held back has gone on: all iterations, and whether
@@ -270,6 +283,8 @@ class Solver:
             self._rtol = ON_THE_WAY if left else self._own_rtol
             if self._down is not None:
                 self._down.descent.begin()
+            if self._forcing is not None:
+                self._forcing.begin()
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
@@ -310,7 +325,7 @@ class Solver:
 
     # --- linear solves by themselves ---
 
-    def linear_response(self, force: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def linear_response(self, force: Values) -> Values:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m, where
         nothing else touches the body.
 
@@ -341,6 +356,8 @@ class Solver:
         tangent, ksp = self.balance.tangent, self.snes.ksp
         self._assemble_tangent(tangent)
         self._preconditioner.its = None
+        if self._forcing is not None:
+            ksp.setTolerances(rtol=self._forcing.exact())
         ksp.setOperators(self._operator, tangent)
         ksp.solve(self.balance.vector, self._correction)
         return bool(ksp.reason > 0)
@@ -348,6 +365,17 @@ class Solver:
     def _assemble(self, tangent: PETSc.Mat) -> None:
         small = None if self._down is None else self._down.small
         self.balance.assemble_tangent(tangent, small=small)
+
+    def _linearise(self, tangent: PETSc.Mat) -> None:
+        """K at an iterate of Newton's method, and how exactly it is solved with."""
+        ksp, forcing = self.snes.ksp, self._forcing
+        if forcing is None:
+            self._assemble_tangent(tangent)
+            return
+        self._preconditioner.its = forcing.iterations(ksp.its)
+        self._assemble_tangent(tangent)
+        norm, little = self.snes.getFunctionNorm(), self._last_little
+        ksp.setTolerances(rtol=forcing.rough(norm, little) if self.balance.couples else forcing.exact())
 
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
@@ -415,7 +443,8 @@ class Solver:
     def _little(self, first: float) -> float:
         """|r| of a solution, N, where that of the guess is `first` (collective)."""
         scale, floor = self.balance.force_scale()
-        return max(self._rtol * max(first, scale), floor)
+        self._last_little = max(self._rtol * max(first, scale), floor)
+        return self._last_little
 
     def destroy(self) -> None:
         """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""

@@ -61,6 +61,7 @@ class SelfContact(Term):
 
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
+        self._struck: Values | None = None
         self._start: Values | None = None
         self._tangent_at: Values | None = None
         self._rubbing: Friction | None = None
@@ -136,6 +137,7 @@ class SelfContact(Term):
         """(n, d) at the end of the step that belongs to the current u, on rank 0 (collective)."""
         if self._moved:
             self._x, self._moved = self._placed(self._level.at_end(self._u.x.array[: self._owned])), False
+            self._struck = None
         return self._x
 
     def _placed(self, u: Values) -> Values | None:
@@ -160,7 +162,10 @@ class SelfContact(Term):
 
     def struck(self) -> Values:
         """(owned dofs,) forces at the end of the step, N (collective)."""
-        return self._handed_down(self._places())
+        x = self._places()
+        if self._struck is None:  # r and its scale ask for the same
+            self._struck = self._handed_down(x)
+        return self._struck
 
     def scale(self) -> Values:
         """(owned dofs,) the same as they enter r, N (collective)."""
@@ -227,14 +232,13 @@ class SelfContact(Term):
         assert self._surface is not None and x is not None and way is not None
         return self._surface.pairs.longest_step(x, x + self._surface.at.weights @ way)
 
-    def _set_out(self) -> None:
-        """An attempt at the step begins."""
+    def set_out(self) -> None:
+        """Newton's method sets out on the step: after it has failed it is exact later."""
         self._tangent_at, self._attempts = None, self._attempts + 1
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u as far on the way from the start as nothing meets (collective)."""
         level = self._level
-        self._set_out()
         if not level.dt:
             return u
         x, way = self._start, self._gathered(self._level.at_end(u) - level.u)

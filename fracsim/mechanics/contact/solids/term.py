@@ -216,7 +216,6 @@ class Solids(SelfContact):
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
-        self._set_out()
         if not level.dt or self._beside.is_far([level.u, level.at_end(u)], self._ways):
             return u
         start, end = self._gathered(level.u), self._gathered(level.at_end(u))
