@@ -84,11 +84,11 @@ class RigidRun:
         stepper = self.scene.stepper
         self.state, report = stepper.advance(self.state)
         if report.broken:
-            self.frames.note(stepper.breakable.damage()[0], self.state.t)
+            self.frames.note(stepper.copies.damage()[0], self.state.t)
         self.broken, self.blows, self.loads = (
             self.broken + report.broken, self.blows + report.blows, self.loads + report.loads
         )  # fmt: skip
-        state, split = self.state, int(np.count_nonzero(stepper.breakable.graph.split))
+        state, split = self.state, stepper.copies.split_cells
         lost = self._start + state.work - report.kinetic
         self.history.append_row([
             state.step, state.t, self.scene.study.time.step, report.kinetic, 0.0, lost, state.work, self.broken, split,
@@ -99,7 +99,7 @@ class RigidRun:
 
     def write_frame(self) -> None:
         """The bodies as they are now. Raises CannotWrite."""
-        state, (pattern, cut) = self.state, self.scene.stepper.breakable.damage()
+        state, (pattern, cut) = self.state, self.scene.stepper.copies.damage()
         written(ALONE, self.folder / "surface.pvd", lambda: self.frames.write(state.t, state.bodies, pattern, cut))
         self._clock.wrote(state)  # type: ignore[arg-type]
 
@@ -160,9 +160,9 @@ class RigidRun:
         summary = {
             "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
-            "split_cells": int(np.count_nonzero(scene.stepper.breakable.graph.split)), "pieces": len(state.bodies),
+            "split_cells": scene.stepper.copies.split_cells, "pieces": len(state.bodies),
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
-            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.breakable.passes,
+            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.copies.passes,
             "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
             "ranks": MPI.COMM_WORLD.size, "versions": versions(MPI.COMM_WORLD),

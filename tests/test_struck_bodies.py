@@ -121,7 +121,7 @@ def test_a_block_that_rests_carries_its_weight() -> None:
     """From the contact forces of the engine: rho g (H - z) in every layer but those that touch."""
     mesh = lattice(4, 4, 8, size=0.25)
     stepper = stepper_of(mesh, 1e12, 1e-3)
-    state, body = go(stepper, stepper.start(), 0.1), stepper.breakable
+    state, body = go(stepper, stepper.start(), 0.1), stepper.copies.copy(0)
     assert stepper._engine is not None
     _, touches = stepper._engine.advance(state.bodies)
     points, impulse = touches.on(0)
@@ -144,7 +144,7 @@ def test_the_crack_of_a_blow_does_not_depend_on_the_step() -> None:
         while not broken:
             state, report = stepper.advance(state)
             broken = report.broken
-        found.append(stepper.breakable.graph.broken.copy())
+        found.append(stepper.copies.copy(0).graph.broken.copy())
     assert np.array_equal(*found)
 
 
@@ -167,7 +167,7 @@ def test_momentum_is_kept_through_a_fracture() -> None:
 def test_a_body_broken_at_rest_stays_where_it_is() -> None:
     """Without gravity: hulls that overlap along the crack do not push the pieces apart."""
     stepper = stepper_of(bar(), 1e3, 1e-3, gravity=0 * DOWN, obstacles=[])
-    body, state = stepper.breakable, stepper.start()
+    body, state = stepper.copies.copy(0), stepper.start()
     points, force = np.array([[1.5, 0.5, 1.05], [0.1, 0.5, 0.05], [2.9, 0.5, 0.05]]), np.diag([1e5, 1e5, 1e5])
     body.strike(0, body.loads(0, points, force))
     broken = stepper._divided(state.bodies, {0})
@@ -194,11 +194,11 @@ def test_bodies_that_were_not_struck_are_not_analysed() -> None:
     mesh.points[len(mesh.points) // 2 :, 2] += 50.0
     stepper = stepper_of(mesh, 1e12, 2e-3)
     go(stepper, moving(stepper, np.array([0.0, 0.0, -3.0])), 0.05)
-    assert stepper.breakable.passes == 0, "too strong to break under this blow: no analysis at all"
+    assert stepper.copies.passes == 0, "too strong to break under this blow: no analysis at all"
     weak = stepper_of(mesh, 1e6, 2e-3)
     go(weak, moving(weak, np.array([0.0, 0.0, -3.0])), 0.05)
-    assert weak.breakable.passes > 0
-    assert set(weak.breakable._kept) <= set(np.flatnonzero(weak.breakable.graph.domain.nodes[:, 2] < 10))
+    assert weak.copies.passes > 0
+    assert set(weak.copies.copy(0)._kept) <= set(np.flatnonzero(weak.copies.copy(0).graph.domain.nodes[:, 2] < 10))
 
 
 # --- shapes ---
@@ -262,22 +262,22 @@ def test_shapes_of_pieces_lie_where_the_split_surface_is() -> None:
     skeleton = Skeleton(mesh)
     broken = separated(skeleton, (mesh.points[:, 0] > 2.5).astype(int))
     geometry = Geometry(mesh)
-    whole = geometry.shapes(patterns(skeleton, 0 * broken > 0))
+    whole = geometry.shapes({})
     cut = np.where(broken, np.abs(2.5 - mesh.points[skeleton.edges][:, 0, 0]), np.nan)
-    halves = geometry.shapes(patterns(skeleton, broken), cut)
+    halves = geometry.shapes({0: (patterns(skeleton, broken), cut)})
     assert len(whole.parts) == 1 and len(halves.parts) == 2
     for number, (low, high) in enumerate(((0.0, 2.5), (2.5, 4.0))):
         corners = np.concatenate(halves.parts[number])
         assert corners[:, 0].min() == pytest.approx(low) and corners[:, 0].max() == pytest.approx(high)
-    again = geometry.shapes(patterns(skeleton, broken), cut)
+    again = geometry.shapes({0: (patterns(skeleton, broken), cut)})
     assert all(a is b for a, b in zip(again.parts, halves.parts, strict=True))
 
 
 def nodes_in_others(stepper: RigidStepper, state: RigidState, depth: float) -> float:
     """Share of the nodes that lie in a whole cell of another piece, farther than a depth (m) from all of its faces: by
     barycentric coordinates, which share nothing with the engine."""
-    domain, bodies = stepper.breakable.graph.domain, state.bodies
-    of_node = stepper.breakable.pieces.of_node
+    body, bodies = stepper.copies.copy(0), state.bodies
+    domain, of_node = body.graph.domain, body.pieces.of_node
     x = bodies.to_space(domain.nodes, of_node)
     of_cell = of_node[domain.cell_nodes]
     whole = np.all(of_cell == of_cell[:, :1], axis=1)

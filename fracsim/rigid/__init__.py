@@ -1,6 +1,6 @@
 """Stiff bodies that move rigidly, are strained by blows and break (METHOD section 10; Bao et al. 2007).
 
-Strain and fracture, of the one mesh that all bodies of a study are in:
+Strain and fracture, of copies of one mesh:
 
 relief       what a load accelerates a free body with is taken off it
 free_body    the quasi-static analysis of one body, or of one piece of a broken one
@@ -8,6 +8,8 @@ pinned       B07's three pinned points, to compare with
 point_loads  forces at points of a surface, handed to the nodes of the cells behind
 analyses     of several bodies at once, spread over ranks
 breakable    a struck piece breaks, and its pieces in turn
+copies       each with damage of its own, all with one operator while they are whole
+placing      where copies are at the start
 
 Motion:
 

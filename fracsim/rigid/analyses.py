@@ -1,8 +1,8 @@
 """Analyses of bodies that were struck in one step, spread over ranks; the engine is on the first of them.
 
-Every rank has the whole mesh. Strikes of a step do not feel one another: each sees the surfaces that there were before,
-and may open its share of those that are left, so that what comes of it is the same on any number of ranks. Those that
-have used theirs up share what the others left.
+Every rank has the mesh, and the damage of its copies. Strikes of a step do not feel one another: each sees the surfaces
+that there were before, and may open its share of those that are left, so that what comes of it is the same on any
+number of ranks. Those that have used theirs up share what the others left.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .breakable import Breakable, Opened
+from .breakable import Opened
+from .copies import Copies
 
 Values = npt.NDArray[np.float64]
 
@@ -42,25 +43,25 @@ class _Message:
 class Analyses:
     """Of one mesh (rank 0 of a communicator)."""
 
-    def __init__(self, breakable: Breakable, comm: MPI.Comm = MPI.COMM_SELF, begin: Any = None) -> None:
-        """`begin`: what other ranks make their `Breakable` of, see `serve`."""
-        self._breakable, self._comm, self._begin = breakable, comm, begin
+    def __init__(self, bodies: Copies, comm: MPI.Comm = MPI.COMM_SELF, begin: Any = None) -> None:
+        """`begin`: what other ranks make their `Copies` of, see `serve`."""
+        self._bodies, self._comm, self._begin = bodies, comm, begin
         self._saved: dict[str, Any] | None = None
         self._news: list[Opened] = []
 
     def restored(self) -> None:
         """The mesh is as a checkpoint said."""
-        self._saved, self._news = self._breakable.saved(), []
+        self._saved, self._news = self._bodies.saved(), []
 
     def __call__(self, strikes: list[Strike]) -> dict[int, int]:
         """How many edges broke, by the names of bodies. Raises NotConverged."""
-        breakable, broken = self._breakable, {each.name: 0 for each in strikes}
+        bodies, broken = self._bodies, {each.name: 0 for each in strikes}
         waiting = strikes
-        while waiting and breakable.left:
-            few, more = divmod(breakable.left, len(waiting))
+        while waiting and bodies.left:
+            few, more = divmod(bodies.left, len(waiting))
             tasks = [Strike(each.name, each.points, each.force, few + (k < more)) for k, each in enumerate(waiting)]
             found = self._spread([each for each in tasks if each.share])
-            breakable.take(found)
+            bodies.take(found)
             for opened in found:
                 broken[opened.name] += len(opened.keys)
             spent = {
@@ -73,14 +74,14 @@ class Analyses:
         """What opened, in their order."""
         comm = self._comm
         if comm.size == 1 or len(strikes) == 1:
-            found = [opened_by(self._breakable, each) for each in strikes]
+            found = [opened_by(self._bodies, each) for each in strikes]
             self._news += found if comm.size > 1 else []
             return found
         if self._begin is not None:
             comm.bcast(self._begin)
             self._begin = None
         comm.bcast(_Message(self._saved, self._news, strikes))
-        parts = _gathered(comm, self._breakable, strikes)
+        parts = _gathered(comm, self._bodies, strikes)
         assert parts is not None
         for part in parts:
             if isinstance(part, Exception):
@@ -90,34 +91,33 @@ class Analyses:
         return found
 
 
-def serve(comm: MPI.Comm, make: Callable[[Any], Breakable]) -> None:
+def serve(comm: MPI.Comm, make: Callable[[Any], Copies]) -> None:
     """On all other ranks: analyse what rank 0 says, until it sends None; `make`: of what `begin` is."""
     if (begin := comm.bcast(None)) is None:
         return
-    breakable: Breakable | None = None
+    bodies: Copies | None = None
     while (message := comm.bcast(None)) is not None:
         try:
-            breakable = breakable or make(begin)
+            bodies = bodies or make(begin)
             if message.saved is not None:
-                breakable.restore(message.saved)
-            breakable.take(message.news)
+                bodies.restore(message.saved)
+            bodies.take(message.news)
         except Exception as error:  # told instead of what was found: rank 0 waits for it
             comm.gather(error)
         else:
-            _gathered(comm, breakable, message.strikes)
+            _gathered(comm, bodies, message.strikes)
 
 
-def _gathered(comm: MPI.Comm, breakable: Breakable, strikes: list[Strike]) -> list[Any] | None:
+def _gathered(comm: MPI.Comm, bodies: Copies, strikes: list[Strike]) -> list[Any] | None:
     """On rank 0 what opened on each rank, or why it failed."""
     result: Any
     try:
-        result = [opened_by(breakable, each) for each in strikes[comm.rank :: comm.size]]
+        result = [opened_by(bodies, each) for each in strikes[comm.rank :: comm.size]]
     except Exception as error:
         result = error
     return comm.gather(result)
 
 
-def opened_by(breakable: Breakable, strike: Strike) -> Opened:
+def opened_by(bodies: Copies, strike: Strike) -> Opened:
     """What a strike opens. Raises NotConverged."""
-    piece = breakable.piece_of(strike.name)
-    return breakable.opened(strike.name, breakable.loads(piece, strike.points, strike.force), strike.share)
+    return bodies.opened(strike.name, strike.points, strike.force, strike.share)

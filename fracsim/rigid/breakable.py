@@ -1,4 +1,4 @@
-"""What breaks of rigid bodies: the cells, edges and pieces of the one mesh that all bodies of a study are in.
+"""What breaks of a body, or of several in one mesh: its cells, edges and pieces.
 
 A blow on a piece is analysed, surfaces open where the averaged principal stress reaches the strength, and the pieces
 that come of it are analysed in turn under what of the blow falls on them, until nothing breaks.
@@ -162,14 +162,26 @@ class Breakable:
     def stress(self, piece: int, loads: PointLoads) -> Values:
         """(cells, 3 or 6) stress of a piece under loads that fall on it, 0 in all other cells, Pa. Raises
         NotConverged."""
-        key = int(np.flatnonzero(self.pieces.of_node == piece)[0])
-        if key not in self._kept:
-            self._kept[key] = FreeBody(self._stiffness, self.shares(piece), self._options)
-        body = self._kept[key]
+        body = self._free(piece)
         self.passes += 1
         u = body(loads.nodal(len(self._domain.nodes)))
         self.iterations += body.iterations
         return self._stiffness.tensor(u, body.share)
+
+    def _free(self, piece: int) -> FreeBody:
+        """The analysis of a piece, kept until it breaks; of all cells it is that of all copies of the mesh."""
+        key = int(np.flatnonzero(self.pieces.of_node == piece)[0])
+        if key not in self._kept:
+            share = self.shares(piece)
+            if np.all(share == 1):
+                return self._stiffness.whole(self._options)
+            self._kept[key] = FreeBody(self._stiffness, share, self._options)
+        return self._kept[key]
+
+    @property
+    def started(self) -> int:
+        """Surfaces that have opened."""
+        return 0 if self._criterion is None else len(self._criterion.starts)
 
     @property
     def left(self) -> int:

@@ -53,6 +53,13 @@ class Stiffness:
         self._form = CellForm(stress.tangent(v, w, cells_measure(domain)))
         sigma = cauchy_stress(stress.energy, deformation_gradient(stress.u))
         self._tensor = CellExpression(domain.comm, domain.mesh, symmetric_components(sigma), domain.cell_count)
+        self._whole: FreeBody | None = None
+
+    def whole(self, options: Options | None = None) -> FreeBody:
+        """The body of all cells; kept, for all copies of the mesh."""
+        if self._whole is None:
+            self._whole = FreeBody(self, np.ones(self.stress.domain.cell_count), options)
+        return self._whole
 
     def tensor(self, u: Values, share: Values) -> Values:
         """(cells, 3 or 6) stress of displacements u (nodes, d) in the cells with a share, 0 in all others, Pa."""

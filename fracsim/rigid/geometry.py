@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,11 @@ from ..mesh.split.moments import Moments, moments
 from ..mesh.split.skeleton import Skeleton
 from ..meshes.data import MeshData
 from .hulls import Solid, convex_parts
+from .placing import Poses
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Patterns = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -32,28 +35,70 @@ class Shapes:
     parts: list[list[Values]]
 
 
+@dataclass(frozen=True)
+class _Copy:
+    """A copy as it was last broken, in the axes of the mesh, its nodes counted from 0."""
+
+    pattern: Patterns
+    names: Ints
+    of: Moments
+    piece_of_node: Ints
+    parts: list[list[Values]]
+
+
 class Geometry:
-    """Of one mesh, on the rank that has it. What has not changed is not worked out again."""
+    """Of copies of one mesh, on the rank that has it. What has not changed is not worked out again.
 
-    def __init__(self, mesh: MeshData) -> None:
-        self.skeleton = Skeleton(mesh)
-        self._edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
-        # by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as these break
-        self._kept: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
+    Attributes:
+        mean_edge: of the mesh, m.
+    """
 
-    def shapes(self, pattern: npt.NDArray[np.uint8], cut: Values | None = None) -> Shapes:
-        """Of patterns (C,) of broken edges, cut where `cut` (E,) says."""
+    def __init__(self, mesh: MeshData, poses: Poses | None = None) -> None:
+        """`poses`: where the copies are at rest; None: one, where the mesh has it."""
+        self.skeleton, self.poses = Skeleton(mesh), poses or Poses.at_rest(1)
+        self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
+        # of each copy, by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as
+        # these break
+        self._hulls: dict[int, dict[int, tuple[tuple[int, int, float], list[Values]]]] = {}
+        self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0)
+        self._placed = [self._at(number, self._whole) for number in range(len(self.poses))]
+        self._known: dict[int, _Copy] = {}
+
+    def shapes(self, damage: Mapping[int, tuple[Patterns, Values | None]]) -> Shapes:
+        """Of copies by their numbers: patterns (C,) of broken edges, cut where (E,); all others are whole."""
+        for number, (pattern, cut) in damage.items():
+            known = self._known.get(number, self._whole)
+            if not np.array_equal(known.pattern, pattern):
+                self._known[number] = known = self._copy(pattern.copy(), cut, number)
+                self._placed[number] = self._at(number, known)
+        pieces = np.cumsum([0, *(len(each.names) for each in self._placed)])
+        of = Moments(*(np.concatenate([getattr(each.moments, name) for each in self._placed])
+                       for name in ("volume", "centre", "second")))  # fmt: skip
+        piece = [each.piece_of_node + first for each, first in zip(self._placed, pieces, strict=False)]
+        parts = [part for each in self._placed for part in each.parts]
+        return Shapes(np.concatenate([each.names for each in self._placed]), of, np.concatenate(piece), parts)
+
+    def _copy(self, pattern: Patterns, cut: Values | None, number: int) -> _Copy:
+        """A copy with patterns (C,)."""
         made = split(self.skeleton, pattern, cut)
         piece = made.piece_of_point[made.elements[:, 0]]
         of = moments(made.points, made.elements, piece, made.pieces)
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
-        kept: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
+        before = self._hulls.get(number, {})
+        after: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
         elements = np.bincount(piece, minlength=made.pieces)
-        for number, name in enumerate(map(int, names)):
-            key = int(size[number]), int(elements[number]), float(f"{of.volume[number]:.9e}")
-            same = self._kept.get(name)
+        for each, name in enumerate(map(int, names)):
+            key = int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")
+            same = before.get(name)
             if same is None or same[0] != key:
-                same = key, convex_parts(Solid.of(made.points, made.elements[piece == number]), self._edge)
-            kept[name] = same
-        self._kept = kept
-        return Shapes(names, of, made.piece_of_node, [kept[int(name)][1] for name in names])
+                same = key, convex_parts(Solid.of(made.points, made.elements[piece == each]), self.mean_edge)
+            after[name] = same
+        self._hulls[number] = after
+        return _Copy(pattern, names, of, made.piece_of_node, [after[int(name)][1] for name in names])
+
+    def _at(self, number: int, copy: _Copy) -> Shapes:
+        """A copy where it is at rest."""
+        turn, place = self.poses.turn[number], self.poses.place[number]
+        of = Moments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
+        parts = [[corners @ turn.T + place for corners in each] for each in copy.parts]
+        return Shapes(copy.names + number * len(copy.piece_of_node), of, copy.piece_of_node, parts)

@@ -25,10 +25,32 @@ class Place:
     spin: Values
 
 
+@dataclass(frozen=True)
+class Poses:
+    """Of copies: a point X of the mesh is at x = place + turn X; turn (n, 3, 3), place (n, 3) m."""
+
+    turn: Values
+    place: Values
+
+    @classmethod
+    def of(cls, places: list[Place]) -> Poses:
+        """At the start."""
+        turn = Rotation.from_rotvec(np.array([each.rotation for each in places])).as_matrix()
+        return cls(turn, np.array([each.position for each in places]))
+
+    @classmethod
+    def at_rest(cls, count: int) -> Poses:
+        """As the mesh is."""
+        return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
 def placed(mesh: MeshData, places: list[Place]) -> MeshData:
     """A mesh of all copies, one after the other; groups and regions have those of all."""
-    turns = Rotation.from_rotvec(np.array([place.rotation for place in places])).as_matrix()
-    points = np.einsum("kij,nj->kni", turns, mesh.points) + np.array([place.position for place in places])[:, None]
+    poses = Poses.of(places)
+    points = np.einsum("kij,nj->kni", poses.turn, mesh.points) + poses.place[:, None]
     nodes, cells = len(mesh.points) * np.arange(len(places)), len(mesh.cells) * np.arange(len(places))
     return MeshData(
         points.reshape(-1, 3), _copied(mesh.cells, nodes),

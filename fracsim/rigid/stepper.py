@@ -14,7 +14,7 @@ from ..mechanics.contact.obstacle import Obstacle
 from .analyses import Analyses, Strike
 from .blows import Blows, Strain
 from .bodies import Bodies
-from .breakable import Breakable
+from .copies import Copies
 from .engine import Engine
 from .geometry import Geometry, Shapes
 from .hertz import Hertz, reduced
@@ -71,17 +71,17 @@ class Phases:
 
 
 class RigidStepper:
-    """Bodies of one mesh, on one rank; the bodies of a state are the pieces of its mesh as it is broken now.
+    """Copies of one mesh, on one rank; the bodies of a state are their pieces as they are broken now.
 
     Attributes:
-        shapes: of the pieces.    breakable: the mesh.    phases: seconds so far.
+        shapes: of the pieces.    copies: of the mesh.    phases: seconds so far.
     """
 
     shapes: Shapes
 
     def __init__(
         self,
-        breakable: Breakable,
+        copies: Copies,
         geometry: Geometry,
         density: float,
         obstacles: Sequence[Obstacle],
@@ -91,8 +91,8 @@ class RigidStepper:
         analyses: Analyses | None = None,
     ) -> None:
         """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh."""
-        self.analyses = analyses or Analyses(breakable)
-        self.breakable, self._geometry, self._density = breakable, geometry, density
+        self.analyses = analyses or Analyses(copies)
+        self.copies, self._geometry, self._density = copies, geometry, density
         self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
         self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
         self._driven = any(each.moved is not None for each in obstacles)
@@ -101,8 +101,9 @@ class RigidStepper:
         self.look_again()
 
     def look_again(self) -> None:
-        """The mesh has broken: shapes are those of its pieces."""
-        self.shapes, self._engine = self._geometry.shapes(*self.breakable.damage()), None
+        """Copies have broken: shapes are those of their pieces."""
+        damage = {number: each.damage() for number, each in self.copies.damaged.items()}
+        self.shapes, self._engine = self._geometry.shapes(damage), None
 
     def start(self) -> RigidState:
         """The bodies where the mesh has them, at rest."""
@@ -117,11 +118,11 @@ class RigidStepper:
         """Arrays that `restore` goes on from."""
         bodies = {f"body.{name}": values for name, values in vars(state.bodies).items()}
         overlaps = {f"overlap.{name}": values for name, values in vars(self.overlaps).items()}
-        return {**bodies, **overlaps, **self.breakable.saved(), **self.blows.saved()}
+        return {**bodies, **overlaps, **self.copies.saved(), **self.blows.saved()}
 
     def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
         """The state that `saved` was of, with the mesh as broken as then."""
-        self.breakable.restore(saved)
+        self.copies.restore(saved)
         self.analyses.restored()
         self.look_again()
         self.overlaps = Overlaps(**{name: saved[f"overlap.{name}"] for name in vars(self.overlaps)})
@@ -137,7 +138,7 @@ class RigidStepper:
         Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
         """
         began = clock = time.perf_counter()
-        iterations, bodies = self.breakable.iterations, state.bodies
+        iterations, bodies = self.copies.iterations, state.bodies
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.shapes.names)
         clock = self.phases.add("motion", clock)
@@ -155,7 +156,7 @@ class RigidStepper:
         work = state.work + gained + float(worked.sum())
         after = RigidState(state.t + self._rules.step, state.step + 1, moved, work)
         blows = sum(each.speed > 0 for each in due)
-        krylov, seconds = self.breakable.iterations - iterations, time.perf_counter() - began
+        krylov, seconds = self.copies.iterations - iterations, time.perf_counter() - began
         return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, krylov, seconds)
 
     def _moved(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, Touches]:
@@ -195,10 +196,9 @@ class RigidStepper:
 
     def _strikes(self, due: list[Strain]) -> list[Strike]:
         """Those that might break a body."""
-        breakable = self.breakable
         every = [Strike(int(self.shapes.names[each.body]), each.points, each.force) for each in due]
         sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
-        may = [breakable.may_break(breakable.piece_of(each.name), much) for each, much in zip(every, sums, strict=True)]
+        may = [self.copies.may_break(each.name, much) for each, much in zip(every, sums, strict=True)]
         return [each for each, yes in zip(every, may, strict=True) if yes]
 
     def _divided(self, bodies: Bodies, names: set[int]) -> Bodies:

@@ -112,24 +112,24 @@ def average_of(study: Study, domain: Domain) -> Average | None:
     return NonlocalAverage(domain, table.radius, table.kernel)
 
 
-def strength_of(study: Study, domain: Domain, graph: EdgeGraph) -> Strength:
-    """Strength of edges by region, with scatter and a fibre."""
+def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> Strength:
+    """Strength of edges by region, with scatter, another one in each `copy` of a mesh, and a fibre."""
     from ..fracture.strength import Fibre, Scatter, Strength
 
     table = study.fracture
     assert table is not None
-    scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed)
+    scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed + copy)
     direction = fibre_direction(study, domain.dim)
     fibre = Fibre(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
     of_cell = per_cell(study, domain, table, "strength")
     return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def surface_rules(table: Brittle) -> SurfaceRules:
-    """[brittle] as numbers."""
+def surface_rules(table: Brittle, copy: int = 0) -> SurfaceRules:
+    """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
     from ..fracture.brittle.rules import GrainRules, SurfaceRules
 
     given = table.grains
-    grains = None if given is None else GrainRules(given.count, given.seed, given.spread, given.mode)
+    grains = None if given is None else GrainRules(given.count, given.seed + copy, given.spread, given.mode)
     curved = table.shape == "curved"
-    return SurfaceRules(table.surfaces, table.spacing, curved, table.seed, table.per_pass, grains)
+    return SurfaceRules(table.surfaces, table.spacing, curved, table.seed + copy, table.per_pass, grains)

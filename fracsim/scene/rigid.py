@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +14,18 @@ from ..errors import InputError
 from ..mechanics.contact.obstacle import Obstacle
 from ..mechanics.stress import Stress, Weakening
 from ..mechanics.vectors import Assembler
-from ..mesh.domain import Domain, distribute
+from ..mesh.domain import distribute
 from ..mesh.edges import EdgeGraph
+from ..mesh.topology import MeshTopology
 from ..meshes.data import MeshData
 from ..meshes.words import format_point
 from ..rigid.analyses import Analyses, serve
 from ..rigid.breakable import Breakable, Within
+from ..rigid.copies import Copies
 from ..rigid.free_body import Stiffness
 from ..rigid.geometry import Geometry
 from ..rigid.hertz import Hertz
-from ..rigid.placing import Place, motion, placed
+from ..rigid.placing import Place, Poses, motion, placed
 from ..study import Contact, Study
 from ..study.check import checked_mesh
 from ..study.conditions import volume_loads
@@ -38,9 +41,12 @@ except ImportError:
         'time.scheme = "rigid" needs mujoco, which this environment lacks: pip install fracsim[contact]'
     ) from None
 
+if TYPE_CHECKING:
+    from ..fracture.criterion import Average
+
 Values = npt.NDArray[np.float64]
 
-DEEP = 0.02  # of the mean edge: bodies that lie in one another by more at the start are refused
+DEEP = 0.01  # of the mean edge: bodies that lie in one another by more at the start are refused
 
 
 @dataclass
@@ -48,20 +54,15 @@ class RigidScene:
     """What a run of rigid bodies moves.
 
     Attributes:
-        domain: the mesh of all bodies.    obstacles: what stands in their way.    first: the state at t = 0.
+        mesh: of all bodies, where they are at the start.    obstacles: what stands in their way.
+        first: the state at t = 0.
     """
 
     study: Study
-    domain: Domain
+    mesh: MeshData
     stepper: RigidStepper
     obstacles: list[Obstacle]
     first: RigidState
-
-    @property
-    def mesh(self) -> MeshData:
-        """As it was built."""
-        assert self.domain.source is not None
-        return self.domain.source
 
     def ended(self, state: RigidState) -> bool:
         """Whether the state is at the end of the study."""
@@ -72,32 +73,29 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit."""
     single = checked_mesh(study)
     places = _places(study)
-    domain = distribute(MPI.COMM_SELF, placed(single, places))
-    breakable, density = _breakable(study, domain), float(study.material.density)
+    copies, poses, density = _copies(study, single, places), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
     contact, obstacles = study.contact or Contact(), obstacle_entries(study, 3)
     rules = Rules(study.time.step, gravity, contact.friction, contact.restitution or 0.0)
-    assert domain.source is not None
-    geometry = Geometry(domain.source)
     hertz = Hertz(study.material.young, study.material.poisson)
-    analyses = Analyses(breakable, comm, (study, domain.source))
-    stepper = RigidStepper(breakable, geometry, density, obstacles, rules, hertz, contact.contact_time, analyses)
+    analyses = Analyses(copies, comm, (study, single, places))
+    geometry = Geometry(single, poses)
+    stepper = RigidStepper(copies, geometry, density, obstacles, rules, hertz, contact.contact_time, analyses)
     first = stepper.start()
     _check_masses(first)
     at_rest = first.bodies
     velocity, spin = motion(stepper.shapes.names, len(single.points), at_rest.centre, at_rest.mass, places)
     first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin))
-    _check_room(stepper, first, obstacles, domain)
-    return RigidScene(study, domain, stepper, obstacles, first)
+    _check_room(stepper, first, obstacles, geometry.mean_edge)
+    return RigidScene(study, placed(single, places), stepper, obstacles, first)
 
 
 def help_rigid(comm: MPI.Comm) -> None:
     """On all ranks but the first: analyse bodies, until it lets go."""
 
-    def made(begin: tuple[Study, MeshData]) -> Breakable:
-        study, mesh = begin
-        return _breakable(study, distribute(MPI.COMM_SELF, mesh))
+    def made(begin: tuple[Study, MeshData, list[Place]]) -> Copies:
+        return _copies(*begin)
 
     serve(comm, made)
 
@@ -114,18 +112,26 @@ def _places(study: Study) -> list[Place]:
     return places
 
 
-def _breakable(study: Study, domain: Domain) -> Breakable:
-    """The mesh, with what breaks of it."""
-    material = material_of(study, domain)
-    stress = Stress(Assembler(domain), fem.Function(domain.space), material, Weakening("chi"))
+def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:
+    """Of the mesh, in its own axes."""
+    domain = distribute(MPI.COMM_SELF, mesh)
+    stress = Stress(Assembler(domain), fem.Function(domain.space), material_of(study, domain), Weakening("chi"))
     stiffness = Stiffness(stress, np.full(domain.cell_count, float(study.material.density)))
-    graph, within = EdgeGraph(domain), Within(average_of(study, domain), domain.cell_count)
+    average = average_of(study, domain)
+    sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
+    return Copies(lambda number: _breakable(study, stiffness, average, number), Poses.of(places), sizes)
+
+
+def _breakable(study: Study, stiffness: Stiffness, average: Average | None, number: int) -> Breakable:
+    """A copy of the mesh, with what breaks of it. Chance differs from copy to copy."""
+    domain = stiffness.stress.domain
+    graph, within = EdgeGraph(domain), Within(average, domain.cell_count)
     criterion = None
     if study.brittle is not None:
         from ..fracture.brittle.surfaces import BrittleSurfaces
 
-        strength = strength_of(study, domain, graph)
-        criterion = BrittleSurfaces(stress, graph, strength, within, surface_rules(study.brittle))
+        strength, rules = strength_of(study, domain, graph, number), surface_rules(study.brittle, number)
+        criterion = BrittleSurfaces(stiffness.stress, graph, strength, within, rules)
     return Breakable(stiffness, graph, criterion, within, study.solver)
 
 
@@ -137,9 +143,9 @@ def _check_masses(state: RigidState) -> None:
                          "inside out or flat; mend the mesh")  # fmt: skip
 
 
-def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[Obstacle], domain: Domain) -> None:
+def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[Obstacle], edge: float) -> None:
     """InputError where bodies lie in one another, or in an obstacle, at the start."""
-    found = [each for each in stepper.depths(state) if each[2] > DEEP * domain.mean_edge]
+    found = [each for each in stepper.depths(state) if each[2] > DEEP * edge]
     if not found:
         return
     first, second, depth = max(found, key=lambda each: each[2])

@@ -11,6 +11,7 @@ from fracsim.mechanics.contact.shapes import Plane
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.copies import Copies
 from fracsim.rigid.geometry import Geometry
 from fracsim.rigid.hertz import Hertz
 from fracsim.rigid.model import Rules, Stand
@@ -55,4 +56,4 @@ def stepper_of(
     body = breakable(mesh, strength, SurfaceRules(surfaces))
     stand = [Obstacle("floor", Plane((0.0, 0.0, 1.0)), np.zeros(3), moved, 0.5)] if obstacles is None else obstacles
     rules = Rules(step, gravity, 0.5, restitution)
-    return RigidStepper(body, Geometry(mesh), DENSITY, stand, rules, Hertz(1e9, 0.2), contact_time)
+    return RigidStepper(Copies.of(body), Geometry(mesh), DENSITY, stand, rules, Hertz(1e9, 0.2), contact_time)
