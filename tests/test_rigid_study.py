@@ -248,13 +248,13 @@ def test_a_blow_on_a_copy_opens_what_it_opens_on_the_body_itself() -> None:
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     force = 2e4 * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
     alone = Copies.of(breakable(mesh, 2e4, rules))
-    Analyses(alone)([Strike(0, points, force)])
+    Analyses(alone)([Strike(0, points, force, np.zeros(3))])
     poses = Poses.of([Place(np.array([k, 5.0, -k]), np.array([0.3, k, -0.7]), *np.zeros((2, 3))) for k in range(4)])
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
     several, again = (Copies(lambda _: breakable(mesh, 2e4, rules), poses, sizes) for _ in range(2))
     turn, place = poses.turn[2], poses.place[2]
     name = 2 * len(mesh.points)
-    broken = Analyses(several)([Strike(name, points @ turn.T + place, force @ turn.T)])
+    broken = Analyses(several)([Strike(name, points @ turn.T + place, force @ turn.T, np.zeros(3))])
     assert broken[name] == alone.copy(0).graph.broken.sum() > 0 and several.left == alone.left < 6
     again.restore(several.saved())
     for each in (several, again):
@@ -295,7 +295,8 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one() -> None:
     serial, spread = Analyses(alone), Analyses(first, comm, "begin")  # type: ignore[arg-type]
     for size in (1e4, 3e4):
         force = size * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
-        strikes = [Strike(k * length, points + mesh.points[k * length] - mesh.points[0], force) for k in range(3)]
+        there = [points + mesh.points[k * length] - mesh.points[0] for k in range(3)]
+        strikes = [Strike(k * length, each, force, np.zeros(3)) for k, each in enumerate(there)]
         broken = serial(strikes)
         assert spread(strikes) == broken
     assert comm.asked and alone.left == 0 and alone.copy(0).pieces.count > 3

@@ -61,11 +61,16 @@ def tau(first: Ints, second: Ints, speed: Values) -> Values:
     return np.full(len(first), TAU)
 
 
+def at_points(first: Ints, second: Ints) -> Values:
+    """Nothing spreads."""
+    return np.zeros(len(first))
+
+
 def strains(step: float, height: float) -> list[Strain]:
     """Of a cube that is dropped on another one on the floor, in half a second."""
     bodies = cubes([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5 + height]])
     engine, names = Engine(bodies, [[CUBE]] * 2, [floor()], Rules(step, DOWN, 0.5)), np.arange(2)
-    blows, found = Blows(step, 2 * G * step, tau), []
+    blows, found = Blows(step, 2 * G * step, tau, at_points), []
     for _ in range(round(0.5 / step)):
         after, touches = engine.advance(bodies)
         found += blows.look(touches, bodies, names)
@@ -94,7 +99,11 @@ def test_a_blow_has_its_whole_impulse_and_is_passed_on(step: float) -> None:
 def test_what_rests_is_not_struck() -> None:
     """A cube on the floor: one load, no blow."""
     bodies = cubes([[0.0, 0.0, 0.5]])
-    engine, blows, found = Engine(bodies, [[CUBE]], [floor()], Rules(2e-3, DOWN)), Blows(2e-3, 4e-3 * G, tau), []
+    engine, blows, found = (
+        Engine(bodies, [[CUBE]], [floor()], Rules(2e-3, DOWN)),
+        Blows(2e-3, 4e-3 * G, tau, at_points),
+        [],
+    )
     for _ in range(200):
         after, touches = engine.advance(bodies)
         found += blows.look(touches, bodies, np.arange(1))

@@ -6,6 +6,7 @@ relief       what a load accelerates a free body with is taken off it
 free_body    the quasi-static analysis of one body, or of one piece of a broken one
 pinned       B07's three pinned points, to compare with
 point_loads  forces at points of a surface, handed to the nodes of the cells behind
+patches      forces on circles of contact, with Hertz's pressure
 analyses     of several bodies at once, spread over ranks
 breakable    a struck piece breaks, and its pieces in turn
 copies       each with damage of its own, all with one operator while they are whole
@@ -26,6 +27,6 @@ siblings     pieces that lie in one another from birth
 tumbling     how bodies turn, by their angular momentum
 touches      what touched in a step
 blows        which contacts are blows, and which are loads
-hertz        how long a blow lasts
+hertz        how long a blow lasts, and what it presses on
 stepper      a step: motion, blows, analyses, pieces
 """

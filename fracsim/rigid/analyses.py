@@ -8,7 +8,7 @@ number of ranks. Those that have used theirs up share what the others left.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,13 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Strike:
-    """On the body of a name: forces (k, 3) at points (k, 3) at rest, N and m; at most `share` surfaces may open."""
+    """On the body of a name: forces (k, 3) on circles of radii (k,) about points (k, 3) at rest, N and m; at most
+    `share` surfaces may open."""
 
     name: int
     points: Values
     force: Values
+    radius: Values
     share: int = 0
 
 
@@ -59,7 +61,7 @@ class Analyses:
         waiting = strikes
         while waiting and bodies.left:
             few, more = divmod(bodies.left, len(waiting))
-            tasks = [Strike(each.name, each.points, each.force, few + (k < more)) for k, each in enumerate(waiting)]
+            tasks = [replace(each, share=few + (k < more)) for k, each in enumerate(waiting)]
             found = self._spread([each for each in tasks if each.share])
             bodies.take(found)
             for opened in found:
@@ -120,4 +122,4 @@ def _gathered(comm: MPI.Comm, bodies: Copies, strikes: list[Strike]) -> list[Any
 
 def opened_by(bodies: Copies, strike: Strike) -> Opened:
     """What a strike opens. Raises NotConverged."""
-    return bodies.opened(strike.name, strike.points, strike.force, strike.share)
+    return bodies.opened(strike.name, strike.points, strike.force, strike.radius, strike.share)

@@ -32,6 +32,7 @@ STANDS = 2**30  # above all names of bodies: what stands in their way is known b
 NEVER = 2**30  # steps since a body was struck that never was
 
 Time = Callable[[Ints, Ints, Values], Values]  # s of things (k,) and (k,) that meet at speeds (k,), m/s
+Spread = Callable[[Ints, Ints], Values]  # (k,) a^3 / F of where things (k,) and (k,) touch, m^3/N
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,14 @@ class Strain:
 
     Attributes:
         body: its number.    points, force: (k, 3) where and what, of the body at rest, m and N.
+        radius: (k,) of the circles that the forces press on, m.
         speed: of approach, m/s; 0 of a load.    time: s that a blow lasts.
     """
 
     body: int
     points: Values
     force: Values
+    radius: Values
     speed: float = 0.0
     time: float = 0.0
 
@@ -54,7 +57,8 @@ class Strain:
 class _Known:
     """Of bodies by their names (n,), ascending: steps that they were not struck for, the greatest load that was looked
     at, N; of the last step, by the codes of pairs of things (k,), ascending, what they gave one another, N s, and what
-    the bodies `on` (m,) received, `gave` (m, 3) N s at points `where` (m, 3), m, in their axes at rest."""
+    the bodies `on` (m,) received, `gave` (m, 3) N s at points `where` (m, 3), m, in their axes at rest, and how it
+    `spread` (m,), m^3/N."""
 
     names: Ints
     quiet: Ints
@@ -64,20 +68,21 @@ class _Known:
     on: Ints
     where: Values
     gave: Values
+    spread: Values
 
     @classmethod
     def nothing(cls) -> _Known:
         """Before the first step."""
-        none, no = np.empty(0, np.int64), np.empty(0)
-        return cls(none, none, no, none, no, none, *np.empty((2, 0, 3)))
+        none, no, nowhere = np.empty(0, np.int64), np.empty(0), np.empty((0, 3))
+        return cls(none, none, no, none, no, none, nowhere, nowhere, no)
 
 
 class Blows:
     """Watches contacts from step to step; bodies are known by names that stay with them."""
 
-    def __init__(self, step: float, fast: float, time: Time) -> None:
+    def __init__(self, step: float, fast: float, time: Time, spread: Spread) -> None:
         """`step`: s; `fast`: what pushes by less, times the mass of the lighter thing, passes no blow on, m/s."""
-        self._step, self._fast, self._time = step, fast, time
+        self._step, self._fast, self._time, self._spread = step, fast, time, spread
         self._known = _Known.nothing()
 
     def look(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
@@ -86,8 +91,8 @@ class Blows:
         speed, time = self._struck(touches, bodies, names)
         known, n = self._known, len(names)
         known.quiet = np.where(speed > 0, 0, np.minimum(known.quiet + 1, NEVER))
-        body, points, impulses = _at_rest(touches, bodies)
-        received = _Received(body, points, impulses)
+        received = _at_rest(touches, bodies, self._spread)
+        body, impulses = received.body, received.impulses
         due = [self._blow(received, int(each), int(names[each]), float(speed[each]), float(time[each]))
                for each in np.flatnonzero(speed)]  # fmt: skip
         size = np.linalg.norm(impulses, axis=1) / self._step
@@ -101,8 +106,9 @@ class Blows:
         self._align(names)
         known = self._known
         known.pairs, _, known.pushed = self._by_pairs(touches, names)
-        body, known.where, known.gave = _at_rest(touches, bodies)
-        known.on = names[body]
+        received = _at_rest(touches, bodies, self._spread)
+        known.on, known.where = names[received.body], received.points
+        known.gave, known.spread = received.impulses, received.spread
 
     def forget(self, names: Ints) -> None:
         """Bodies of these names are no more."""
@@ -182,37 +188,42 @@ class Blows:
     # --- strains ---
 
     def _blow(self, received: _Received, body: int, name: int, speed: float, time: float) -> Strain:
-        points, impulses = received.by(body)
-        before = self._known.on == name
+        new, before = received.body == body, self._known.on == name
         still = self._known.gave[before] * (1 / self._step - 1 / time)
-        force = np.concatenate([impulses / time, still])
-        return Strain(body, np.concatenate([points, self._known.where[before]]), force, speed, time)
+        force = np.concatenate([received.impulses[new] / time, still])
+        points = np.concatenate([received.points[new], self._known.where[before]])
+        spread = np.concatenate([received.spread[new], self._known.spread[before]])
+        return Strain(body, points, force, _radius(spread, force), speed, time)
 
     def _load(self, received: _Received, body: int) -> Strain:
-        points, impulses = received.by(body)
-        return Strain(body, points, np.asarray(impulses / self._step))
+        mine = received.body == body
+        force = np.asarray(received.impulses[mine] / self._step)
+        return Strain(body, received.points[mine], force, _radius(received.spread[mine], force))
+
+
+def _radius(spread: Values, force: Values) -> Values:
+    """(k,) m, of forces (k, 3) that spread so."""
+    return np.asarray(np.cbrt(spread * np.linalg.norm(force, axis=1)))
 
 
 @dataclass(frozen=True)
 class _Received:
-    """What bodies (m,) received in a step: impulses (m, 3) at points (m, 3) of theirs at rest, N s and m."""
+    """What bodies (m,) received in a step: impulses (m, 3) at points (m, 3) of theirs at rest, N s and m, and how they
+    `spread` (m,), m^3/N."""
 
     body: Ints
     points: Values
     impulses: Values
-
-    def by(self, body: int) -> tuple[Values, Values]:
-        """(k, 3) points and (k, 3) impulses of one of them."""
-        mine = self.body == body
-        return self.points[mine], self.impulses[mine]
+    spread: Values
 
 
-def _at_rest(touches: Touches, bodies: Bodies) -> tuple[Ints, Values, Values]:
-    """(m,) bodies, (m, 3) points and (m, 3) impulses on them, in their axes at rest."""
+def _at_rest(touches: Touches, bodies: Bodies, spread: Spread) -> _Received:
+    """What the bodies received, in their axes at rest."""
     things = np.concatenate([touches.first, touches.second])
     mine = things < len(bodies)
     body, points = things[mine], np.tile(touches.point, (2, 1))[mine]
     impulse = np.concatenate([-touches.impulse, touches.impulse])[mine]
     turn = bodies.turn[body]
     arm = np.einsum("kji,kj->ki", turn, points - bodies.place[body])
-    return body, arm + bodies.centre[body], np.einsum("kji,kj->ki", turn, impulse)
+    wide = np.tile(spread(touches.first, touches.second), 2)[mine]
+    return _Received(body, arm + bodies.centre[body], np.einsum("kji,kj->ki", turn, impulse), wide)

@@ -19,6 +19,7 @@ from ..mesh.pieces import Pieces, find_pieces
 from ..mesh.topology import MeshTopology
 from ..stepping.petsc_options import Options
 from .free_body import FreeBody, Stiffness
+from .patches import patches
 from .point_loads import PointLoads, point_loads
 
 Ints = npt.NDArray[np.int64]
@@ -147,8 +148,10 @@ class Breakable:
         sides = np.maximum.reduceat(X[order], start) - np.minimum.reduceat(X[order], start)
         return np.asarray(np.linalg.norm(sides, axis=1))
 
-    def loads(self, piece: int, points: Values, force: Values) -> PointLoads:
-        """Forces (k, d) at points (k, d) of a piece at rest."""
+    def loads(self, piece: int, points: Values, force: Values, radius: Values | None = None) -> PointLoads:
+        """Forces (k, d) at points (k, d) of a piece at rest, on circles of radii (k,), m; None: at points."""
+        if radius is not None:
+            points, force = patches(points, force, radius, self._domain.mean_edge)
         cells = self._domain.cell_nodes[self.shares(piece) > 0].astype(np.int64)
         return point_loads(self._domain.nodes, cells, points, force)
 

@@ -25,6 +25,7 @@ from .touches import Touches
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,11 @@ class RigidStepper:
         self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
         self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
         self._driven = any(each.moved is not None for each in obstacles)
-        self.blows, self.phases, self.overlaps = Blows(rules.step, rules.fast, self._time), Phases(), Overlaps.none()
+        self.blows, self.phases, self.overlaps = (
+            Blows(rules.step, rules.fast, self._time, self._spread),
+            Phases(),
+            Overlaps.none(),
+        )
         self._engine: Engine | None = None
         self.look_again()
 
@@ -196,7 +201,7 @@ class RigidStepper:
 
     def _strikes(self, due: list[Strain]) -> list[Strike]:
         """Those that might break a body."""
-        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force) for each in due]
+        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force, each.radius) for each in due]
         sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
         may = [self.copies.may_break(each.name, much) for each, much in zip(every, sums, strict=True)]
         return [each for each, yes in zip(every, may, strict=True) if yes]
@@ -216,15 +221,24 @@ class RigidStepper:
         self.overlaps = self.overlaps.divided(after.names, before.names[parent])
         return replace(parts, **kept)
 
-    # --- how long a blow lasts ---
+    # --- how long a blow lasts, and what it presses on ---
 
     def _time(self, first: Ints, second: Ints, speed: Values) -> Values:
         """s, of things (k,) that meet others (k,) at speeds (k,), m/s."""
         if self._given is not None:
             return np.full(len(first), self._given)
         mass, size = self._weights()
-        both = np.maximum(first, second) < len(self.shapes.names)
+        both = self._both_give(first, second)
         return self._hertz(reduced(mass[first], mass[second]), reduced(size[first], size[second]), speed, both)
+
+    def _spread(self, first: Ints, second: Ints) -> Values:
+        """a^3 / F, m^3/N, of things (k,) that touch others (k,)."""
+        _, size = self._weights()
+        return self._hertz.spread(reduced(size[first], size[second]), self._both_give(first, second))
+
+    def _both_give(self, first: Ints, second: Ints) -> Flags:
+        """(k,) whether both are bodies: what stands does not give way."""
+        return np.asarray(np.maximum(first, second) < len(self.shapes.names))
 
     def _weights(self) -> tuple[Values, Values]:
         """Masses of all things in kg and half their sizes in m: half the side of a cube as large."""
