@@ -404,7 +404,14 @@ def _run_rigid(
 def _check(
     folder: Path, study: Study, text: str, source: Path | None = None, *, restart: bool, overwrite: bool
 ) -> None:
-    inputs = (source, study.mesh.file, study.mesh.surface, study.mesh.outline, *(each.file for each in study.obstacle))
+    inputs = (
+        source,
+        study.mesh.file,
+        study.mesh.surface,
+        study.mesh.outline,
+        study.mesh.shell,
+        *(each.file for each in study.obstacle),
+    )
     check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs)
 
 

@@ -15,6 +15,20 @@ class MeshError(ValueError):
     """A mesh that cannot be built or used; the message says what is wrong, where, and what to do."""
 
 
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """What a mesh is the thickness of: n nodes below, n above, three cells to a triangle (meshes.shell).
+
+    Attributes:
+        middle: (2 n, 3) place in the middle surface of each node of the mesh, m.
+        triangles: (m, 3) between the first n nodes.    thickness: m.
+    """
+
+    middle: Points
+    triangles: Indices
+    thickness: float
+
+
 @dataclass(frozen=True, eq=False)  # two are equal where they are the same: what is made of one is kept beside it
 class MeshData:
     """A simplex mesh in arrays, with named groups.
@@ -26,6 +40,7 @@ class MeshData:
             A facet may be in more than one group.
         regions: name -> (k,) cell indices. Empty: the body is of one material.
         notes: what was mended while reading, one sentence each, to be told to the user.
+        shell: of what it is the thickness; None: a solid.
     """
 
     points: Points
@@ -33,6 +48,7 @@ class MeshData:
     facet_groups: dict[str, Indices] = field(default_factory=dict)
     regions: dict[str, Indices] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    shell: Shell | None = None
 
     @property
     def dim(self) -> int:

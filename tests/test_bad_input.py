@@ -87,7 +87,7 @@ REFUSED: list[tuple[Data, str]] = [
     (right(fix="x", pressure=1.0), "found fix and pressure"),
     (
         changed(BAR, mesh=None) | {"mesh": {}},
-        "mesh: give exactly one of builder, file, surface, outline; found none of them",
+        "mesh: give exactly one of builder, file, surface, outline, shell; found none of them",
     ),
     (changed(BAR, mesh={"file": "a.msh"}), "found builder and file"),
     (held_at({"point": [0, 0, 0]}), "boundary.0.on.normal is missing"),
@@ -113,7 +113,7 @@ REFUSED: list[tuple[Data, str]] = [
     (probing(on="left", name="a b"), 'probe.0.name = "a b": must be letters, digits and -'),
     # words that are not on the list
     (changed(BAR, mesh={"builder": "boxx"}), 'mesh.builder = "boxx" is not a builder; did you mean box?'),
-    (changed(BAR, mesh={"builder": "quiche"}), "is not a builder; there are: box, cylinder, disk, figure, loaf"),
+    (changed(BAR, mesh={"builder": "quiche"}), "is not a builder; there are: boat, box, cylinder, disk, figure, loaf"),
     (changed(BAR, material={"energy": "neohookean"}), "did you mean neo-hookean?"),
     (changed(BAR, material={"energy": "rubber"}), "must be 'linear', 'corotated', 'stvk' or 'neo-hookean'"),
     (changed(BAR, time={"scheme": "newmarks"}), "did you mean newmark?"),

@@ -42,6 +42,9 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("notched-plate", {"thickness": 0.004, "h": 0.003, "h_tip": 0.001}),
     ("plate-hole", {}),
     ("plate-hole", {"length": 0.04, "thickness": 0.01, "h_hole": 0.002}),
+    ("boat", {}),
+    ("ornament", {}),
+    ("ornament", {"neck": 0.0, "h": 0.01}),
     ("stones", {"count": 12, "aside": (3, 2)}),
     ("vase", {"h": 0.01}),
     ("vase", {"wall": 0.0, "h": 0.012}),
@@ -85,6 +88,8 @@ def test_cells_are_positive_and_the_check_has_nothing_to_say(built: tuple[Any, M
     assert signed_measures(mesh.points, mesh.cells).min() > 0
     notes = check_mesh(mesh).notes
     assert len(notes) == 1 and "12 bodies that share no node" in notes[0] if builder.name == "stones" else not notes
+    if mesh.shell is not None:
+        return  # its cells are as flat as it is thin; its triangles are what is solved on
     quality = mesh_quality(mesh)
     # gmsh may not move the surface of a figure, so that it cannot mend every cell below it: a few in ten thousand
     assert quality["radius_ratio_min"] > (0.05 if builder.name == "figure" else 0.15)
@@ -130,7 +135,7 @@ def test_bounds_are_known_before_building(built: tuple[Any, MeshData]) -> None:
     size = np.subtract(high, low)
     # A polygon in a circle misses the circle's extremes by up to r (1 - cos(h / 2r)) ~ h^2 / 8r.
     # The blended figure reaches beyond its parts: at a tip of two deep parts, by up to blend * log(2).
-    slack = builder.h**2 / (8 * builder.radius) if builder.name in ("cylinder", "disk", "vase") else 0.0
+    slack = builder.h**2 / (8 * builder.radius) if builder.name in ("cylinder", "disk", "ornament", "vase") else 0.0
     if builder.name == "figure":
         slack = builder.h**2 / (8 * builder.height * 0.03) + builder.height * BLEND * log(2)
     np.testing.assert_allclose(mesh.points.min(axis=0), low, atol=slack + 1e-12 * size.max())

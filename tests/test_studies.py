@@ -41,6 +41,7 @@ COARSE = {
     "punched-slab": ["mesh.h=0.01"],
     "rigid-dropped-vase": ["mesh.h=0.02"],
     "rigid-figure": ["mesh.h=0.015"],
+    "rigid-ornament": ["mesh.h=0.01"],
     "rigid-vase": ["mesh.h=0.015"],
     "rigid-wall": ["mesh.h=0.15"],
     "struck-figure": ["mesh.h=0.015"],

@@ -4,6 +4,8 @@ Strain and fracture, of copies of one mesh:
 
 relief       what a load accelerates a free body with is taken off it
 free_body    the quasi-static analysis of one body, or of one piece of a broken one
+plate        flat shell triangles: membrane and bending
+shell_body   the same analysis of a shell
 pinned       B07's three pinned points, to compare with
 point_loads  forces at points of a surface, handed to the nodes of the cells behind
 patches      forces on circles of contact, with Hertz's pressure

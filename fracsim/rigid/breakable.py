@@ -7,18 +7,18 @@ that come of it are analysed in turn under what of the blow falls on them, until
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..fracture.brittle.surfaces import BrittleSurfaces
 from ..fracture.criterion import Average
+from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from ..mesh.pieces import Pieces, find_pieces
 from ..mesh.topology import MeshTopology
 from ..stepping.petsc_options import Options
-from .free_body import FreeBody, Stiffness
 from .patches import patches
 from .point_loads import PointLoads, point_loads
 
@@ -71,6 +71,34 @@ class Opened:
     iterations: int
 
 
+class Analysis(Protocol):
+    """Of one free body: its cells' shares, and what it moves by under forces at the nodes of the mesh."""
+
+    share: Values
+
+    @property
+    def iterations(self) -> int: ...
+
+    def __call__(self, force: Values) -> Values: ...
+
+    def destroy(self) -> None: ...
+
+
+class Operator(Protocol):
+    """Of the mesh: what solves for its bodies (rigid.free_body, rigid.shell_body); `finest`: m, their least size."""
+
+    stress: Stress
+
+    @property
+    def finest(self) -> float: ...
+
+    def whole(self, options: Options | None = None) -> Analysis: ...
+
+    def body(self, share: Values, options: Options | None = None) -> Analysis: ...
+
+    def tensor(self, u: Values, share: Values) -> Values: ...
+
+
 class Breakable:
     """Bodies in one mesh, on one rank.
 
@@ -81,7 +109,7 @@ class Breakable:
 
     def __init__(
         self,
-        stiffness: Stiffness,
+        stiffness: Operator,
         graph: EdgeGraph,
         criterion: BrittleSurfaces | None,
         within: Within,
@@ -90,7 +118,7 @@ class Breakable:
         """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's."""
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
         self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
-        self._kept: dict[int, FreeBody] = {}  # by the lowest node of the piece
+        self._kept: dict[int, Analysis] = {}  # by the lowest node of the piece
         self._node = np.argsort(self._domain.node_input)  # of each node of the input mesh
         self._find_pieces()
 
@@ -137,7 +165,7 @@ class Breakable:
             return False
         if self._length is None:
             self._length = self._lengths()
-        h = self._domain.mean_edge
+        h = self._stiffness.finest
         return bool(2 * force * max(float(self._length[piece]), h) / h**3 >= self._criterion.strength.weakest)
 
     def _lengths(self) -> Values:
@@ -171,14 +199,14 @@ class Breakable:
         self.iterations += body.iterations
         return self._stiffness.tensor(u, body.share)
 
-    def _free(self, piece: int) -> FreeBody:
+    def _free(self, piece: int) -> Analysis:
         """The analysis of a piece, kept until it breaks; of all cells it is that of all copies of the mesh."""
         key = int(np.flatnonzero(self.pieces.of_node == piece)[0])
         if key not in self._kept:
             share = self.shares(piece)
             if np.all(share == 1):
                 return self._stiffness.whole(self._options)
-            self._kept[key] = FreeBody(self._stiffness, share, self._options)
+            self._kept[key] = self._stiffness.body(share, self._options)
         return self._kept[key]
 
     @property

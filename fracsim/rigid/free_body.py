@@ -58,8 +58,17 @@ class Stiffness:
     def whole(self, options: Options | None = None) -> FreeBody:
         """The body of all cells; kept, for all copies of the mesh."""
         if self._whole is None:
-            self._whole = FreeBody(self, np.ones(self.stress.domain.cell_count), options)
+            self._whole = self.body(np.ones(self.stress.domain.cell_count), options)
         return self._whole
+
+    def body(self, share: Values, options: Options | None = None) -> FreeBody:
+        """Of the cells with a share (cells,)."""
+        return FreeBody(self, share, options)
+
+    @property
+    def finest(self) -> float:
+        """m, an edge of the mesh."""
+        return self.stress.domain.mean_edge
 
     def tensor(self, u: Values, share: Values) -> Values:
         """(cells, 3 or 6) stress of displacements u (nodes, d) in the cells with a share, 0 in all others, Pa."""

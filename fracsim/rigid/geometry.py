@@ -91,7 +91,7 @@ class Geometry:
             key = int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")
             same = before.get(name)
             if same is None or same[0] != key:
-                same = key, convex_parts(Solid.of(made.points, made.elements[piece == each]), self.mean_edge)
+                same = key, convex_parts(Solid.of(made.points, made.elements[piece == each]).filled, self.mean_edge)
             after[name] = same
         self._hulls[number] = after
         return _Copy(pattern, names, of, made.piece_of_node, [after[int(name)][1] for name in names])

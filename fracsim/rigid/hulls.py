@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from ..mesh.split.moments import Moments, cones, moments
+from ..meshes.components import components
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -52,6 +53,16 @@ class Solid:
         """Of triangles (m, 3) between some of the points."""
         used, corners = np.unique(triangles, return_inverse=True)
         return cls(points[used], corners.reshape(-1, 3))
+
+    @property
+    def filled(self) -> Solid:
+        """Without its cavities: what is closed up within meets nothing."""
+        count, part = components(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.points))
+        if count == 1:
+            return self
+        of = part[self.triangles[:, 0]]
+        volume = np.bincount(of, cones((self.points - self.points[0])[self.triangles]), count)
+        return Solid.of(self.points, self.triangles[volume[of] > 0])
 
     @property
     def moments(self) -> Moments:

@@ -24,7 +24,7 @@ class Relief:
     """Of one body with n nodes.
 
     Attributes:
-        mass: (n,) lumped, kg.    modes: (n d, m) rigid modes, in any basis.
+        mass: (n,) lumped, kg, or (n, d) of each unknown.    modes: (n d, m) rigid modes, in any basis.
     """
 
     mass: Values
@@ -32,6 +32,7 @@ class Relief:
 
     def __call__(self, force: Values) -> Values:
         """(n, d) nodal forces f - M a that no longer accelerate the body, from forces f (n, d), N."""
-        weighted = np.repeat(self.mass, force.shape[1])[:, None] * self.modes
+        mass = np.repeat(self.mass, force.shape[1]) if self.mass.ndim == 1 else self.mass.reshape(-1)
+        weighted = mass[:, None] * self.modes
         c = np.linalg.solve(self.modes.T @ weighted, self.modes.T @ force.reshape(-1))
         return np.asarray(force - (weighted @ c).reshape(force.shape))

@@ -20,7 +20,7 @@ from ..mesh.topology import MeshTopology
 from ..meshes.data import MeshData
 from ..meshes.words import format_point
 from ..rigid.analyses import Analyses, serve
-from ..rigid.breakable import Breakable, Within
+from ..rigid.breakable import Breakable, Operator, Within
 from ..rigid.copies import Copies
 from ..rigid.free_body import Stiffness
 from ..rigid.geometry import Geometry
@@ -72,6 +72,7 @@ class RigidScene:
 def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScene:
     """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit."""
     single = checked_mesh(study)
+    _check_shell(study, single)
     places = _places(study)
     copies, poses, density = _copies(study, single, places), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
@@ -116,13 +117,20 @@ def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:
     """Of the mesh, in its own axes."""
     domain = distribute(MPI.COMM_SELF, mesh)
     stress = Stress(Assembler(domain), fem.Function(domain.space), material_of(study, domain), Weakening("chi"))
-    stiffness = Stiffness(stress, np.full(domain.cell_count, float(study.material.density)))
+    stiffness: Operator
+    density = float(study.material.density)
+    if mesh.shell is None:
+        stiffness = Stiffness(stress, np.full(domain.cell_count, density))
+    else:
+        from ..rigid.shell_body import ShellStiffness
+
+        stiffness = ShellStiffness(stress, mesh.shell, study.material.young, study.material.poisson, density)
     average = average_of(study, domain)
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
     return Copies(lambda number: _breakable(study, stiffness, average, number), Poses.of(places), sizes)
 
 
-def _breakable(study: Study, stiffness: Stiffness, average: Average | None, number: int) -> Breakable:
+def _breakable(study: Study, stiffness: Operator, average: Average | None, number: int) -> Breakable:
     """A copy of the mesh, with what breaks of it. Chance differs from copy to copy."""
     domain = stiffness.stress.domain
     graph, within = EdgeGraph(domain), Within(average, domain.cell_count)
@@ -133,6 +141,16 @@ def _breakable(study: Study, stiffness: Stiffness, average: Average | None, numb
         strength, rules = strength_of(study, domain, graph, number), surface_rules(study.brittle, number)
         criterion = BrittleSurfaces(stiffness.stress, graph, strength, within, rules)
     return Breakable(stiffness, graph, criterion, within, study.solver)
+
+
+def _check_shell(study: Study, mesh: MeshData) -> None:
+    """InputError where a shell is asked for what shells do not have."""
+    if mesh.shell is None:
+        return
+    if study.brittle is not None and study.brittle.shape == "curved":
+        raise InputError('brittle.shape = "curved" is not for shells: take "planar"')
+    if study.material.regions:
+        raise InputError("a shell is of one material: remove the regions of [material]")
 
 
 def _check_masses(state: RigidState) -> None:

@@ -9,12 +9,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from .values import NonNegative, Poisson, Positive, Strength, Table
 
-SOURCES = ("builder", "file", "surface", "outline")
+SOURCES = ("builder", "file", "surface", "outline", "shell")
 
 
 class Mesh(BaseModel):
     """`builder` with its own parameters, or `file` with named groups, or a closed `surface` or a plane `outline` filled
-    at size `h`."""
+    at size `h`, or a `shell` of some thickness."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -22,6 +22,7 @@ class Mesh(BaseModel):
     file: Path | None = None
     surface: Path | None = None
     outline: Path | None = None
+    shell: Path | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Mesh:
@@ -32,8 +33,13 @@ class Mesh(BaseModel):
         return self
 
     @property
+    def source(self) -> str | Path:
+        """What it is made of."""
+        return next(value for key in SOURCES if (value := getattr(self, key)) is not None)
+
+    @property
     def parameters(self) -> dict[str, Any]:
-        """Everything besides the source: the builder's parameters, or h of a surface."""
+        """Everything besides the source: the builder's parameters, or h of a surface, or the thickness of a shell."""
         return dict(self.model_extra or {})
 
 

@@ -189,7 +189,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     if study.time.scheme == "rigid":
         yield from _rigid_description(study, anatomy)
         return
-    source = study.mesh.builder or study.mesh.file or study.mesh.surface or study.mesh.outline
+    source = study.mesh.source
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
     yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
@@ -248,7 +248,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
 
 def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     """What there is of a study of rigid bodies."""
-    source = study.mesh.builder or study.mesh.file or study.mesh.surface or study.mesh.outline
+    source = study.mesh.source
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}"
     yield f"size        {_size(anatomy)}"
     copies = sum(int(np.prod(each.copies)) for each in study.body) or 1

@@ -73,7 +73,12 @@ BESIDE = {
         "scale": "metres for each unit of length of the file, a number > 0",
         "seed": "of its random points, a whole number > 0",
     },
+    "shell": {
+        "thickness": "a shell has a thickness > 0 (m)",
+        "scale": "metres for each unit of length of the file, a number > 0",
+    },
 }
+NEEDED = ("h", "thickness")  # of those that have it
 
 
 def _check_source(mesh: Mesh) -> None:
@@ -87,7 +92,7 @@ def _check_source(mesh: Mesh) -> None:
     for name, meaning in BESIDE[key].items():
         value: Any = mesh.parameters.get(name)
         whole = name != "seed" or isinstance(value, int)
-        if (name in mesh.parameters or name == "h") and not (is_number(value) and value > 0 and whole):
+        if (name in mesh.parameters or name in NEEDED) and not (is_number(value) and value > 0 and whole):
             raise InputError(f"mesh.{name} = {value}: {meaning}")
 
 
@@ -147,6 +152,11 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
             from ..meshes.scattered.drawn import fill_outline
 
             data = fill_outline(drawn, float(mesh.parameters["h"]), int(mesh.parameters.get("seed", 1)))
+        elif mesh.shell is not None:
+            from ..meshes.shell import read_shell
+
+            given = mesh.parameters
+            data = read_shell(mesh.shell, float(given["thickness"]), float(given.get("scale", 1.0)))
         else:
             assert mesh.file is not None
             data = read_mesh(mesh.file)

@@ -42,6 +42,8 @@ def check_rigid(study: Study) -> None:
         own = ["[[body]]"] if study.body else []
         if contact is not None:
             own += [f"contact.{key}" for key in ("restitution", "contact_time") if getattr(contact, key) is not None]
+        if study.mesh.shell is not None:
+            own.append("mesh.shell")
         if own:
             raise ValueError(f'{own[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
         return

@@ -71,11 +71,28 @@ def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
             triangles without an area or points that are no numbers, or parts that cut each other.
     """
     path = Path(path)
+    return closed_surface(*_read_triangles(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
+
+
+def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, int]:
+    """Points [m] and triangles of a surface, closed or open, joined at coincident points and turned alike; how many
+    were turned. MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
+    points, triangles = _read_triangles(path, scale, source)
+    _check_points(points, triangles, source)
+    points, triangles = _joined(points, triangles)
+    _check_areas(points, triangles, source)
+    _check_edges(points, triangles, source, (2,))
+    triangles, _, turned = _consistent(triangles, source)
+    return points, triangles, turned
+
+
+def _read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
+    """As they are in a file; `scale`: metres per unit of it."""
     contents = read_contents(path)
     triangles = np.concatenate([np.zeros((0, 3), np.int64), *map(_triangles, contents.blocks)])
     if len(triangles) == 0 or contents.points.shape[1] != 3:
-        raise MeshError(f"Surface file '{path}' holds no triangles in space.")
-    return closed_surface(scale * contents.points, triangles, f"Surface file '{path}'")
+        raise MeshError(f"{source} holds no triangles in space.")
+    return scale * contents.points, triangles
 
 
 def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
@@ -166,11 +183,17 @@ def _areas(points: Points, triangles: Indices) -> Floats:
 
 
 def _check_closed(points: Points, triangles: Indices, source: str) -> None:
+    _check_edges(points, triangles, source, (1, 2))
+
+
+def _check_edges(points: Points, triangles: Indices, source: str, which: tuple[int, ...]) -> None:
+    """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
     edges, counts, _ = distinct_rows(np.sort(_directed_edges(triangles), axis=1))
-    for wrong, what in (
-        (edges[counts == 1], "is open: {} edges belong to one triangle only"),
-        (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
-    ):
+    found = {
+        1: (edges[counts == 1], "is open: {} edges belong to one triangle only"),
+        2: (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
+    }
+    for wrong, what in (found[kind] for kind in which):
         if len(wrong):
             raise MeshError(
                 f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
@@ -191,8 +214,9 @@ def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]
     """
     count = len(triangles)
     directed = _directed_edges(triangles)
-    _, _, edge = distinct_rows(np.sort(directed, axis=1))
+    _, counts, edge = distinct_rows(np.sort(directed, axis=1))
     order = np.argsort(edge, kind="stable")
+    order = order[counts[edge[order]] == 2]  # an open one has edges of one triangle
     first, second = order[0::2], order[1::2]
     disagree = directed[first, 0] == directed[second, 0]
     a, b = first // 3, second // 3

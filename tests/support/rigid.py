@@ -20,8 +20,9 @@ from fracsim.mesh.split.build import split
 from fracsim.mesh.split.moments import Moments, moments
 from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.breakable import Breakable, Within
+from fracsim.rigid.breakable import Breakable, Operator, Within
 from fracsim.rigid.free_body import FreeBody, Stiffness
+from fracsim.rigid.shell_body import ShellStiffness
 
 Values = npt.NDArray[np.float64]
 DENSITY = 2000.0  # kg/m^3
@@ -34,6 +35,12 @@ def stiffness_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> St
     material = material_fields(domain, "linear", young=young, poisson=poisson, density=DENSITY)
     stress = Stress(Assembler(domain), fem.Function(domain.space), material, Weakening("chi"))
     return Stiffness(stress, np.full(domain.cell_count, DENSITY))
+
+
+def shell_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> ShellStiffness:
+    """Of a shell of linear material."""
+    assert mesh.shell is not None
+    return ShellStiffness(stiffness_of(mesh, young, poisson).stress, mesh.shell, young, poisson, DENSITY)
 
 
 def whole_body(mesh: MeshData) -> tuple[Stiffness, FreeBody, Domain]:
@@ -52,7 +59,7 @@ def section_mean(domain: Domain, values: Values, axis: int, low: float, high: fl
 
 def breakable(mesh: MeshData, strength: float, rules: SurfaceRules, poisson: float = 0.2) -> Breakable:
     """A mesh that breaks along surfaces where its stress, averaged over neighbours, reaches a strength in Pa."""
-    stiffness = stiffness_of(mesh, poisson=poisson)
+    stiffness: Operator = stiffness_of(mesh, poisson=poisson) if mesh.shell is None else shell_of(mesh, poisson=poisson)
     domain = stiffness.stress.domain
     graph, within = EdgeGraph(domain), Within(NeighbourAverage(domain), domain.cell_count)
     criterion = BrittleSurfaces(stiffness.stress, graph, Strength(graph, strength, tie_break=1e-6), within, rules)

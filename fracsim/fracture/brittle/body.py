@@ -18,32 +18,18 @@ Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
 
-class Body(MeshTopology):
-    """A mesh as level sets cut it.
+class Cells:
+    """Cells by their nodes.
 
     Attributes:
-        corners: (d + 1, C) nodes of the cells.    centroids: (C, d) m.
-        tolerance: m; nodes as near as this to a surface lie on it.
+        cells: (C, k) nodes.    corners: (k, C) the same.
     """
 
-    def __init__(self, mesh: MeshData) -> None:
-        super().__init__(mesh)
-        self.corners: Ints = np.ascontiguousarray(mesh.cells.T)
-        self.centroids: Values = mesh.points[mesh.cells].mean(axis=1)
-        self.tolerance = 1e-7 * float(np.mean(self.volumes)) ** (1 / mesh.dim)
+    cells: Ints
+    corners: Ints
 
-    @cached_property
-    def volumes(self) -> Values:
-        """(C,) m^d."""
-        return signed_measures(self.points, self.cells)
-
-    @cached_property
-    def around(self) -> csr_matrix:
-        """(N, C) cells around each node."""
-        cell = np.repeat(np.arange(len(self.cells)), self.cells.shape[1])
-        return csr_matrix(
-            (np.ones(len(cell), np.int8), (self.cells.ravel(), cell)), (len(self.points), len(self.cells))
-        )
+    def __init__(self, cells: Ints) -> None:
+        self.cells, self.corners = cells, np.ascontiguousarray(cells.T)
 
     def crossed(self, sides: Flags) -> Ints:
         """Cells with nodes on both sides (N,)."""
@@ -59,6 +45,33 @@ class Body(MeshTopology):
         for column in self.corners[1:]:
             result |= nodes[column]
         return result
+
+
+class Body(MeshTopology, Cells):
+    """A mesh as level sets cut it. A shell is cut where its middle surface is, across its whole thickness.
+
+    Attributes:
+        centroids: (C, d) m.    layer: triangles of a shell, whose nodes are there twice; None of a solid.
+        tolerance: m; nodes as near as this to a surface lie on it.
+    """
+
+    def __init__(self, mesh: MeshData) -> None:
+        MeshTopology.__init__(self, mesh)
+        Cells.__init__(self, mesh.cells)
+        self.volumes: Values = signed_measures(mesh.points, mesh.cells)
+        self.layer = None if mesh.shell is None else Cells(mesh.shell.triangles)
+        if mesh.shell is not None:
+            self.points = mesh.shell.middle
+        self.centroids: Values = self.points[mesh.cells].mean(axis=1)
+        self.tolerance = 1e-7 * float(np.mean(self.volumes)) ** (1 / mesh.dim)
+
+    @cached_property
+    def around(self) -> csr_matrix:
+        """(N, C) cells around each node."""
+        cell = np.repeat(np.arange(len(self.cells)), self.cells.shape[1])
+        return csr_matrix(
+            (np.ones(len(cell), np.int8), (self.cells.ravel(), cell)), (len(self.points), len(self.cells))
+        )
 
     def whole(self, cells: Ints, broken: Flags) -> Flags:
         """(n,) which of the cells have not come apart."""

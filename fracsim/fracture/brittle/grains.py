@@ -37,7 +37,9 @@ class Grains:
         self.of_node, _ = least(body.points, self.seeds, self.weights)
         self.of_cell, _ = least(body.centroids, self.seeds, self.weights)
         if settle:
-            self.of_node = _settled(body.cells, self.of_node)
+            half = len(self.of_node) // 2
+            self.of_node = (_settled(body.cells, self.of_node) if body.layer is None
+                            else np.tile(_settled(body.layer.cells, self.of_node[:half]), 2))  # fmt: skip
         both = self.of_node[body.edges]
         self.edges: Ints = np.flatnonzero(both[:, 0] != both[:, 1])
         self._ends = both[self.edges]

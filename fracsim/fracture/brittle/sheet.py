@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ...mesh.simplices import local_edges
 from ...meshes.components import components
-from .body import Body, triangles
+from .body import Body, Cells, triangles
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -80,8 +80,18 @@ def settled(body: Body, sides: Flags, usable: Flags, movable: Flags | None = Non
     `usable` (C,): cells that have not come apart. `movable` (N,): nodes that may move; None: all. A node without such a
     cell would drift off as a crumb without stiffness. It goes over where all other nodes of one of its cells are, so
     that it has a whole cell there; or else it draws those of one of its cells over to its own side, which is tried for
-    all such nodes of one side, then of the other, and kept where fewer are left.
+    all such nodes of one side, then of the other, and kept where fewer are left. In a shell both faces go along.
     """
+    if body.layer is None:
+        return _settled(body, sides, usable, movable)
+    half = len(sides) // 2
+    free = None if movable is None else movable[:half]
+    whole: Flags = np.asarray(usable.reshape(-1, 3).all(axis=1))
+    return np.tile(_settled(body.layer, sides[:half], whole, free), 2)
+
+
+def _settled(body: Cells, sides: Flags, usable: Flags, movable: Flags | None) -> Flags:
+    """The same, of cells that are whole."""
     near = np.zeros(len(sides), bool)
     near[body.cells[body.crossed(sides)]] = True
     if movable is not None:
