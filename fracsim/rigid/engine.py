@@ -30,6 +30,7 @@ Values = npt.NDArray[np.float64]
 
 ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farther than was thought,
 FARTHER = 1.5  # by as many times
+ROOM = 2.0  # times how far bodies come as they move: what is struck in a crowd goes farther
 STAGES = (mujoco.mj_makeM, mujoco.mj_factorM, mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint,
           mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint)  # fmt: skip
 
@@ -45,10 +46,12 @@ class Engine:
         rules: Rules,
         overlaps: Overlaps | None = None,
         names: Ints | None = None,
+        outer: Sequence[Ints] | None = None,
     ) -> None:
-        """`parts`: convex parts of each body; `overlaps`: of bodies by their names (n,), ascending, or numbers."""
+        """`parts`: convex parts of each body, of whose corners those `outer` are outermost (None: any may be);
+        `overlaps`: of bodies by their names (n,), ascending, or numbers."""
         self._rules, self._count = rules, len(bodies)
-        self._model = model_of(bodies, parts, stands, rules)
+        self._model = model_of(bodies, parts, stands, rules, outer)
         self._data = mujoco.MjData(self._model.made)
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         planes = self._model.planes
@@ -69,7 +72,7 @@ class Engine:
         """The bodies a step later, and what touched; `ways`: (stands, 3) where the reference points of what stands are
         at the end of the step, m (None: where they were)."""
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
-        reach = self._reach(bodies)
+        reach = ROOM * self._reach(bodies)
         for _ in range(ROUNDS):
             moved, touches = self._moved(bodies, rates, reach)
             farther = self._reach(moved)
@@ -160,7 +163,7 @@ class Engine:
     def _add_planes(self, bodies: Bodies, reach: Values, speeds: Values) -> None:
         """Contacts of hulls with planes, after those that MuJoCo finds."""
         planes = self._model.planes
-        for number, parts, gaps, points in planes.near(bodies, self._way, reach, speeds):
+        for number, parts, gaps, points in planes.near(bodies, self._way, reach, speeds, self._rules.step):
             contact = self._plane_contacts[number]
             for k, part in enumerate(parts):
                 contact.dist, contact.pos, contact.geom = gaps[k], points[k], [planes.geom[number], part]

@@ -12,12 +12,13 @@ from ..mesh.split.build import split
 from ..mesh.split.moments import Moments, moments
 from ..mesh.split.skeleton import Skeleton
 from ..meshes.data import MeshData
-from .hulls import Solid, convex_parts
+from .hulls import Solid, convex_parts, outermost
 from .placing import Poses
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
+_Kept = tuple[tuple[int, int, float], list[Values], Ints]
 
 
 @dataclass(frozen=True)
@@ -26,13 +27,14 @@ class Shapes:
 
     Attributes:
         names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
-        parts: corners (m, 3) of the convex parts of each, at rest, m.
+        parts: corners (m, 3) of the convex parts of each, at rest, m.    outer: of all of these, those (k,) outermost.
     """
 
     names: Ints
     moments: Moments
     piece_of_node: Ints
     parts: list[list[Values]]
+    outer: list[Ints]
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class _Copy:
     of: Moments
     piece_of_node: Ints
     parts: list[list[Values]]
+    outer: list[Ints]
 
 
 class Geometry:
@@ -59,7 +62,7 @@ class Geometry:
         self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
         # of each copy, by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as
         # these break
-        self._hulls: dict[int, dict[int, tuple[tuple[int, int, float], list[Values]]]] = {}
+        self._hulls: dict[int, dict[int, _Kept]] = {}
         self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0)
         self._placed = [self._at(number, self._whole) for number in range(len(self.poses))]
         self._known: dict[int, _Copy] = {}
@@ -76,7 +79,8 @@ class Geometry:
                        for name in ("volume", "centre", "second")))  # fmt: skip
         piece = [each.piece_of_node + first for each, first in zip(self._placed, pieces, strict=False)]
         parts = [part for each in self._placed for part in each.parts]
-        return Shapes(np.concatenate([each.names for each in self._placed]), of, np.concatenate(piece), parts)
+        outer = [each for placed in self._placed for each in placed.outer]
+        return Shapes(np.concatenate([each.names for each in self._placed]), of, np.concatenate(piece), parts, outer)
 
     def _copy(self, pattern: Patterns, cut: Values | None, number: int) -> _Copy:
         """A copy with patterns (C,)."""
@@ -85,20 +89,23 @@ class Geometry:
         of = moments(made.points, made.elements, piece, made.pieces)
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
         before = self._hulls.get(number, {})
-        after: dict[int, tuple[tuple[int, int, float], list[Values]]] = {}
+        after: dict[int, _Kept] = {}
         elements = np.bincount(piece, minlength=made.pieces)
         for each, name in enumerate(map(int, names)):
             key = int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")
             same = before.get(name)
             if same is None or same[0] != key:
-                same = key, convex_parts(Solid.of(made.points, made.elements[piece == each]).filled, self.mean_edge)
+                made_of = convex_parts(Solid.of(made.points, made.elements[piece == each]).filled, self.mean_edge)
+                same = key, made_of, outermost(made_of)
             after[name] = same
         self._hulls[number] = after
-        return _Copy(pattern, names, of, made.piece_of_node, [after[int(name)][1] for name in names])
+        _, parts, outer = zip(*(after[int(name)] for name in names), strict=True)
+        return _Copy(pattern, names, of, made.piece_of_node, list(parts), list(outer))
 
     def _at(self, number: int, copy: _Copy) -> Shapes:
         """A copy where it is at rest."""
         turn, place = self.poses.turn[number], self.poses.place[number]
         of = Moments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
         parts = [[corners @ turn.T + place for corners in each] for each in copy.parts]
-        return Shapes(copy.names + number * len(copy.piece_of_node), of, copy.piece_of_node, parts)
+        names = copy.names + number * len(copy.piece_of_node)
+        return Shapes(names, of, copy.piece_of_node, parts, copy.outer)

@@ -25,6 +25,7 @@ SPARE = 0.02  # of the body's volume: what hulls may have beyond it
 ROUGH = 0.1  # of the mean edge of the mesh: how far off they may be, in the mean
 PARTS = 32  # of a body, at most
 MANY = 1000  # points: what has more is cut across its longest axis, without a comparison
+LONG = 0.4  # of its greatest length (as its second moments go): it is not cut across what is shorter
 THIN = 0.01  # of its length: no part is flatter, or it would have no hull
 
 
@@ -136,12 +137,23 @@ def convex_parts(body: Solid, edge: float = 0.0, most: int = PARTS) -> list[Valu
     return [thickened(hull.corners) for *_, hull in heap]
 
 
+def outermost(parts: list[Values]) -> Ints:
+    """Which of the corners of all parts of a body, one after the other, are corners of their common hull: no other is
+    the first to touch a plane."""
+    corners = np.concatenate(parts)
+    try:
+        return np.sort(ConvexHull(corners).vertices).astype(np.int64)
+    except (QhullError, ValueError):
+        return np.arange(len(corners))
+
+
 def _halved(part: Solid) -> list[tuple[Solid, Hull]]:
-    """The best of the three ways of cutting it through its middle; none where it has no volume to cut."""
+    """The best way of cutting it through its middle, across one of its longer axes; none where it has no volume to cut."""
     of = part.moments
     if not of.volume[0] > 0:
         return []
-    axes = np.linalg.eigh(of.second[0])[1].T[::-1]
+    spread, axes = np.linalg.eigh(of.second[0])
+    axes = axes.T[spread > LONG**2 * spread[-1]][::-1]
     ways = [part.halves(of.centre[0], axis) for axis in (axes[:1] if len(part.points) > MANY else axes)]
     made = [[(half, half.hull) for half in way] for way in ways if all(len(half.points) > 3 for half in way)]
     return min(made, key=lambda way: sum(half.spare for _, half in way), default=[])

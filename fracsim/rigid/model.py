@@ -83,8 +83,14 @@ class Model:
     planes: Planes
 
 
-def model_of(bodies: Bodies, parts: Sequence[Sequence[Part]], stands: Sequence[Stand], rules: Rules) -> Model:
-    """Of bodies of these convex parts. MuJoCo numbers the geoms of what stands still first."""
+def model_of(
+    bodies: Bodies,
+    parts: Sequence[Sequence[Part]],
+    stands: Sequence[Stand],
+    rules: Rules,
+    outer: Sequence[Ints] | None = None,
+) -> Model:
+    """Of bodies of these convex parts, corners of which may be `outer`. MuJoCo numbers the geoms of what stands still first."""
     mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
     spec, things = _spec(rules), []
     for number, each in enumerate(parts):
@@ -105,14 +111,16 @@ def model_of(bodies: Bodies, parts: Sequence[Sequence[Part]], stands: Sequence[S
         _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat)
     first = len(fixed) + np.searchsorted(things, np.arange(count))
     thing, extent = [count + number for number in fixed] + things, [_extent(each) for each in parts]
-    planes = _planes(parts, stands, np.array(thing, np.int64), first)
+    planes = _planes(parts, stands, np.array(thing, np.int64), first, outer)
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia, inverse,
                  np.array(extent), planes)  # fmt: skip
 
 
-def _planes(parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints) -> Planes:
-    """Planes among what stands, and the corners of all hulls."""
+def _planes(
+    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Ints] | None
+) -> Planes:
+    """Planes among what stands, and the corners of all hulls, or the outermost ones."""
     stand = np.array([number for number, each in enumerate(stands) if each.shape.kind == "plane"], np.int64)
     normal = np.array([stands[number].shape.turn[:, 2] for number in stand]).reshape(-1, 3)
     hulls = [(number, first[number] + place, each) for number, part in enumerate(parts)
@@ -121,7 +129,12 @@ def _planes(parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Int
     sizes = [len(each) for *_, each in hulls]
     of, part = (np.repeat(np.array([each[k] for each in hulls], np.int64), sizes) for k in (0, 1))
     geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
-    return Planes(stand, geom, normal, np.array([stands[k].friction for k in stand]), corners, of, part)
+    friction = np.array([stands[k].friction for k in stand])
+    if outer is None:
+        return Planes(stand, geom, normal, friction, corners, of, part)
+    begin = np.cumsum([0, *(sum(map(len, each)) for each in parts)])
+    kept = np.concatenate([np.empty(0, np.int64), *(each + k for each, k in zip(outer, begin, strict=False))])
+    return Planes(stand, geom, normal, friction, corners[kept], of[kept], part[kept])
 
 
 def plane_contact(normal: Values, friction: float, rules: Rules) -> Any:

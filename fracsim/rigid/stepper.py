@@ -179,7 +179,7 @@ class RigidStepper:
                   for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
         centres = zip(self.shapes.parts, bodies.centre, strict=True)
         parts: list[list[Part]] = [[corners - centre for corners in each] for each, centre in centres]
-        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.shapes.names)
+        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.shapes.names, self.shapes.outer)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
