@@ -26,6 +26,7 @@ TOLERANCE = 1e-10  # of MuJoCo's solver, to the mean inertia
 HELD = 1e6  # mass of what is driven, in masses of all bodies
 LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
 SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
+MEMORY, LEAST_MEMORY = 2**18, 2**26  # bytes a part, and in all: pairs of parts that may touch are held at once
 FLAT, OTHER = 1, 2  # bits of what meets what
 SLOW = 1e-3  # m/s: what comes together slower than this strikes nothing, whatever the step
 
@@ -112,6 +113,7 @@ def model_of(
     first = len(fixed) + np.searchsorted(things, np.arange(count))
     thing, extent = [count + number for number in fixed] + things, [_extent(each) for each in parts]
     planes = _planes(parts, stands, np.array(thing, np.int64), first, outer)
+    spec.memory = max(LEAST_MEMORY, MEMORY * len(thing))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia, inverse,
                  np.array(extent), planes)  # fmt: skip
