@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+# A look for plugins in all installed packages, and a check of schemas that pydantic has just made: a tenth of a second.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+os.environ.setdefault("PYDANTIC_SKIP_VALIDATING_CORE_SCHEMAS", "1")
 
 from annotated_types import Ge, Gt, Len, Lt
 from pydantic import AfterValidator, AllowInfNan, BaseModel, ConfigDict, Discriminator, Strict, Tag, model_validator
+from pydantic_core.core_schema import no_info_plain_validator_function
 
 # Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
 # No Field() in here: it is shared by all keys of the type, and the default of one would become that of the others.
@@ -42,7 +48,20 @@ Motion = Annotated[list[Component], Len(2, 3)]
 class Table(BaseModel):
     """A table of the study file: unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants", defer_build=True)
+
+
+class _Later:
+    """Its schema is made where such a table is given: that of all of them takes as long as to read a study."""
+
+    def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: Any) -> Any:
+        return no_info_plain_validator_function(source.model_validate)
+
+
+if TYPE_CHECKING:
+    type Later[Model] = Model
+else:
+    type Later[Model] = Annotated[Model, _Later()]
 
 
 class TimeTable[Value](Table):

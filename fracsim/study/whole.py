@@ -14,7 +14,7 @@ from .moving import Body, check_rigid
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
 from .touching import Contact, Obstacle
-from .values import Table
+from .values import Later, Table
 
 
 def _moduli(material: Material) -> list[tuple[float, float]]:
@@ -31,19 +31,19 @@ class Study(Table):
     mesh: Mesh
     material: Material
     time: Time
-    fracture: Fracture | None = None
-    plasticity: Plasticity | None = None
-    brittle: Brittle | None = None
-    crack: list[Crack] = Field(default_factory=list)
-    damping: Damping | None = None
+    fracture: Later[Fracture] | None = None
+    plasticity: Later[Plasticity] | None = None
+    brittle: Later[Brittle] | None = None
+    crack: list[Later[Crack]] = Field(default_factory=list)
+    damping: Later[Damping] | None = None
     boundary: list[Boundary] = Field(default_factory=list)
-    load: Load | None = None
-    initial: Initial | None = None
+    load: Later[Load] | None = None
+    initial: Later[Initial] | None = None
     solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
-    obstacle: list[Obstacle] = Field(default_factory=list)
-    body: list[Body] = Field(default_factory=list)
-    contact: Contact | None = None
-    probe: list[Probe] = Field(default_factory=list)
+    obstacle: list[Later[Obstacle]] = Field(default_factory=list)
+    body: list[Later[Body]] = Field(default_factory=list)
+    contact: Later[Contact] | None = None
+    probe: list[Later[Probe]] = Field(default_factory=list)
     output: Output = Output()
 
     @model_validator(mode="before")
