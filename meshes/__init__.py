@@ -12,33 +12,44 @@ Importing this needs NumPy only: gmsh, meshio and SciPy are imported when they a
 
 from __future__ import annotations
 
-from .builders.boat import Boat
-from .builders.box import Box
-from .builders.cylinder import Cylinder, Disk
-from .builders.figure import Figure
-from .builders.loaf import Loaf
-from .builders.notched_bar import NotchedBar
-from .builders.notched_plate import NotchedPlate
-from .builders.ornament import Ornament
-from .builders.plate_hole import PlateHole
-from .builders.stones import Stones
-from .builders.vase import Vase
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import ClassVar
+
 from .data import MeshData, MeshError
 from .parameters import Builder
 
-BUILDERS: dict[str, type[Builder]] = {
-    "boat": Boat,
-    "box": Box,
-    "cylinder": Cylinder,
-    "disk": Disk,
-    "figure": Figure,
-    "loaf": Loaf,
-    "notched-bar": NotchedBar,
-    "notched-plate": NotchedPlate,
-    "ornament": Ornament,
-    "plate-hole": PlateHole,
-    "stones": Stones,
-    "vase": Vase,
-}
+
+class _Builders(Mapping[str, type[Builder]]):
+    """Builders by the name that studies call them by, each imported when it is asked for."""
+
+    classes: ClassVar[dict[str, str]] = {
+        "boat": "boat.Boat",
+        "box": "box.Box",
+        "cylinder": "cylinder.Cylinder",
+        "disk": "cylinder.Disk",
+        "figure": "figure.Figure",
+        "loaf": "loaf.Loaf",
+        "notched-bar": "notched_bar.NotchedBar",
+        "notched-plate": "notched_plate.NotchedPlate",
+        "ornament": "ornament.Ornament",
+        "plate-hole": "plate_hole.PlateHole",
+        "stones": "stones.Stones",
+        "vase": "vase.Vase",
+    }
+
+    def __getitem__(self, name: str) -> type[Builder]:
+        module, kind = self.classes[name].split(".")
+        found: type[Builder] = getattr(import_module(f".builders.{module}", __name__), kind)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.classes)
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+
+BUILDERS = _Builders()
 
 __all__ = ["BUILDERS", "Builder", "MeshData", "MeshError"]

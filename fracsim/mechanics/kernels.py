@@ -18,8 +18,7 @@ from dolfinx.jit import get_options
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from ufl.core.expr import Expr
-from ufl.corealg.map_dag import map_expr_dag
-from ufl.corealg.multifunction import MultiFunction
+from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
 
 from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels
@@ -116,26 +115,23 @@ def _clear_abandoned() -> bool:
     return bool(abandoned)
 
 
-class _Labels(MultiFunction):  # type: ignore[misc]
-    """Numbers the labels of an expression's variables from 0, in the order in which they are met."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._given: dict[Label, Label] = {}
-
-    expr = MultiFunction.reuse_if_untouched
-
-    def label(self, label: Label) -> Label:
-        return self._given.setdefault(label, Label(len(self._given)))
-
-
 def labelled_anew(expression: Expr) -> Expr:
-    """An expression whose labels (of ufl.variable) do not tell how many there have been before it.
+    """An expression whose labels (of ufl.variable) are numbered from 0, in the order in which they are met: they do not
+    tell how many there have been before it.
 
     FFCx knows a kernel again by its signature. UFL 2024.2 puts the number of a label into that of an expression: each
     scene of a process would compile its own.
     """
-    return map_expr_dag(_Labels(), expression)
+    anew: dict[Expr, Expr] = {}
+    given = 0
+    for part in unique_post_traversal(expression):
+        if isinstance(part, Label):
+            anew[part], given = Label(given), given + 1
+            continue
+        operands = [anew[each] for each in part.ufl_operands]
+        same = all(new is old for new, old in zip(operands, part.ufl_operands, strict=True))
+        anew[part] = part if same else part._ufl_expr_reconstruct_(*operands)
+    return anew[expression]
 
 
 class CellExpression:

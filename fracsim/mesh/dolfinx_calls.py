@@ -70,12 +70,15 @@ def create_mesh(
     return dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
 
 
-def facets_of_nodes(mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64]) -> Ints:
-    """Local facets of (n, d) input nodes, each rank giving its share (collective)."""
+def facets_of_nodes(
+    mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64], values: npt.NDArray[np.int32]
+) -> tuple[Ints, Ints]:
+    """Local facets of (n, d) distinct sets of input nodes, each rank giving its share, and values (collective)."""
     dim = mesh.topology.dim
-    local, values = distribute_entity_data(mesh, dim - 1, nodes, np.zeros(len(nodes), np.int32))
+    local, found = distribute_entity_data(mesh, dim - 1, nodes, values)
     mesh.topology.create_connectivity(dim - 1, 0)
-    return dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, graph.adjacencylist(local), values).indices
+    tags = dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, graph.adjacencylist(local), found)
+    return tags.indices, tags.values
 
 
 def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
