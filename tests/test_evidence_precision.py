@@ -199,6 +199,7 @@ def test_flow_at_a_finite_rate_against_its_equations() -> None:
 # --- trials ---
 
 
+@pytest.mark.usefixtures("little_built")
 @pytest.mark.parametrize("trial", [t for t in TRIALS if t.study], ids=lambda t: f"{t.case}-{t.name}")
 def test_studies_are_valid(trial: Trial) -> None:
     assert trial.study is not None

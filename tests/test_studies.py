@@ -74,6 +74,7 @@ def test_a_coarse_version_runs(path: Path, tmp_path: Path) -> None:
     assert np.isfinite(summary["external_work"])
 
 
+@pytest.mark.usefixtures("little_built")
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_what_the_comments_offer_is_valid(path: Path) -> None:
     for options in offered(path):

@@ -117,6 +117,7 @@ def test_the_written_study_is_the_study(tmp_path: Path, data: Data) -> None:
     assert study_text(again) == study_text(first)
 
 
+@pytest.mark.usefixtures("little_built")
 @pytest.mark.parametrize("path", sorted(folder().glob("*.toml")), ids=lambda path: path.stem)
 def test_studies_of_the_package_survive_being_written(tmp_path: Path, path: Path) -> None:
     from fracsim.study.check import check_study
