@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.pieces import find_pieces, hold_together
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from fracsim.meshes.components import components
 from support.scenes import make_scene
@@ -118,6 +119,27 @@ def test_keys_name_edges(graph: EdgeGraph) -> None:
     assert keys is not None
     assert np.array_equal(graph.flags_of_keys(keys), graph.broken)
     assert np.all(keys[:, 0] < keys[:, 1])
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_what_parts_nothing_is_seen(dim: int) -> None:
+    """Edges break in random order until all are dust: where it is said that pieces are those of before, they are, also
+    for edges that break together. It is said of the first few and not of the last, nor of what is whole again."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.34}, fracture={"strength": 1.0})
+    graph = scene.fracture.graph
+    said, pieces, before = [], find_pieces(graph), graph.broken.copy()
+    order = np.random.default_rng(6).permutation(len(graph.broken))
+    for edges in np.split(order, np.arange(1, len(order), 2)):
+        flags = np.zeros(len(graph.broken), bool)
+        flags[edges] = True
+        graph.break_edges(flags)
+        now, same = find_pieces(graph), hold_together(graph, before)
+        assert not same or np.array_equal(now.of_node, pieces.of_node)
+        said.append(same)
+        pieces, before = now, graph.broken.copy()
+    assert pieces.count == (4**dim) and all(said[:4]) and np.mean(said) > 0.3 and not said[-1]
+    graph.set_integrity(np.ones(len(graph.broken)))
+    assert not hold_together(graph, before)
 
 
 def test_components_are_numbered_by_their_lowest_node() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fracsim.fracture.strength import Fibre, Scatter, along_fibre, weibull
+from fracsim.fracture.strength import Fibre, Scatter, Strength, along_fibre, weibull
 from support.scenes import make_scene, march
 
 
@@ -37,6 +37,20 @@ def test_direction() -> None:
     fibre = Fibre(direction=[3.0, 0.0, 4.0], ratio=2.5)
     vectors = np.array([[6.0, 0.0, 8.0], [0.0, 5.0, 0.0], [-4.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
     assert along_fibre(vectors, fibre) == pytest.approx([2.5, 1.0, 1.0, 1 + 1.5 * 0.36], rel=1e-14)
+
+
+def test_no_edge_of_a_cell_is_weaker_than_is_said_of_it() -> None:
+    """With scatter, a fibre and two regions' worth of strengths; one edge of each cell is that weak but for the tie."""
+    mesh = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34, "pattern": "unstructured"}
+    graph = make_scene(mesh=mesh, fracture={"strength": 1.0})[0].fracture.graph
+    cells = np.arange(len(graph.cell_edges))
+    of_cell = np.where(cells % 2, 1.0, 3.0)
+    how = {"scatter": Scatter(5.0, 2), "fibre": Fibre([1.0, 0.0, 1.0], 2.0)}
+    strength = Strength(graph, of_cell, tie_break=1e-3, **how)
+    least = strength(cells, graph.cell_edges).min(axis=1)
+    said = strength.weakest_of(cells)
+    assert np.all(said <= least) and np.all(said >= (1 - 2.1e-3) * least)
+    assert Strength(graph, 2.0, tie_break=0.1).weakest_of(cells) == pytest.approx(1.8)
 
 
 def pulled(**fracture: Any) -> int:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +64,16 @@ class Strength:
         base = self._of_cell[cells, None] if isinstance(self._of_cell, np.ndarray) else self._of_cell
         factor = 1.0 if self._factor is None else self._factor[edges]
         return np.asarray(base * factor * (1 + self._tie_break * self.noise(edges)))
+
+    def weakest_of(self, cells: npt.NDArray[np.int64]) -> Values | float:
+        """(n,) Pa, what no edge of each cell is weaker than; one number where that is the same for all of them."""
+        return self._of_cells[cells] if isinstance(self._of_cells, np.ndarray) else self._of_cells
+
+    @cached_property
+    def _of_cells(self) -> Values | float:
+        """`weakest_of` all cells."""
+        least = self._of_cell * (1 - self._tie_break)
+        return least if self._factor is None else least * self._factor[self._graph.cell_edges].min(axis=1)
 
     def noise(self, edges: npt.NDArray[np.int32]) -> Values:
         """Numbers in [-1, 1) hashed from the mid-points of local edges; worked out only for those asked for."""

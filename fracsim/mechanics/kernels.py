@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,19 @@ class CellForm(fem.Form):
 
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
-        self._cpp_object = bind_to_cells(self, self._whole, self._constants, lambda cells: cells[~dead[cells]])
+        self._cpp_object = self._over(~dead)
+
+    @contextmanager
+    def only(self, chosen: npt.NDArray[np.bool_]) -> Iterator[None]:
+        """Integrate over the cells of the measure that are flagged, for as long as it lasts (not collective)."""
+        kept, self._cpp_object = self._cpp_object, self._over(chosen)
+        try:
+            yield
+        finally:
+            self._cpp_object = kept
+
+    def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
+        return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])
 
 
 def cells_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:

@@ -227,6 +227,19 @@ class Stress(Term):
         """(owned dofs,) forces of the stress alone at the current u, N."""
         return self._assembler(self._alone)
 
+    def force_lost(self, before: Sequence[Values]) -> Values:
+        """(owned dofs,) forces at the current u, N, that went with what `fields` lost since they were `before`: over
+        the cells alone that lost any (collective)."""
+        lower = np.zeros(self.domain.cell_count, bool)
+        for field, was in zip(self.fields, before, strict=True):
+            differs = (field.x.array != was).reshape(-1, field.function_space.dofmap.bs)
+            lower |= differs[: len(lower)].any(axis=1)
+        with self._alone.only(lower):
+            now = self.exchange(before)
+            lost = self.force()
+            self.exchange(now)
+            return lost - self.force()
+
     def damage_changed(self) -> None:
         """Cells without stress are not integrated from here on: they would add zeros for ever."""
         if (dead := self.stressless) is not None:

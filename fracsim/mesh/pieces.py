@@ -11,7 +11,8 @@ from dolfinx import la
 from ..meshes.components import components
 from .domain import Domain
 from .edges import EdgeGraph
-from .ranks import offset
+from .ranks import offset, total
+from .simplices import local_edges, node_groups
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,19 @@ def find_pieces(graph: EdgeGraph) -> Pieces:
     lowest = np.concatenate(domain.comm.allgather(lowest))
     count, joined = components(every, len(lowest))
     return Pieces(count, _by_lowest(joined, lowest, count)[label])
+
+
+def hold_together(graph: EdgeGraph, before: npt.NDArray[np.bool_]) -> bool:
+    """Whether pieces are those of `before`, flags (edges,) of what was broken then: nothing is whole again, and the
+    ends of what has broken since are still joined by a cell of some rank, as behind the tip of a crack (collective)."""
+    new = graph.broken & ~before
+    cells = np.flatnonzero(new[graph.cell_edges].any(axis=1))
+    group = node_groups(graph.domain.dim)[graph.pattern[cells]]
+    first, second = local_edges(graph.domain.dim).T
+    joined = np.zeros(len(new), bool)
+    joined[graph.cell_edges[cells][group[:, first] == group[:, second]]] = True
+    other = (before & ~graph.broken) | (new & ~graph.on_any_rank(joined))
+    return not total(graph.domain.comm, np.count_nonzero(other))[0]
 
 
 def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
     from ..fracture.brittle.surfaces import BrittleSurfaces
     from ..fracture.record import EdgeRecord
+    from ..mesh.edges import EdgeGraph
     from ..mesh.pieces import Pieces
 
 
@@ -38,6 +39,7 @@ class Breaks:
         self.pieces: Pieces | None = None
         self.figures = (0, 0, _bodies(self._domain))
         self._cut_by: npt.NDArray[np.float64] | None = None
+        self._broken = np.zeros(0, bool)  # (edges,) when `pieces` were looked for last
         if breaking is not None:
             from ..fracture.record import EdgeRecord
 
@@ -69,12 +71,19 @@ class Breaks:
         """Bring `pieces` and `figures` up to date, as after the damage of a checkpoint was read (collective)."""
         if self.record is None:
             return
-        from ..mesh.pieces import find_pieces
-
         graph = self.record.graph
         broken, split = total(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
-        self.pieces = find_pieces(graph)
+        self.pieces = self._pieces(graph)
         self.figures = int(broken), int(split), self.pieces.count
+
+    def _pieces(self, graph: EdgeGraph) -> Pieces:
+        """Those of now: of the last time where what has broken since parts nothing (collective)."""
+        from ..mesh.pieces import find_pieces, hold_together
+
+        before, self._broken = self._broken, graph.broken.copy()
+        if self.pieces is not None and hold_together(graph, before):
+            return self.pieces
+        return find_pieces(graph)
 
     def _cuts(self) -> npt.NDArray[np.float64]:
         """(edges,) cuts in inverse proportion to the nodal forces of now (M22 fig. 12)."""

@@ -42,9 +42,8 @@ def released_state(
         forces[own] += balance.reactions[own] - reactions
         return replace(end, forces=forces)
     balance.displace(solved)
-    after = balance.stress.force()
+    lost = balance.stress.force_lost(before)
     now = balance.stress.exchange(before)
-    lost = balance.stress.force() - after
     if any(term.keeps_apart for term in balance.terms):
         balance.displace(end.u)  # gaps are open at the step's end, and need not be where forces balance
     free = np.where(balance.motion.free, lost, 0.0)
