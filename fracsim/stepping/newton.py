@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
+from .factors import FACTORISED, SOONER_THAN_GMRES, Factors
 from .forcing import Forcing
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
@@ -44,8 +44,6 @@ LARGE_GAP = 0.01
 
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
-# dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
-FACTORISED = 100_000
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
 
@@ -104,6 +102,7 @@ class Solver:
         rough = balance.limits_steps and balance.conservative and not self._asked
         self._forcing = Forcing(float(chosen["ksp_rtol"])) if rough else None
         self._first = self._last_little = 0.0
+        self._factors = Factors(self._preconditioner)
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
 
     def _take_tangent(self) -> None:
@@ -156,6 +155,7 @@ class Solver:
         result = self._attempt_iteratively(guess)
         if not self._misled(result):
             self._spell = FIRST_SPELL
+            self._factors.forget()
         elif self._may_factorise():
             result = self._attempt_directly(guess)
             if result.converged:
@@ -171,6 +171,7 @@ class Solver:
             result = self._attempt_positively(start) if self.balance.conservative else self._attempt(start)
             self._preconditioner.keep = self._iterative
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
+        stalled = stalled or self._may_factorise(SOONER_THAN_GMRES[self.balance.domain.dim])
         if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
             # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
             self.snes.ksp.setType("gmres")
@@ -208,33 +209,13 @@ class Solver:
         snes.setConvergenceTest(self._converged)
         return down
 
-    def _may_factorise(self) -> bool:
+    def _may_factorise(self, most: int = FACTORISED) -> bool:
         dofs = self.balance.vector.getSize()
-        return self._iterative and dofs <= FACTORISED and bool(PETSc.Sys.hasExternalPackage("mumps"))
+        return self._iterative and dofs <= most and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
     def _attempt_directly(self, guess: Values) -> SolveResult:
-        with self._factors():
+        with self._factors.of(self.snes.ksp):
             return self._attempt(guess)
-
-    @contextmanager
-    def _factors(self) -> Iterator[None]:
-        """Factors instead of iterations, for tangents that no Krylov method gets through: pieces that hang by a
-        thread, or no compressibility. A shorter step would be no easier.
-        """
-        ksp = self.snes.ksp
-        pc = self._preconditioner.pc
-        kind, preconditioner = ksp.getType(), pc.getType()
-        ksp.setType("preonly")
-        pc.reset()
-        pc.setType("lu")
-        pc.setFactorSolverType("mumps")
-        self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
-        yield
-        pc.reset()
-        pc.setType(preconditioner)
-        pc.setFromOptions()
-        ksp.setType(kind)
-        self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, True
 
     def _misled(self, result: SolveResult) -> bool:
         """Whether it was the linear solves that failed: outright, or by what they found.
@@ -336,7 +317,7 @@ class Solver:
         with_factors = [False, True] if self._may_factorise() else [False]
         for factors in with_factors[1:] if self._with_factors else with_factors:
             self.balance.vector.array_w[:] = force
-            with self.balance.untouched(), self._factors() if factors else nullcontext():
+            with self.balance.untouched(), self._factors.of(self.snes.ksp) if factors else nullcontext():
                 solved = self._solve_linear()
             if solved:
                 return np.asarray(self._correction.array_r.copy())
@@ -449,6 +430,7 @@ class Solver:
     def destroy(self) -> None:
         """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
         self._options.remove()
+        self._factors.forget()
         for kept in (*self._made, self._x, self._correction):
             kept.destroy()
         if self._downhill is not None:
