@@ -1,8 +1,8 @@
 """Factors instead of iterations, for tangents that no Krylov method gets through: pieces that hang by a thread, or no
 compressibility. A shorter step would be no easier.
 
-MUMPS orders the unknowns once for a pattern, a third of the time in the plane, so the object is kept from solve to solve
-until iterations have their turn again: its factors are memory.
+MUMPS orders the unknowns once for a pattern, a third of the time in the plane: the object is kept from solve to solve
+until iterations have their turn again, since its factors are memory.
 """
 
 from __future__ import annotations

@@ -266,8 +266,8 @@ RUNS: dict[str, dict[str, Any]] = {
     # broken by a stone that flies, falls, spins and rubs
     "thrown": {
         "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xy"}],
-        "fracture": {"strength": 0.015, "radius": 0.1}, "load": {"gravity": [0.0, -0.1]},
-        "obstacle": [{"name": "stone", "shape": "sphere", "radius": 0.15, "at": [0.8, 0.76], "velocity": [0.05, -0.8],
+        "fracture": {"strength": 0.006, "radius": 0.1}, "load": {"gravity": [0.0, -0.1]},
+        "obstacle": [{"name": "stone", "shape": "sphere", "radius": 0.15, "at": [0.8, 0.77], "velocity": [0.05, -1.2],
                       "spin": [1.0], "mass": 0.02, "friction": 0.3}],
         "time": {"scheme": "generalized-alpha", "step": 0.05, "end": 0.1},
     },
