@@ -24,6 +24,7 @@ from fracsim.studies.evidence.precision import (
     fracture,
     page,
     plastic,
+    short,
     statics,
     wave,
 )
@@ -375,6 +376,18 @@ def test_a_section_says_that_its_reference_is_missing() -> None:
 
 def test_all_sections_can_be_made_of_nothing() -> None:
     assert len(precision.sections([])) == sum(len(family.CASES) for family in precision.FAMILIES)
+
+
+def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
+    """Errors 8, 4, 2 % for 2.5, 5, 10 s; another program takes 1 s for 3 %; no one gets to 1 %."""
+    peer = record("p", 0.03, 1.0, elements="quadratic") | {"cpu": [], "figures": {"e": 0.03, "seconds": 1.0}}
+    (found,) = short.summary([MADE], [*EULER, peer])
+    row = dict(zip(found.tables[0].columns, found.tables[0].rows[0], strict=True))
+    assert found.first and row["s for 5%"] == 5.0 and row["s for 1%"] is None
+    assert row["cheapest setting for 5%"] == "scheme = generalized-alpha, dt = 0.2"
+    assert row["DOLFINx alone, quadratic: s for 5%"] == 1.0 and row["DOLFINx alone, quadratic: s for 1%"] is None
+    assert found.plots[0].series[0].x == (2.5, 5.0, 10.0)
+    assert short.summary([MADE], []) == []
 
 
 def test_the_tolerances_called_default_are() -> None:

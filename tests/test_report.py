@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, swept_here, write_study
-from fracsim.errors import InputError
+from fracsim.errors import FalseClaim, InputError
 from fracsim.report.content import Claim, Picture, Plot, Section, Series, Table, from_data, to_data
 from fracsim.report.make import make_report
 from fracsim.report.page import write_page
@@ -236,6 +236,48 @@ print([name for name in ("dolfinx", "fracsim.studies", "mpi4py", "petsc4py") if 
     (tmp_path / "evidence.json").write_text("{}")
     with pytest.raises(InputError, match="cannot be read"):
         make_report([tmp_path], references=[])
+
+
+def test_what_is_first_lies_open_and_the_rest_is_folded(tmp_path: Path) -> None:
+    """A section of the first screen goes before the claims, those that fail before those that hold, which are folded
+    away, as are all other sections; a page without a first screen lies open."""
+    some = (Claim("it is well", "3", True), Claim("it is bad", "4", False), Claim("it is open", "not run", None))
+    sections = [Section("Far down", "deep text", some), Section("Up front", "short text", first=True)]
+    for name, part in (("short", sections), ("long", sections[:1])):
+        data = {"about": {}, "groups": {"precision": {"sections": to_data(part)}}}
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "evidence.json").write_text(json.dumps(data))
+        with pytest.raises(FalseClaim):
+            make_report([tmp_path / name], references=[])
+    text = (tmp_path / "short" / "report.html").read_text()
+    order = ["short text", "What must hold", "it is bad", "<details>", "it is open", "<details>", "it is well"]
+    places = [text.index(order[0])]
+    for words in order[1:]:
+        places.append(text.index(words, places[-1]))
+    folded = text.index('<details class="part">')
+    assert places[-1] < folded < text.index("Far down", folded)
+    assert text.index("deep text") > folded and "1 of 3 claims do not hold" in text
+    assert '<details class="part">' not in (tmp_path / "long" / "report.html").read_text()
+
+
+def test_names_in_a_plot_are_clear_of_one_another() -> None:
+    """Twelve points in a heap and two apart, by the size that the names are really drawn at; most of them are there."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from fracsim.report.labels import name_points
+
+    random = np.random.default_rng(5)
+    points = [*random.normal(0.0, 0.1, (12, 2)).tolist(), [-1.0, 1.0], [1.0, -1.0]]
+    figure = Figure(figsize=(6.4, 3.8))
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.plot(*np.transpose(points), "o")
+    name_points(axes, [(x, y, f"trial-{at}-mm") for at, (x, y) in enumerate(points)], [tuple(p) for p in points])
+    boxes = [text.get_window_extent(canvas.get_renderer()) for text in axes.texts]
+    assert len(boxes) >= 8
+    assert not any(one.overlaps(other) for at, one in enumerate(boxes) for other in boxes[:at])
+    assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 for box in boxes)
 
 
 @pytest.mark.parametrize(("holds", "code"), ((True, 0), (None, 0), (False, 1)))

@@ -87,7 +87,11 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page, in the order claims, text, tables, plots, pictures. Blank lines part paragraphs of `text`."""
+    """A part of the page, in the order claims, text, tables, plots, pictures. Blank lines part paragraphs of `text`.
+
+    Attributes:
+        first: on the first screen of the page, whichever group it is of.
+    """
 
     title: str
     text: str = ""
@@ -95,6 +99,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     plots: tuple[Plot, ...] = ()
     pictures: tuple[Picture, ...] = ()
+    first: bool = False
 
 
 def to_data(sections: list[Section]) -> list[dict[str, Any]]:
@@ -112,6 +117,7 @@ def from_data(data: list[dict[str, Any]]) -> list[Section]:
             tuple(_table(table) for table in part["tables"]),
             tuple(_plot(plot) for plot in part["plots"]),
             tuple(Picture(**picture) for picture in part["pictures"]),
+            bool(part.get("first", False)),
         )
         for part in data
     ]

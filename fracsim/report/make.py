@@ -48,9 +48,11 @@ def _of_evidence(folder: Path, target: Path) -> Path:
         about = dict(data["about"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{folder}/evidence.json cannot be read: {type(error).__name__}: {error}") from None
-    page = [*_verdict(sections), *sections]
+    first, others = [each for each in sections if each.first], [each for each in sections if not each.first]
+    page = [*first, *_verdict(sections), *others]
     subtitle = f"{_today()}. Each number comes from a trial recorded beside this page (record.json of each folder)."
-    path = write_page(target, page, folder, title="fracsim: evidence", subtitle=subtitle, about=about)
+    shown = len(page) - len(others) if first else None
+    path = write_page(target, page, folder, title="fracsim: evidence", subtitle=subtitle, about=about, shown=shown)
     if false := [claim for section in sections for claim in section.claims if claim.holds is False]:
         what = "; ".join(f"{claim.text} ({claim.measured})" for claim in false)
         raise FalseClaim(f"saved {path}, in which {len(false)} claims do not hold: {what}")

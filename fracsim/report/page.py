@@ -15,20 +15,30 @@ from .plots import draw
 
 
 def write_page(
-    target: Path, sections: list[Section], pictures: Path, *, title: str, subtitle: str, about: dict[str, str]
+    target: Path,
+    sections: list[Section],
+    pictures: Path,
+    *,
+    title: str,
+    subtitle: str,
+    about: dict[str, str],
+    shown: int | None = None,
 ) -> Path:
     """Write `target` and, in the folder of the same name without its suffix, the CSVs.
 
-    `pictures`: the folder that paths of pictures start from.
+    `pictures`: the folder that paths of pictures start from. `shown`: so many sections lie open, the others are folded
+    away under their titles; None: all are open.
     """
     import jinja2
 
     csvs = target.with_suffix("")
-    shown = [_section(section, number, pictures, csvs.name) for number, section in enumerate(sections)]
+    made = [_section(section, number, pictures, csvs.name) for number, section in enumerate(sections)]
     template = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined).from_string(
         files(__package__).joinpath("template.html").read_text(encoding="utf-8")
     )
-    text = template.render(title=title, subtitle=subtitle, sections=shown, about=about)
+    text = template.render(
+        title=title, subtitle=subtitle, sections=made, about=about, shown=len(made) if shown is None else shown
+    )
     try:
         csvs.mkdir(parents=True, exist_ok=True)
         for table in (table for section in sections for table in section.tables):
@@ -50,7 +60,9 @@ def write_csv(path: Path, table: Table) -> None:
 def _section(section: Section, number: int, pictures: Path, csvs: str) -> dict[str, Any]:
     return {
         "title": section.title,
-        "claims": section.claims,
+        "open": [claim for claim in section.claims if claim.holds is False],
+        "unknown": [claim for claim in section.claims if claim.holds is None],
+        "holding": [claim for claim in section.claims if claim.holds],
         "paragraphs": [part for part in re.split(r"\n\s*\n", section.text.strip()) if part],
         "tables": [_table(table, csvs) for table in section.tables],
         "plots": [

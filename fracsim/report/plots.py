@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .content import Plot, Series
+from .labels import name_points
 from .pareto import pareto_front
 
 # Colours that colour-blind readers can tell apart (Okabe and Ito), for light and for dark pages.
@@ -45,6 +46,8 @@ def draw(plot: Plot, name: str) -> str:
         if axes.get_legend_handles_labels()[1]:
             many = len(plot.series) > MOST_IN_LEGEND // 2
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0)) if many else axes.legend()
+        if named := _named(plot):
+            name_points(axes, named, _points(plot))
         return _svg(figure)
 
 
@@ -71,16 +74,13 @@ def _add(axes: Any, series: Series, number: int) -> None:
     if series.style == "reference":
         axes.plot(x, y, color=FAINT, linestyle="--", linewidth=1.5, label=label, zorder=1)
         return
-    colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+    colour, turn = COLOURS[number % len(COLOURS)], number + number // len(COLOURS)  # another marker with each round
     line = "" if series.style == "points" else "-"
-    marker = "" if series.style == "line" else marker
+    marker = "" if series.style == "line" else MARKERS[turn % len(MARKERS)]
     if series.spread:
         axes.errorbar(x, y, list(series.spread), color=colour, linestyle=line, marker=marker, capsize=2, label=label)
     else:
         axes.plot(x, y, color=colour, linestyle=line, marker=marker, linewidth=1.4, label=label)
-    for at, name in enumerate(series.names):
-        if np.isfinite(x[at]) and np.isfinite(y[at]):
-            axes.annotate(name, (x[at], y[at]), textcoords="offset points", xytext=(4, 4), fontsize=7.5)
 
 
 def _scale(axes: Any, plot: Plot) -> None:
@@ -108,6 +108,16 @@ def _points(plot: Plot) -> list[tuple[float, float]]:
         for series in plot.series
         if series.style != "reference"
         for a, b in zip(values(series.x), values(series.y), strict=True)
+    ]
+
+
+def _named(plot: Plot) -> list[tuple[float, float, str]]:
+    """Points that have a name."""
+    return [
+        (float(x), float(y), name)
+        for series in plot.series
+        for x, y, name in zip(values(series.x), values(series.y), series.names, strict=False)
+        if name
     ]
 
 

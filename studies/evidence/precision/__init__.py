@@ -8,6 +8,7 @@ from ..section import Section
 from ..trial import Trial
 from . import average, beam, brazilian, finite, fracture, plastic, solver, statics, wave
 from .page import in_doubt, section
+from .short import summary
 
 FAMILIES = (statics, beam, wave, finite, fracture, plastic, brazilian, average, solver)
 
@@ -23,5 +24,6 @@ def to_time_again(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """A section for each case."""
-    return [section(case, records) for family in FAMILIES for case in family.CASES]
+    """The first screen, and a section for each case."""
+    cases = [case for family in FAMILIES for case in family.CASES]
+    return [*summary(cases, records), *(section(case, records) for case in cases)]

@@ -115,14 +115,21 @@ def section(case: Case, records: Records) -> Section:
                    tables, _plots(case, rows))  # fmt: skip
 
 
-def in_doubt(case: Case, records: Records) -> set[str]:
-    """Names of trials to be timed again: a default, and what came out cheaper by more than noise, perhaps by chance."""
+def rows_of(case: Case, records: Records) -> list[Row]:
+    """The trials of a case with their errors; none where its reference is missing."""
     mine = [record for record in records if record["case"] == case.name]
     try:
         errors = case.compare(mine)
     except (KeyError, StopIteration):
+        return []
+    return [Row(record, errors.get(record["name"], {})) for record in mine]
+
+
+def in_doubt(case: Case, records: Records) -> set[str]:
+    """Names of trials to be timed again: a default, and what came out cheaper by more than noise, perhaps by chance."""
+    if not (rows := rows_of(case, records)):
         return set()
-    advice, _ = _advice(case, [Row(record, errors.get(record["name"], {})) for record in mine])
+    advice, _ = _advice(case, rows)
     rivals = [
         row.record for each in advice if each.default is not None and not _as_good(each.default, each.candidate)
         for row in (each.default, each.candidate) if row is not None
@@ -160,21 +167,21 @@ class Advice:
 
 
 def _advice(case: Case, rows: list[Row]) -> tuple[list[Advice], list[int]]:
-    usable = [row for row in rows if _counts(case, row)]
+    usable = [row for row in rows if counts(case, row)]
     found = [_for_limit(case, usable, limit) for limit in LIMITS]
     return found, sorted({rows.index(each.chosen) for each in found if each.chosen is not None})
 
 
-def _counts(case: Case, row: Row) -> bool:
+def counts(case: Case, row: Row) -> bool:
     """Reference runs and failed ones are not recommended."""
     return row.record["outcome"] == "done" and case.errors[0] in row.errors and "elements" not in row.record["settings"]
 
 
 def _for_limit(case: Case, rows: list[Row], limit: float) -> Advice:
-    cheapest = _cheapest(case, rows, limit)
-    candidate = _cheapest(case, [row for row in rows if not _apart(case, row)], limit)
-    default = _cheapest(case, [row for row in rows if is_default(row.record["settings"])], limit)
-    chosen = default if default is not None and _as_good(default, cheapest) else cheapest
+    best = cheapest(case, rows, limit)
+    candidate = cheapest(case, [row for row in rows if not _apart(case, row)], limit)
+    default = cheapest(case, [row for row in rows if is_default(row.record["settings"])], limit)
+    chosen = default if default is not None and _as_good(default, best) else best
     return Advice(limit, chosen, candidate, default)
 
 
@@ -191,7 +198,8 @@ def _apart(case: Case, row: Row) -> bool:
     return any(value in case.apart for value in row.record["settings"].values() if isinstance(value, str))
 
 
-def _cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
+def cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
+    """Of those whose error is at most its share of a limit."""
     points = [Point(row.core_seconds, row.errors[case.errors[0]], {"row": number}) for number, row in enumerate(rows)]
     best = recommended(points, limit * case.share)
     return None if best is None else rows[int(best.settings["row"])]
@@ -234,10 +242,11 @@ def _sentence(advice: Advice, case: Case) -> str:
     if advice.chosen is None:
         return f"{head} no setting here is good enough."
     row = advice.chosen
-    return f"{head} {_setting(row)} (error {row.errors[case.errors[0]]:.2g}, {row.core_seconds:.2g} core-seconds)."
+    return f"{head} {setting(row)} (error {row.errors[case.errors[0]]:.2g}, {row.core_seconds:.2g} core-seconds)."
 
 
-def _setting(row: Row) -> str:
+def setting(row: Row) -> str:
+    """In words."""
     settings = row.record["settings"].items()
     return ", ".join(f"{key} = {f'{value:.4g}' if isinstance(value, float) else value}" for key, value in settings)
 
@@ -254,12 +263,12 @@ def _default_claim(case: Case, advice: Advice) -> Claim:
     text = f"the setting recommended for {advice.limit:.0%} of {case.errors[0]} is the program's default"
     if advice.candidate is None:
         return Claim(text, "no setting reaches it", None)
-    best = f"cheapest: {_setting(advice.candidate)}, {advice.candidate.core_seconds:.3g} core-seconds"
+    best = f"cheapest: {setting(advice.candidate)}, {advice.candidate.core_seconds:.3g} core-seconds"
     if advice.default is None:
         return Claim(text, f"{best}; the default does not reach it here", False)
     runs = min(len(row.record["cpu"]) for row in (advice.candidate, advice.default))
     medians = f", medians of {runs}" if runs > 1 else ""
-    measured = f"{best}; default: {_setting(advice.default)}, {advice.default.core_seconds:.3g}{medians}"
+    measured = f"{best}; default: {setting(advice.default)}, {advice.default.core_seconds:.3g}{medians}"
     holds = _as_good(advice.default, advice.candidate)
     return Claim(text, f"{measured} (a factor below {NOISE:g} is noise)", holds)
 
@@ -290,13 +299,13 @@ def _outcomes(case: Case, records: Records) -> Table:
 
 
 def _front(case: Case, rows: list[Row]) -> set[int]:
-    numbers = [number for number, row in enumerate(rows) if _counts(case, row)]
+    numbers = [number for number, row in enumerate(rows) if counts(case, row)]
     points = [(rows[number].core_seconds, rows[number].errors[case.errors[0]]) for number in numbers]
     return {numbers[place] for place in pareto_front(points)}
 
 
 def _plots(case: Case, rows: list[Row]) -> tuple[Plot, ...]:
-    usable = [row for row in rows if _counts(case, row)]
+    usable = [row for row in rows if counts(case, row)]
     if not usable:
         return ()
     return tuple(

@@ -1,0 +1,56 @@
+"""The first screen: for each case the cheapest setting for 5 % and for 1 %, its seconds, and other programs'."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..section import Cell, Plot, Section, Series, Table, pareto_front
+from .page import LIMITS, Case, Records, Row, cheapest, counts, rows_of, setting
+
+PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` of their trials
+
+
+def summary(cases: list[Case], records: Records) -> list[Section]:
+    """The section, where any case has rows."""
+    found = [(case, rows) for case in cases if (rows := rows_of(case, records))]
+    if not found:
+        return []
+    peers = sorted({peer for _, rows in found for row in rows if (peer := peer_of(row.record))})
+    seconds = [f"{peer}: s for {limit:.0%}" for peer in peers for limit in LIMITS]
+    own = [words for limit in LIMITS for words in (f"cheapest setting for {limit:.0%}", f"s for {limit:.0%}")]
+    table = Table(
+        "precision-short", "Core-seconds in the steps that an error takes. Empty: no setting that ran is that good.",
+        ("case", "error of", *own, *seconds), tuple(_line(case, rows, peers) for case, rows in found),
+    )  # fmt: skip
+    plot = Plot(
+        "Error against core-seconds: the best settings of each case.", "core-seconds in the steps", "relative error",
+        tuple(_front(case, rows) for case, rows in found), "loglog", levels=LIMITS,
+    )  # fmt: skip
+    without = "" if peers else " No other program has run beside them here."
+    text = f"What an error of 5 % and of 1 % costs.{without} What does not hold comes next, everything else below."
+    return [Section("Error against run time", text, tables=(table,), plots=(plot,), first=True)]
+
+
+def peer_of(record: dict[str, Any]) -> str | None:
+    """The program of a trial that is not ours."""
+    elements = record["settings"].get("elements")
+    return None if elements is None else PEERS.get(str(elements), str(elements))
+
+
+def _line(case: Case, rows: list[Row], peers: list[str]) -> tuple[Cell, ...]:
+    ours = [row for row in rows if counts(case, row)]
+    cells: list[Cell] = [case.title, case.errors[0]]
+    for limit in LIMITS:
+        row = cheapest(case, ours, limit)
+        cells += [None, None] if row is None else [setting(row), row.core_seconds]
+    for peer in peers:
+        theirs = [row for row in rows if peer_of(row.record) == peer and case.errors[0] in row.errors]
+        cells += [None if row is None else row.core_seconds for row in (cheapest(case, theirs, x) for x in LIMITS)]
+    return tuple(cells)
+
+
+def _front(case: Case, rows: list[Row]) -> Series:
+    """Settings that no other beats in both, the cheapest first."""
+    points = [(row.core_seconds, max(row.errors[case.errors[0]], 1e-16)) for row in rows if counts(case, row)]
+    best = sorted(points[place] for place in pareto_front(points))
+    return Series(case.title, tuple(x for x, _ in best), tuple(y for _, y in best))
