@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all readers bench report report-full lint format clean
+.PHONY: demo test test-all readers bench table report report-full lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -36,6 +36,10 @@ readers:
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json
+
+# Seconds per step of the nine scenes of Mandal et al. (2022), table 2; hours. `make table small=1`: a third of the cells.
+table:
+	./env python3 -m fracsim.studies.table -o out/table $(if $(small),--small --limit 60)
 
 # The evidence: short trials in under 15 minutes on two cores, or all of them. What has been run is not run again.
 report:
