@@ -38,7 +38,7 @@ COARSE = {
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "platens": ["mesh.h=0.01"],
-    "punched-slab": ["mesh.h=0.01"],
+    "punched-slab": ["mesh.h=0.015"],
     "rigid-dropped-vase": ["mesh.h=0.02"],
     "rigid-figure": ["mesh.h=0.015"],
     "rigid-boats": ["mesh.h=0.5", "body.0.copies=[1,1,2]"],

@@ -111,7 +111,7 @@ def _settled(body: Cells, sides: Flags, usable: Flags, movable: Flags | None) ->
 
 def _loose(cells: Ints, sides: Flags, near: Flags) -> Flags:
     """(N,) nodes of cells (m, d + 1) that have none of them whole on their own side."""
-    above = np.count_nonzero(sides[cells], axis=1)
+    above = _count(sides[cells])
     loose = np.zeros(len(sides), bool)
     loose[cells] = True
     loose[cells[(above == 0) | (above == cells.shape[1])]] = False
@@ -123,7 +123,7 @@ def _gone_over(cells: Ints, sides: Flags, near: Flags) -> Flags:
     sides, most = sides.copy(), cells.shape[1] - 1
     for _ in range(ROUNDS):
         side = sides[cells]
-        above = np.count_nonzero(side, axis=1)
+        above = _count(side)
         lone = np.flatnonzero((above == 1) | (above == most))
         odd = cells[lone][side[lone] == (above[lone] == 1)[:, None]]
         over = odd[_loose(cells, sides, near)[odd]]
@@ -139,7 +139,7 @@ def _drawn(cells: Ints, sides: Flags, near: Flags, to: bool) -> Flags:
     The cell with the fewest to draw, of these the first.
     """
     side = sides[cells]
-    others = np.count_nonzero(side != to, axis=1)
+    others = _count(side != to)
     wanting = (_loose(cells, sides, near) & (sides == to))[cells] & (near[cells] | (side == to)).all(axis=1)[:, None]
     row, corner = np.nonzero(wanting)
     order = np.lexsort((row, others[row]))
@@ -159,3 +159,9 @@ def cut_places(phi: Values, sides: Flags, ends: Ints) -> Values:
     both = distance.sum(axis=1)
     place = np.divide(distance[:, 0], both, out=np.full(len(both), 0.5), where=both > 0)
     return np.clip(place, NEAREST, 1 - NEAREST)
+
+
+def _count(flags: Flags) -> npt.NDArray[np.int8]:
+    """(m,) how many of each row (m, d + 1) are set: column by column, a tenth of the time of NumPy's sum over so few."""
+    columns = flags.view(np.int8).T
+    return np.asarray(sum(columns[1:], start=columns[0]))
