@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.along import Along
 from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
+from fracsim.mechanics.contact.bent import Start
+from fracsim.mechanics.contact.facets import Facets, between
 from fracsim.mechanics.contact.friction import Friction, tangential
 from fracsim.mechanics.contact.motion import Motion
 from fracsim.mechanics.contact.placed import Placed
 from fracsim.mechanics.contact.pose import Pose
 from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
+from fracsim.mechanics.contact.touch import touch
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
 
@@ -77,11 +80,29 @@ def test_barrier_is_c2_where_it_begins() -> None:
 
 
 def test_closed_gaps_are_infinitely_dear() -> None:
+    """Their slopes are finite, but no norm of them is: products with 0 are 0, and no solver takes them."""
     g = np.array([0.0, -1e-3, -np.inf])
     np.testing.assert_array_equal(BARRIER.energy(g), np.inf)
-    np.testing.assert_array_equal(BARRIER.slope(g), -np.inf)
-    np.testing.assert_array_equal(BARRIER.curvature(g), np.inf)
+    for law in (BARRIER.slope(g), BARRIER.curvature(g)):
+        assert np.isfinite(law).all()
+        with np.errstate(over="ignore"):
+            assert not np.isfinite(law**2).any()
     assert BARRIER.energy(np.empty(0)).shape == (0,)
+
+
+@pytest.mark.parametrize("along", (False, True))
+def test_a_point_in_an_obstacle_is_pushed_straight_out_of_it(along: bool) -> None:
+    """Before a floor: a force in no other direction, and no stiffness that a tangent could hold (with infinities
+    0 times infinity would be an invalid value)."""
+    x, area = np.array([[0.3, -1e-4], [0.5, 0.5e-3]]), np.array([0.1, 0.2])
+    start = Start.straight(np.array([0.5e-3, 0.5e-3]), 2) if along else None
+    found = touch(x, area, Placed(Plane((0.0, 1.0)), Pose.at(np.zeros(2))), BARRIER, None, None, np.zeros(2), start)
+    assert found.energy == np.inf and found.potential == np.inf
+    assert (found.normal[:, 0] == 0).all() and found.normal[0, 1] > 1e150 and 0 < found.normal[1, 1] < 1e8
+    assert not found.stiffness[0].any() and found.stiffness[1, 1, 1] > 0
+    facets = Facets(np.array([[0, 1]]), np.array([0.2]), 1e-4)
+    inner, stored = between(facets, Placed(Sphere(0.1, dim=2), Pose.at(np.array([0.4, -0.05]))), x, BARRIER)
+    assert stored == np.inf and np.isfinite(inner.forces).all() and np.isfinite(inner.stiffness).all()
 
 
 @given(shares=st.lists(st.floats(1e-9, 2), min_size=2, max_size=20))

@@ -129,7 +129,7 @@ def test_an_isolated_pair_keeps_its_momentum(scheme: str) -> None:
         assert report.kinetic + report.elastic + state.dissipated < 12.69 * (1 + 1e-9)
         given += told(scene)["work_it"]
     row = told(scene)
-    assert row["velocity_it_y"] > -0.1 and state.dissipated > 0.5
+    assert row["velocity_it_y"] > -0.5 and state.dissipated > 0.5  # of -2; how far it is round depends on the mesh
     if scheme == "newmark":
         assert given == pytest.approx(
             12.69 - row["kinetic_it"], rel=4e-2

@@ -14,6 +14,7 @@ Values = npt.NDArray[np.float64]
 
 KEPT = 0.1  # share of a gap that a motion leaves
 ITERATIONS = 50
+HUGE = 1e200  # Pa, of a gap that is closed, and Pa/m: no infinity, of which there is no product with 0
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,16 @@ class Barrier:
         return self._or(g, -self.stiffness * self.width * (s - 1) ** 2 * np.log(s), np.inf)
 
     def slope(self, g: Values) -> Values:
-        """(n,) b', Pa: minus the pressure; never positive."""
+        """(n,) b', Pa: minus the pressure; never positive; -HUGE, that no norm of forces holds, where a gap is closed."""
         s = self._share(g)
-        return self._or(g, -self.stiffness * (s - 1) * (2 * np.log(s) + (s - 1) / s), -np.inf)
+        return self._or(g, -self.stiffness * (s - 1) * (2 * np.log(s) + (s - 1) / s), -HUGE)
 
     def curvature(self, g: Values) -> Values:
         """(n,) b'', Pa/m; never negative."""
         s = self._share(g)
         # equal to 2 ln s + 3 - 2 / s - 1 / s^2, but without cancellation at s = 1
         bent = 2 * np.log1p(s - 1) + (s - 1) * (3 * s + 1) / s**2
-        return self._or(g, -self.stiffness / self.width * bent, np.inf)
+        return self._or(g, -self.stiffness / self.width * bent, HUGE)
 
     def _share(self, g: Values) -> Values:
         """s within (0, 1]; 1, where all is zero, for gaps that are open or closed."""

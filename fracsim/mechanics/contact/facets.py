@@ -31,7 +31,6 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-HUGE = 1e200  # Pa, of a facet that is cut: no infinity, of which there is no product with 0
 SOFTEN = 0.1  # of the width of the barrier, of deepest places
 FLAT = 0.1  # of the width: facets that bend away from an obstacle by less are as good as flat
 
@@ -167,8 +166,8 @@ class Between:
     @cached_property
     def forces(self) -> Values:
         """(k, c, d) on the corners, N."""
-        own = np.maximum(self.law.slope(self.at.gap), -HUGE)[:, None, None] * self.at.by_corner
-        slope = np.maximum(self.if_flat.slope(self._flat.gap), -HUGE)[:, None]
+        own = self.law.slope(self.at.gap)[:, None, None] * self.at.by_corner
+        slope = self.if_flat.slope(self._flat.gap)[:, None]
         return np.asarray(-self.area[:, None, None] * (own - (slope * self._flat.share)[:, :, None] * self._normals))
 
     @cached_property

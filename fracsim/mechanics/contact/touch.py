@@ -19,6 +19,8 @@ from .placed import Placed
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+HUGE_STIFFNESS = 1e150  # N/m, of a gap that is closed or as good as that
+
 
 @dataclass(frozen=True)
 class Grip:
@@ -150,6 +152,8 @@ def nothing(d: int) -> Touch:
 
 
 def positive(blocks: Values) -> Values:
-    """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with."""
-    values, vectors = np.linalg.eigh(np.nan_to_num(blocks, posinf=0.0, neginf=0.0))
+    """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with. Nothing of gaps
+    that are closed (barrier.HUGE): there is no step from there."""
+    open_ = (abs(blocks) < HUGE_STIFFNESS).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(open_[:, None, None], blocks, 0.0))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))
