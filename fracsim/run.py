@@ -166,7 +166,8 @@ class Run:
             if len(study.obstacle) > 1 and any(each.free for each in study.obstacle):
                 from .output.overlapping import Overlapping
 
-                overlapping = Overlapping(next(term for term in terms if isinstance(term, Obstacles)))
+                watched = [term for term in terms if isinstance(term, Obstacles)]
+                overlapping = Overlapping(watched[0]) if watched else None
         if wants_surface(study) and (study.contact is None or not study.contact.itself):
             from .output.passing import Passing
 

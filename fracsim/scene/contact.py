@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from ..study.mesh_source import open_solid
 if TYPE_CHECKING:
     from ..mechanics.contact.explicit_obstacles import ExplicitObstacles
     from ..mechanics.contact.penalty import Penalty
+    from ..mechanics.contact.solids.solid import Solid
 
 Values = npt.NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def _most_added(contact: Contact, domain: Domain, stress: Stress) -> float:
     return float(ADDED * domain.comm.allreduce(float(np.max(cell_frequencies(stress), initial=0.0)), op=MPI.MAX))
 
 
-def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
+def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Term:
     """The term of the obstacles that are read from files (collective). InputError where one overlaps the body at the
     start, or without ipctk."""
     try:
@@ -102,7 +103,15 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     contact = study.contact or Contact()
     law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     of_speed = 0.0 if contact.creep else OF_SPEED
-    return Solids(domain, u, entries, crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed))
+    how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed)
+    if not any(each.free for each in entries.values()):
+        return Solids(domain, u, entries, how)
+    from ..mechanics.contact.solids.free_term import FreeSolids
+
+    every = enumerate(obstacles(study, domain.dim))
+    rest = {number: each for number, each in every if each.shape != "mesh" and each.loose is None}
+    others = {number: _obstacle(each, number) for number, each in rest.items()}
+    return FreeSolids(domain, u, entries, how, scheme, others, cast("Barrier", law.barrier))
 
 
 def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
@@ -111,7 +120,23 @@ def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
 
     given = entry.geometry
     surface = from_root(comm, lambda: open_solid(given["file"], given.get("scale", 1.0), f"obstacle.{number}"))
-    return Obstacle(entry.name, Solid(surface.points, surface.triangles), entry.at, entry.moved, entry.friction)
+    solid = Solid(surface.points, surface.triangles)
+    if entry.loose is not None:
+        return _free_solid(entry, entry.loose, solid)
+    return Obstacle(entry.name, solid, entry.at, entry.moved, entry.friction, entry.spin)
+
+
+def _free_solid(entry: Placing, loose: Loose, solid: Solid) -> Obstacle:
+    """One with a mass: it moves about its centre of mass, or turns about its hinge."""
+    from ..mechanics.contact.free_obstacle import FreeObstacle
+
+    density, own = loose.density or (loose.mass or 0.0) / solid.volume, solid.centre
+    at = entry.at + own if loose.hinge is None else loose.hinge
+    solid = solid.shifted(entry.at - at)
+    return FreeObstacle(
+        entry.name, solid, at, friction=entry.friction, mass=density * solid.volume, inertia=solid.inertia(density),
+        ways=loose.ways, centre=entry.at + own - at, gravity=loose.gravity, rate=loose.rate,
+    )  # fmt: skip
 
 
 def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:

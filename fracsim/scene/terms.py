@@ -101,7 +101,7 @@ def _solids(parts: Parts) -> Term | None:
         return None
     from .contact import solids_of
 
-    return solids_of(parts.study, parts.domain, parts.u, parts.stress.material)
+    return solids_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
 
 def _contact(parts: Parts) -> Term | None:

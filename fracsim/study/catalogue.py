@@ -22,7 +22,7 @@ OBSTACLES = {
     "capsule": "radius, length between the centres of its ends, axis",
     "cylinder": "radius, length, axis; rounded edges; 3D; hollow",
     "box": "size; rounded edges; hollow",
-    "mesh": "file, scale: a closed surface of triangles; 3D; held or driven",
+    "mesh": "file, scale: a closed surface of triangles; 3D",
 }
 
 

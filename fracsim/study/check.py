@@ -225,7 +225,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
             if each.file is not None:
                 yield f"            {each.name}: {_solid(each.file, each.scale or 1.0, f'obstacle.{i}')}"
         if any(each.free for each in study.obstacle) and any(each.shape == "mesh" for each in study.obstacle):
-            yield "            note: obstacles that move freely do not feel those from files"
+            yield "            note: obstacles that move freely do not feel those from files; free ones from files feel"
+            yield "            shapes that are held or driven, with their points"
     if study.contact is not None and study.contact.itself:
         of = "of pieces alone with one another" if study.contact.itself == "pieces" else "of the body with itself"
         price = _PRICE_OF_CONTACT[study.time.kind.implicit]

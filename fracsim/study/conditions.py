@@ -63,6 +63,7 @@ class Placing:
     moved: TimeFunction | None
     friction: float
     loose: Loose | None = None
+    spin: Values | None = None  # rad/s, at which a driven one turns
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,9 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: fl
     elif entry.velocity is not None and not entry.free:
         moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
     loose = _loose(entry, dim, key, gravity, thickness) if entry.free else None
-    return Placing(entry.name, entry.shape, given, of_size(entry.at, dim, f"{key}.at"), moved, entry.friction, loose)
+    at, turns = of_size(entry.at, dim, f"{key}.at"), entry.spin is not None and not entry.free
+    spin = of_size(entry.spin, 3, f"{key}.spin") if turns and entry.spin is not None else None
+    return Placing(entry.name, entry.shape, given, at, moved, entry.friction, loose, spin)
 
 
 def _check_file(entry: Obstacle, dim: int, key: str) -> None:

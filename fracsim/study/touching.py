@@ -50,7 +50,8 @@ class Obstacle(Table):
     velocity: InTime[Vector] | None = None  # m/s; of a free obstacle at the start
     mass: Positive | None = None  # kg (2D: per metre of thickness): it moves freely
     density: Positive | None = None  # kg/m^3, in place of the mass
-    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None  # rad/s at the start, if free
+    # rad/s at the start, if free; of a mesh that is held or driven all along, about `at`
+    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None
     hinge: Hinge | None = None  # free to turn about it
     guide: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # free to move along these axes, without turning
     friction: NonNegative = 0.0  # Coulomb's coefficient
@@ -70,15 +71,14 @@ class Obstacle(Table):
     @model_validator(mode="after")
     def _is_free_or_not(self) -> Obstacle:
         if not self.free:
-            if given := [key for key in FREE if getattr(self, key) is not None]:
+            given = [key for key in FREE if getattr(self, key) is not None]
+            if given and not (self.shape == "mesh" and given == ["spin"]):
                 raise ValueError(f"{given[0]} is for an obstacle that moves freely: give mass or density, or remove it")
             return self
         if self.mass is not None and self.density is not None:
             raise ValueError("give mass or density, not both")
         if self.shape == "plane":
             raise ValueError("a plane is a half space without end, so it cannot move freely: remove mass and density")
-        if self.shape == "mesh":
-            raise ValueError("an obstacle from a file is held or driven: remove mass and density")
         if self.hollow:
             raise ValueError(f"a hollow {self.shape} has walls without thickness, so it cannot move freely: hold it")
         if self.displacement is not None:

@@ -300,7 +300,10 @@ RUNS: dict[str, dict[str, Any]] = {
         "mesh": MESHES["3d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xyz"}],
         "fracture": {"strength": 0.1, "radius": 0.2},
         "obstacle": [{"name": "axe", "shape": "mesh", "file": str(Path(__file__).parent / "axe.obj"), "scale": 0.1,
-                      "at": [0.8, 0.25, 0.52], "velocity": [0.05, 0.0, -0.8], "friction": 0.3}],
+                      "at": [0.8, 0.25, 0.52], "velocity": [0.05, 0.0, -0.8], "friction": 0.3},
+                     {"name": "chip", "shape": "mesh", "file": str(Path(__file__).parent / "axe.obj"), "scale": 0.05,
+                      "at": [0.4, 0.25, 0.515], "velocity": [0.0, 0.1, -0.8], "spin": [1.0, 2.0, 0.0], "friction": 0.3,
+                      "density": 5.0}],
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.2}, "probe": [{"name": "grip", "on": "left"}],
     },
 }  # fmt: skip

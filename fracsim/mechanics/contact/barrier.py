@@ -39,7 +39,7 @@ class Barrier:
         return self._or(g, -self.stiffness * self.width * (s - 1) ** 2 * np.log(s), np.inf)
 
     def slope(self, g: Values) -> Values:
-        """(n,) b', Pa: minus the pressure; never positive; -HUGE, that no norm of forces holds, where a gap is closed."""
+        """(n,) b', Pa: minus the pressure; never positive; where a gap is closed -HUGE, of which there is no norm."""
         s = self._share(g)
         return self._or(g, -self.stiffness * (s - 1) * (2 * np.log(s) + (s - 1) / s), -HUGE)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ...meshes.words import AXES
 from .free_obstacle import Flight, FreeObstacle
@@ -23,6 +24,10 @@ class Flying(Protocol):
     body: FreeObstacle
     flight: Flight
 
+
+class Placeable(Flying, Protocol):
+    """One that is placed by its flight."""
+
     def look(self) -> Placed:
         """Where it is between two steps."""
 
@@ -34,7 +39,7 @@ class Flights(Obstacles):
         free: those by their number.
     """
 
-    free: Mapping[int, Flying]
+    free: Mapping[int, Placeable]
 
     def _led(self) -> list[int]:
         return [number for number in super()._led() if number not in self.free]
@@ -89,15 +94,16 @@ class Flights(Obstacles):
     def readings(self) -> dict[str, Callable[[], Values]]:
         """With position_NAME_x, velocity_NAME_x of the centre of mass, m and m/s, turn_NAME_z, spin_NAME_z in rad and
         rad/s, and kinetic_NAME in J of each that is free."""
-        columns = super().readings()
-        for each in self.free.values():
-            columns |= {name: partial(self._reading, each, place) for place, name in enumerate(_columns(each.body))}
-        return columns
+        return super().readings() | columns_of(self.free.values(), self.comm)
 
-    def _reading(self, each: Flying, place: int) -> Values:
-        if self.comm.rank:
-            return np.zeros(1)
-        return each.body.told(each.flight)[place : place + 1]
+
+def columns_of(free: Iterable[Flying], comm: MPI.Intracomm) -> dict[str, Callable[[], Values]]:
+    """Columns of history.csv that tell how obstacles fly, each with a function that gives this rank's share, (1,)."""
+    return {name: partial(_reading, each, k, comm) for each in free for k, name in enumerate(_columns(each.body))}
+
+
+def _reading(each: Flying, place: int, comm: MPI.Intracomm) -> Values:
+    return np.zeros(1) if comm.rank else each.body.told(each.flight)[place : place + 1]
 
 
 def _columns(body: FreeObstacle) -> list[str]:

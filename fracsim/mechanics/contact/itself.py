@@ -7,6 +7,8 @@ timings of Pairs: for 50,000 triangles less than a step of the body inside them.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -34,6 +36,7 @@ class SelfContact(Term):
 
     name = "contact"
     keeps_apart = beside = True
+    exact_at_end: ClassVar[bool] = True  # tangents where Newton's method is at its end
     _attempts = 0  # of the step
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
@@ -177,7 +180,8 @@ class SelfContact(Term):
 
         def found() -> tuple[csr_matrix, tuple[Values, Values] | None]:
             assert self._surface is not None and x is not None
-            exact, self._tangent_at = self._surface.is_near(x, self._tangent_at, again=self._attempts > 1), x
+            near, self._tangent_at = self._surface.is_near(x, self._tangent_at, again=self._attempts > 1), x
+            exact = near and self.exact_at_end
             H = self._surface.pairs.hessian(x, exact=exact)
             if self._rubbing is not None:
                 H = (H + self._rubbing.hessian(x, exact=exact)).tocsr()

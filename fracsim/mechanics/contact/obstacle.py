@@ -22,6 +22,7 @@ class Obstacle:
         name: of its columns in history.csv.    shape: about its reference point.    at: (d,) that point at t = 0, m.
         moved: (d,) displacement of the obstacle at a time, m; None: it is held.
         friction: Coulomb's coefficient against the body.
+        spin: (3,) rad/s at which it is turned about its reference point (solids alone); None: it does not turn.
     """
 
     name: str
@@ -29,20 +30,22 @@ class Obstacle:
     at: Values
     moved: TimeFunction | None = None
     friction: float = 0.0
+    spin: Values | None = None
     free: ClassVar[bool] = False  # whether it has a mass, and moves by itself
 
     def placed(self, t: float) -> Placed:
         """Where it is at time t, s."""
-        return Placed(self.shape, Pose.at(self.at + self.displacement(t)))
+        pose = Pose.at(self.at + self.displacement(t))
+        return Placed(self.shape, pose if self.spin is None else pose.moved(np.append(0 * self.at, t * self.spin)))
 
     def displacement(self, t: float) -> Values:
         """(d,) m."""
         return np.zeros(len(self.at)) if self.moved is None else self.moved(t)
 
     def way(self, start: float, end: float) -> Values:
-        """(p,) increment q of its pose from one time to another: it does not turn."""
+        """(p,) increment q of its pose from one time to another."""
         shift = self.displacement(end) - self.displacement(start)
-        return np.concatenate([shift, np.zeros(self._turns)])
+        return np.concatenate([shift, np.zeros(self._turns) if self.spin is None else (end - start) * self.spin])
 
     @cached_property
     def _turns(self) -> int:

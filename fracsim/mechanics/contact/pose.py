@@ -64,6 +64,11 @@ class Pose:
         cos, sin = np.cos(angle), np.sin(angle)
         return Pose(self.centre + t, np.array([[cos, -sin], [sin, cos]]))
 
+    def way_to(self, other: Pose) -> Values:
+        """(p,) the increment that leads from here to another pose, with a turn of half a turn at most."""
+        w = Pose(other.centre, other.rotation @ self.rotation.T).turned()
+        return np.concatenate([other.centre - self.centre, w])
+
 
 def turned(y: Values, w: Values) -> Values:
     """(n, d) exp(w) y of vectors y (n, d), each turned by its own angle w (n, 1) or rotation vector w (n, 3), rad."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from .placed import second_order_turn
 from .pose import Pose, Values, turning
@@ -70,6 +71,20 @@ def carried(found: Touch, x: Values, pose: Pose) -> Push:
     d = pose.dim
     hessian[d:, d:] += second_order_turn(gradient, arm).sum(axis=0)
     return Push(found.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
+
+
+def of_points(energy: float, gradient: Values, exact: csr_matrix, stiff: csr_matrix, arm: Values) -> Push:
+    """Of all points that the body carries, with arms (m, d): derivatives (m, d) of the energy by them, and second ones
+    (m d, m d), exact and positive semi-definite."""
+    d, J = arm.shape[1], ways_of_points(arm).reshape(arm.size, -1)
+    hessian, stiffness = (np.asarray(J.T @ (each @ J)) for each in (exact, stiff))
+    hessian[d:, d:] += second_order_turn(gradient, arm).sum(axis=0)
+    return Push(energy, J.T @ gradient.reshape(-1), hessian, stiffness)
+
+
+def ways_of_points(arm: Values) -> Values:
+    """(m, d, p) how points with arms (m, d) go with an increment of the pose."""
+    return -_by_pose(arm)
 
 
 def on_obstacle(found: Touch, x: Values, pose: Pose) -> Values:

@@ -18,6 +18,7 @@ from .box import Box
 from .cylinder import Cylinder
 from .shape import Body, Shape, Values
 from .shifted import Shifted
+from .solids.solid import Solid
 
 SAMPLES = 9  # of an edge or a side
 ROUND = 24  # of a circle
@@ -62,6 +63,8 @@ def skeleton(shape: Shape) -> Skeleton:
     if isinstance(shape, Shifted):
         inner = skeleton(shape.shape)
         return Skeleton(inner.points + shape.offset, inner.radius, inner.share)
+    if isinstance(shape, Solid):
+        return Skeleton(shape.points, 0.0, surface(shape) / len(shape.points))
     points, radius = _bones(shape)
     return Skeleton(points, radius, surface(shape) / max(len(points), 1))
 

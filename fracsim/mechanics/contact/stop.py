@@ -23,6 +23,7 @@ from .pose import Pose, turned
 from .reach import safe_shares
 from .shape import Shape
 from .skeleton import Grown, Skeleton, skeleton
+from .solids.solid import Solid
 from .touch import Touch, touch
 
 Values = npt.NDArray[np.float64]
@@ -45,6 +46,9 @@ class Stop:
     def of(cls, body: Obstacle, other: Obstacle) -> Stop:
         """Between two obstacles."""
         mine, its = skeleton(body.shape), skeleton(other.shape)
+        if isinstance(body.shape, Solid):  # which has no distance: it feels others at its points
+            nobody = Skeleton(np.empty((0, 3)), 0.0)
+            return cls((mine, nobody), (np.full(len(mine.points), mine.share), np.empty(0)), (other.shape,) * 2)
         areas = np.full(len(mine.points), mine.share), np.full(len(its.points), its.share)
         seen = Grown(other.shape, mine.radius), Grown(body.shape, its.radius)
         return cls((mine, its), areas, cast("tuple[Shape, Shape]", seen))  # what `touch` asks of a shape they have

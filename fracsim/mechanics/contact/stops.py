@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from .stop import Stop
 from .touch import Touch
 
 Values = npt.NDArray[np.float64]
+type Places = Mapping[int, Placed] | Sequence[Placed]  # by the numbers of obstacles
 
 
 class Stops:
@@ -28,12 +29,12 @@ class Stops:
         self._barrier, self._count = barrier, len(body.way(0.0, 0.0))
         self._start: dict[int, list[Values]] = {}
 
-    def begin(self, pose: Pose, placed: Sequence[Placed], *, along: bool) -> None:
+    def begin(self, pose: Pose, placed: Places, *, along: bool) -> None:
         """A step begins; `along`: barriers act along its way (along)."""
         each = self._each.items() if along else []
         self._start = {number: stop.gaps(pose, placed[number].pose) for number, stop in each}
 
-    def are_open(self, pose: Pose, placed: Sequence[Placed]) -> bool:
+    def are_open(self, pose: Pose, placed: Places) -> bool:
         """Whether it lies in none."""
         found = [stop.gaps(pose, placed[number].pose) for number, stop in self._each.items()]
         return all(gap.min(initial=np.inf) > 0 for both in found for gap in both)
@@ -44,7 +45,7 @@ class Stops:
         shares = [stop.safe_share(pose, q, ways[n][0].pose, ways[n][1][:d]) for n, stop in self._each.items()]
         return min(shares, default=1.0)
 
-    def push(self, pose: Pose, placed: Sequence[Placed]) -> Push:
+    def push(self, pose: Pose, placed: Places) -> Push:
         """What they do to its pose."""
         p = self._count
         total = Push(0.0, np.zeros(p), np.zeros((p, p)), np.zeros((p, p)))
@@ -53,16 +54,16 @@ class Stops:
             total = total + carried(own, x, pose) + push(its, y, pose, None, pose)
         return total
 
-    def force(self, pose: Pose, placed: Sequence[Placed]) -> Values:
+    def force(self, pose: Pose, placed: Places) -> Values:
         """(p,) force and moment of all of them on it, N and N m."""
         return -self.push(pose, placed).gradient
 
-    def energies(self, pose: Pose, placed: Sequence[Placed]) -> tuple[float, float]:
+    def energies(self, pose: Pose, placed: Places) -> tuple[float, float]:
         """What their barriers store, and what their forces in the step are the derivative of, J."""
         found = [touch for number in self._each for touch, _ in self._touches(number, pose, placed)]
         return sum(touch.energy for touch in found), sum(touch.potential for touch in found)
 
-    def work(self, pose: Pose, placed: Sequence[Placed], ways: Sequence[Values]) -> float:
+    def work(self, pose: Pose, placed: Places, ways: Mapping[int, Values] | Sequence[Values]) -> float:
         """What they have done to it by their own ways (p,) in the step, J."""
         done = 0.0
         for number in self._each:
@@ -70,5 +71,5 @@ class Stops:
             done += float((own.normal.sum(axis=0) - its.normal.sum(axis=0)) @ ways[number][: pose.dim])
         return done
 
-    def _touches(self, number: int, pose: Pose, placed: Sequence[Placed]) -> list[tuple[Touch, Values]]:
+    def _touches(self, number: int, pose: Pose, placed: Places) -> list[tuple[Touch, Values]]:
         return self._each[number].touches(pose, placed[number].pose, self._barrier, self._start.get(number))

@@ -154,6 +154,6 @@ def nothing(d: int) -> Touch:
 def positive(blocks: Values) -> Values:
     """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with. Nothing of gaps
     that are closed (barrier.HUGE): there is no step from there."""
-    open_ = (abs(blocks) < HUGE_STIFFNESS).all(axis=(1, 2))
-    values, vectors = np.linalg.eigh(np.where(open_[:, None, None], blocks, 0.0))
+    is_open = np.all(abs(blocks) < HUGE_STIFFNESS, axis=(1, 2), keepdims=True)
+    values, vectors = np.linalg.eigh(np.where(is_open, blocks, 0.0))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))

@@ -1,6 +1,7 @@
 """Contact with obstacles whose surface is read from a file, by ipctk.
 
 term            the term of the balance
+free, free_term a solid that moves freely; the term where some do
 front           the split surface of the body before solids, with room for walls that come to light inside one
 facing          barrier and friction between the body's surface and one solid; what is felt of several
 beside          whether the body may be near any of them at all

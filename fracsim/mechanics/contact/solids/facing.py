@@ -7,6 +7,7 @@ it does to them. Each solid has pairs of its own with the body: its friction, it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import ipctk
@@ -16,45 +17,49 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..crossings import NONE
+from ..near import KEPT
 from ..pairs import Pairs
+from ..pose import Pose
 from ..slip import Friction
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 ASKED = 500  # points that a solid's box is nearest to
+TURN = 0.3  # rad of a solid's turn in one piece
+LEAST = 1e-4  # of a piece: a way that is none
 
 
 class Standing:
     """A solid, somewhere.
 
     Attributes:
-        name: where messages find it.    points: (m, 3) at the start, m.    triangles: (k, 3).
-        friction: Coulomb's coefficient.    here: (m, 3) its points now, m.
+        name: where messages find it.    points: (m, 3) in its own frame, m.    triangles: (k, 3).
+        friction: Coulomb's coefficient.    pose: where it is now.    here: (m, 3) its points there, m.
     """
 
     def __init__(self, name: str, points: Values, triangles: Ints, friction: float) -> None:
         self.name, self.points, self.triangles, self.friction = name, points, triangles, friction
-        self.here = points
-        self._shift: Values = np.zeros(3)
         self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
+        self.put(Pose.at(np.zeros(3)))
 
-    def put(self, shift: Values) -> None:
-        """Moved by `shift` (3,) from the start, m."""
-        self.here, self._shift = self.moved(shift), shift
+    def put(self, pose: Pose) -> None:
+        """It is there."""
+        self.pose, self.here = pose, self.placed(pose)
+        self._around = self.here.min(axis=0), self.here.max(axis=0)
 
-    def moved(self, shift: Values) -> Values:
-        """(m, 3) its points then."""
-        return self.points + shift
+    def placed(self, pose: Pose) -> Values:
+        """(m, 3) its points then, m."""
+        return pose.points_to_space(self.points)
 
     def is_far(self, x: Values, distance: float) -> bool:
         """Whether its box is farther than `distance` from that of points x (n, 3), m."""
-        x_low, x_high = x.min(axis=0) - self._shift, x.max(axis=0) - self._shift
-        return bool(np.any(x_low - self._box[1] > distance) or np.any(self._box[0] - x_high > distance))
+        low, high = self._around
+        return bool(np.any(x.min(axis=0) - high > distance) or np.any(low - x.max(axis=0) > distance))
 
     def about(self, x: Values) -> float:
         """Distance from points x (n, 3) to its points, m: half an edge more than to its surface, at most."""
-        x = x - self._shift
+        x = self.pose.to_body(x)
         out = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
         first = np.argpartition(out, min(ASKED, len(out)) - 1)[:ASKED]
         least = float(self._tree.query(x[first])[0].min())
@@ -90,7 +95,38 @@ class Facing(Pairs):
 
     def pushed(self, x: Values) -> Values:
         """(n, 3) dE/dx with the body at x (n, 3), N: the force of the solid on it is its negative."""
-        return np.zeros_like(x) if self.is_far(x) else self.gradient(self.with_solid(x))[: self.count]
+        return self.on_both(x)[: self.count]
+
+    def on_both(self, x: Values) -> Values:
+        """(n + m, 3) the same, and dE/dx of the solid's points, N."""
+        both = self.with_solid(x)
+        return np.zeros_like(both) if self.is_far(x) else self.gradient(both)
+
+    def free_along(self, x: Values, to: Values, before: Pose) -> float:
+        """The share of the straight way of the body from x to `to`, and of the solid from a pose `before` to where it
+        is, on which they do not meet.
+
+        The points of one that turns go on arcs, which are walked in chords that end on them.
+        """
+        end, q = self.solid.pose, before.way_to(self.solid.pose)
+        if not q[3:].any():
+            return self.longest_step(self._both(x, before), self._both(to, end))
+        pieces, way = 1 + int(np.linalg.norm(q[3:]) / TURN), to - x
+        for piece in range(pieces):
+            here, share, chord = piece / pieces, 1.0, 0.0
+            start = self._both(x + here * way, before.moved(here * q))
+            while chord < 1 and share > LEAST:
+                there = here + share / pieces
+                chord = self.longest_step(start, self._both(x + there * way, before.moved(there * q)))
+                share *= 1.0 if chord == 1 else (1 - KEPT) * chord
+            if chord < 1:
+                return here
+            if share < 1:
+                return here + share / pieces
+        return 1.0
+
+    def _both(self, x: Values, pose: Pose) -> Values:
+        return np.concatenate([x, self.solid.placed(pose)])
 
     def cut(self, x: Values) -> Ints:
         """Elements of the body at x (n, 3) that the solid cuts."""
@@ -125,6 +161,12 @@ class Facings:
         how = {"distance": distance, "stiffness": stiffness}
         self.each = [Facing(rest, elements, solid, **how) for solid in solids]
 
+    def some(self, which: Sequence[int]) -> Facings:
+        """Before some of the solids."""
+        part = copy(self)
+        part.each = [self.each[k] for k in which]
+        return part
+
     def energy(self, x: Values) -> float:
         """E, J."""
         return sum(each.energy(each.with_solid(x)) for each in self.each if not each.is_far(x))
@@ -147,15 +189,12 @@ class Facings:
 
     def longest_step(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the straight way of the body from x to `to` on which it meets no solid at rest."""
-        return self.along(x, to, [each.solid.here for each in self.each])
+        return self.along(x, to, [each.solid.pose for each in self.each])
 
-    def along(self, x: Values, to: Values, before: Sequence[Values]) -> float:
-        """The same where solids come from `before` (m, 3), each, to where they are."""
-        share = 1.0
-        for each, then in zip(self.each, before, strict=True):
-            ways = np.concatenate([x, then]), np.concatenate([to, each.solid.here])
-            share = min(share, each.longest_step(*ways))
-        return share
+    def along(self, x: Values, to: Values, before: Sequence[Pose]) -> float:
+        """The same where solids come from poses `before` to where they are."""
+        ways = zip(self.each, before, strict=True)
+        return min((each.free_along(x, to, then) for each, then in ways), default=1.0)
 
     def look_along(self, x: Values, to: Values) -> None:
         """Have candidates for all the way of the body from x to `to`."""
@@ -192,15 +231,17 @@ class Rubbing:
         return sum(part.energy(each.with_solid(x)) for each, part in zip(self.facings, self.parts, strict=True))
 
     def of(self, which: Facing, x: Values) -> Values:
-        """(n, 3) dE/dx by one of the solids, N."""
-        for each, part in zip(self.facings, self.parts, strict=True):
-            if each is which:
-                return part.gradient(each.with_solid(x))[: len(x)]
-        return np.zeros_like(x)
+        """(n + m, 3) dE/dx by one of the solids, of the body's points and of its own, N."""
+        both, part = which.with_solid(x), self.with_one(which)
+        return np.zeros_like(both) if part is None else part.gradient(both)
+
+    def with_one(self, which: Facing) -> Friction | None:
+        """That with one of the solids; None: it rubs nothing."""
+        return next((part for each, part in zip(self.facings, self.parts, strict=True) if each is which), None)
 
     def gradient(self, x: Values) -> Values:
         """(n, 3) dE/dx, N."""
-        return np.sum([np.zeros_like(x), *(self.of(each, x) for each in self.facings)], axis=0)
+        return np.sum([np.zeros_like(x), *(self.of(each, x)[: len(x)] for each in self.facings)], axis=0)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(3 n, 3 n) d2E/dx2, N/m."""

@@ -9,7 +9,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from ..near import KEPT, longest
-from .facing import Facing
+from ..pose import Pose
+from .facing import Facing, Facings
 from .front import Front
 
 Values = npt.NDArray[np.float64]
@@ -19,10 +20,11 @@ PIECES = 50  # of a way, each of an edge's length
 WEIGHT = 1e-3  # of points that are stopped, from which on a node is brought back with them
 
 
-def led_past(front: Front, start: Values, end: Values, before: Sequence[Values]) -> Values:
-    """(nodes, 3) displacements at the `end` of a step, m, with points stopped where they would pass into a solid; at
-    the `start` solids were at `before` (m, 3), each; they are where they will be. The same array where none would."""
-    at, pairs = front.at, front.pairs
+def led_past(front: Front, pairs: Facings, start: Values, end: Values, before: Sequence[Pose]) -> Values:
+    """(nodes, 3) displacements at the `end` of a step, m, with points stopped where they would pass into a solid of
+    `pairs`; at the `start` solids were at poses `before`; they are where they will be. The same array where none
+    would."""
+    at = front.at
     x = at(start)
     for _ in range(ROUNDS):
         to = at(end)
@@ -42,10 +44,10 @@ def _of_nodes(weights: csr_matrix, back: Values) -> Values:
     return np.where(taken[:, None], (weights @ back) / np.where(taken, weight, 1.0)[:, None], 0.0)
 
 
-def brought_back(facing: Facing, before: Values, x: Values, to: Values) -> Values:
+def brought_back(facing: Facing, before: Pose, x: Values, to: Values) -> Values:
     """(n, 3) what the ways of points from x to `to` lack of safe ones, m: seen from the solid a point stops where it
     comes as near to it as a tenth of its distance; piece by piece, each point on its own."""
-    way = to - x - (facing.solid.here[0] - before[0])
+    way = to - facing.solid.pose.points_to_space(before.to_body(x))  # seen from the solid
     edge = facing.edge
     count = min(max(1, int(np.ceil(longest(way) / edge))), PIECES)
     now, there = to - way, to - way  # beside the solid where it is now

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,26 @@ class Solid:
         """As `distance`."""
         return self.distance(x)
 
+    @property
+    def centre(self) -> Values:
+        """(3,) of its mass, from the reference point, m."""
+        each, middle = self._tetrahedra()
+        return np.asarray(each @ middle / each.sum())
+
     def inertia(self, density: float) -> Values:
-        """NotImplementedError."""
-        raise NotImplementedError("solids do not move freely")
+        """(3, 3) rho (tr S 1 - S) about the reference point, S = int x x^T dV: of the tetrahedron between it and a
+        triangle, with corners a, b, c and sum s, V / 20 (a a^T + b b^T + c c^T + s s^T)."""
+        each, _ = self._tetrahedra()
+        corners = self.points[self.triangles]
+        whole = corners.sum(axis=1)
+        S = (np.einsum("k,kci,kcj->ij", each, corners, corners) + np.einsum("k,ki,kj->ij", each, whole, whole)) / 20
+        return np.asarray(density * (np.trace(S) * np.eye(3) - S))
+
+    def shifted(self, offset: Values) -> Solid:
+        """The same with its reference point elsewhere: all points by `offset` (3,), m."""
+        return replace(self, points=self.points + offset)
+
+    def _tetrahedra(self) -> tuple[Values, Values]:
+        """(k,) signed volumes of those between triangles and the reference point, m^3, and (k, 3) their middles, m."""
+        corners = self.points[self.triangles]
+        return np.linalg.det(corners) / 6, corners.sum(axis=1) / 4

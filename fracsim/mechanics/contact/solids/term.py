@@ -26,6 +26,7 @@ from ..drawing import Drawings
 from ..itself import SelfContact
 from ..obstacle import Obstacle
 from ..placed import Placed
+from ..pose import Pose
 from .beside import Beside
 from .facing import Rubbing, Standing
 from .front import Front
@@ -54,8 +55,10 @@ class Solids(SelfContact):
         self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge
         self._drawings = Drawings(self.obstacles, domain.lower, domain.upper)
         self._solids = on_root(domain.comm, lambda: [_standing(*each, edge) for each in obstacles.items()]) or []
-        self._from = self._to = [each.displacement(0.0) for each in self.obstacles]
-        self._gone, self._end, self._dt = 1.0, -np.inf, 0.0
+        self._from = [each.placed(0.0).pose for each in self.obstacles]
+        self._ways: list[Values] = [np.zeros(6) for _ in self.obstacles]  # (6,) of each in the step
+        self._put(1.0)
+        self._end, self._dt = -np.inf, 0.0
         self._beside = Beside(domain, self.obstacles, law.distance)
         self._began_near = True
         self._far: bool | None = None  # of the current u; None: not known yet
@@ -106,19 +109,24 @@ class Solids(SelfContact):
     def _put(self, gone: float) -> None:
         """Solids have gone this share of their way in the step."""
         self._gone, self._moved = gone, True
-        for each, start, end in zip(self._solids, self._from, self._to, strict=False):  # they are on rank 0 alone
-            each.put(start + gone * (end - start))
+        self._now = [self._gone_to(number, gone) for number in range(len(self.obstacles))]
+        for each, pose in zip(self._solids, self._now, strict=False):  # they are on rank 0 alone
+            each.put(pose)
 
-    @property
-    def _ways(self) -> list[tuple[Values, Values]]:
-        """(3,) shifts of each solid at both ends of the step, m."""
-        return list(zip(self._from, self._to, strict=True))
+    def _gone_to(self, number: int, gone: float) -> Pose:
+        """Where a solid is after that share of its way."""
+        return self._from[number].moved(gone * self._ways[number])
+
+    def _between(self) -> list[tuple[Pose, Pose]]:
+        """Poses of each solid at the start of the step, and where it is at its end."""
+        ends = [self._gone_to(number, 1.0) for number in range(len(self.obstacles))]
+        return list(zip(self._from, ends, strict=True))
 
     def _is_far(self) -> bool:
         """Whether nothing can touch at the current u, nor could as the step began: nothing rubs then (collective)."""
         if self._far is None:
             at_end = self._level.at_end(self._u.x.array[: self._owned])
-            self._far = not self._began_near and self._beside.is_far([self._level.u, at_end], self._ways)
+            self._far = not self._began_near and self._beside.is_far([self._level.u, at_end], self._between())
         return self._far
 
     def displaced(self) -> None:
@@ -158,10 +166,10 @@ class Solids(SelfContact):
             return  # a look at what a step has ended with: friction and places are still those of the step
         self._end, self._dt, self._began_with = end, level.dt, level.v
         self._rubbing = self._tangent_at = None
-        self._from = [each.displacement(end - level.dt) for each in self.obstacles]
-        self._to = [each.displacement(end) for each in self.obstacles]
-        self._began_near, self._start = not self._beside.is_far([level.u], self._ways), None
-        self._pushed = [np.zeros(3) for _ in self.obstacles]
+        self._take_places(end - level.dt, end)
+        self._began_near, self._start = not self._beside.is_far([level.u], self._between()), None
+        none: Values = np.zeros((1, 3))
+        self._pushed = [none for _ in self.obstacles]
         if level.dt and self._began_near:
             nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
             if self._surface is not None and nodal is not None:
@@ -169,11 +177,16 @@ class Solids(SelfContact):
                 self._begin_at(self._surface, nodal, creep * level.dt)
         self._put(1.0)
 
+    def _take_places(self, start: float, end: float) -> None:
+        """Where solids are at the ends of a step, s."""
+        self._from = [each.placed(start).pose for each in self.obstacles]
+        self._ways = [each.way(start, end) for each in self.obstacles]
+
     def _begin_at(self, front: Front, nodal: Values, slip: float) -> None:
         """A step begins at displacements (nodes, 3), m, on rank 0; `slip`: that passes for sticking, m."""
         front.make_room(nodal)
         self._start = x = front.at(nodal)
-        self._pushed = [-each.pushed(x).sum(axis=0) for each in front.pairs.each]
+        self._pushed = [each.on_both(x)[len(x) :] for each in front.pairs.each]
         if any(each.friction for each in self._solids):
             self._rubbing = front.pairs.lag_friction(x, slip)
 
@@ -187,16 +200,17 @@ class Solids(SelfContact):
 
     def _book(self, x: Values, front: Front, read: list[Values]) -> None:
         """The same on rank 0, with the body's points at x (n, 3), m; forces on each solid go into `read`, N."""
-        end, pushed = self._level.blow.end, self._pushed
-        for k, (each, (start, to)) in enumerate(zip(front.pairs.each, self._ways, strict=True)):
-            normal, under = -each.pushed(x).sum(axis=0), 0.0
-            read[k] -= normal
+        end, pushed, n = self._level.blow.end, self._pushed, len(x)
+        for k, (each, start) in enumerate(zip(front.pairs.each, self._from, strict=True)):
+            normal, under = each.on_both(x)[n:], 0.0  # of the solid on the body, at the places where it does
+            read[k] -= normal.sum(axis=0)
+            moved = each.solid.here - each.solid.placed(start)
             if self._rubbing is not None and self._start is not None:
-                friction = -self._rubbing.of(each, x)
-                under = float(friction.sum(axis=0) @ (to - start))
-                self._lost += under - float(np.vdot(friction, x - self._start))
-                read[k] -= friction.sum(axis=0)
-            self._worked[k] = float((end * normal + (1 - end) * pushed[k]) @ (to - start)) + under
+                friction = self._rubbing.of(each, x)
+                under = float(np.vdot(friction[n:], moved))
+                self._lost += under + float(np.vdot(friction[:n], x - self._start))
+                read[k] -= friction[n:].sum(axis=0)
+            self._worked[k] = float(np.vdot(end * normal + (1 - end) * pushed[k], moved)) + under
 
     def driven(self) -> tuple[float, float]:
         """Work of the solids' own motion in the step, and what friction takes, on rank 0, J."""
@@ -211,18 +225,18 @@ class Solids(SelfContact):
         """Share of a change of u on the way of which nothing meets (collective)."""
         u, level = self._u.x.array[: self._owned], self._level
         ends = [level.at_end(u), level.at_end(u + change)]
-        return 1.0 if self._beside.is_far(ends, self._ways) else super().longest_step(change)
+        return 1.0 if self._beside.is_far(ends, self._between()) else super().longest_step(change)
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
-        if not level.dt or self._beside.is_far([level.u, level.at_end(u)], self._ways):
+        if not level.dt or self._beside.is_far([level.u, level.at_end(u)], self._between()):
             return u
         start, end = self._gathered(level.u), self._gathered(level.at_end(u))
 
         def found() -> Values | None:
             assert self._surface is not None and start is not None and end is not None
-            led = led_past(self._surface, start, end, self._places_before())
+            led = self._guided(self._surface, start, end)
             return None if led is end else led
 
         led = on_root(self.comm, found)
@@ -231,20 +245,20 @@ class Solids(SelfContact):
         to = np.asarray(self._domain.gather_nodes.scatter(led)).reshape(-1)
         return np.asarray(level.u + level.share * (to - level.u))
 
-    def _places_before(self) -> list[Values]:
-        """(m, 3) of each solid at the start of the step."""
-        return [each.moved(shift) for each, shift in zip(self._solids, self._from, strict=True)]
+    def _guided(self, front: Front, start: Values, end: Values) -> Values:
+        """(nodes, 3) where the body gets to on its way from the `start` to the `end` of the step, on rank 0."""
+        return led_past(front, front.pairs, start, end, self._from)
 
     def clear(self, u: Values) -> bool:
         """Whether nothing is passed on the straight way from the start to u (collective)."""
-        if self._beside.is_far([self._level.u, self._level.at_end(u)], self._ways):
+        if self._beside.is_far([self._level.u, self._level.at_end(u)], self._between()):
             return True
         start, end = self._gathered(self._level.u), self._gathered(self._level.at_end(u))
 
         def found() -> bool:
             assert self._surface is not None and start is not None and end is not None
             at, pairs = self._surface.at, self._surface.pairs
-            return pairs.along(at(start), at(end), self._places_before()) == 1
+            return pairs.along(at(start), at(end), self._from) == 1
 
         return from_root(self.comm, found)
 
@@ -268,7 +282,7 @@ class Solids(SelfContact):
 
         def found() -> float:
             assert self._surface is not None and nodal is not None
-            x, before = self._surface.at(nodal), [each.here for each in self._solids]
+            x, before = self._surface.at(nodal), [each.pose for each in self._solids]
             self._put(1.0)
             return self._surface.pairs.along(x, x, before)
 
@@ -317,11 +331,12 @@ class Solids(SelfContact):
         if x is None or v is None or self._surface is None:
             return [0.0] * len(self.obstacles)
         moved, result = self._dt * (self._surface.at.weights @ v), []
-        for each, start, end in zip(self._surface.pairs.each, self._from, self._to, strict=True):
+        for each, start in zip(self._surface.pairs.each, self._from, strict=True):
             force = -each.pushed(x)
             size = np.linalg.norm(force, axis=1)
             on = size > 0
-            closer = np.einsum("ni,ni->n", (end - start) - moved[on], force[on] / size[on, None])
+            under = x[on] - start.points_to_space(each.solid.pose.to_body(x[on]))
+            closer = np.einsum("ni,ni->n", under - moved[on], force[on] / size[on, None])
             result.append(float(closer.max(initial=0.0)))
         return result
 
@@ -330,5 +345,5 @@ def _standing(number: int, obstacle: Obstacle, edge: float) -> Standing:
     """A solid where it is at the start, with triangles as small as those of the body (rank 0)."""
     solid = obstacle.shape
     assert isinstance(solid, Solid)
-    points, triangles = refined(solid.points + obstacle.at, solid.triangles, edge)
+    points, triangles = refined(solid.points, solid.triangles, edge)
     return Standing(f"obstacle.{number}: {obstacle.name}", points, triangles, obstacle.friction)
