@@ -1,4 +1,4 @@
-"""Obstacles that lie in each other, since they do not feel each other: looked for at every frame, told at the end."""
+"""Obstacles that lie in each other, where they do not feel each other: looked for at frames, told at the end."""
 
 from __future__ import annotations
 
@@ -47,6 +47,6 @@ class Overlapping:
             return []
         first, second = self.seen["both"]
         return [
-            f"{first} ran into {second}, by {self.seen['depth']:.3g} m at t = {self.seen['time']:g} s: obstacles that "
-            "move freely do not feel each other"
+            f"{first} ran into {second}, by {self.seen['depth']:.3g} m at t = {self.seen['time']:g} s: in explicit "
+            "steps obstacles do not feel each other"
         ]

@@ -224,6 +224,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         for i, each in enumerate(study.obstacle):
             if each.file is not None:
                 yield f"            {each.name}: {_solid(each.file, each.scale or 1.0, f'obstacle.{i}')}"
+        if len(study.obstacle) > 1 and any(each.free for each in study.obstacle) and not study.time.kind.implicit:
+            yield "            note: in explicit steps obstacles do not feel, and pass through each other"
         if any(each.free for each in study.obstacle) and any(each.shape == "mesh" for each in study.obstacle):
             yield "            note: obstacles that move freely do not feel those from files; free ones from files feel"
             yield "            shapes that are held or driven, with their points"

@@ -8,8 +8,8 @@ method within the term. The body sees what is left, a function of x alone:
 So the system of equations keeps its size, and its solution is the same as if poses were among its unknowns. The last
 part couples all points in touch with one another; it is of rank k, the freedoms of an obstacle, and is applied, not
 stored. (Without it a disk of a third of the body's mass takes 17,892 iterations in place of 127, or finds no solution.)
-Every rank finds the same poses from sums over all ranks. Free obstacles meet those that are held or driven (stops), but
-not one another.
+Every rank finds the same poses from sums over all ranks. Free obstacles meet those that are held or driven (stops), and
+one another (mutual).
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .flights import Flights
 from .free_obstacle import FreeObstacle
 from .free_pose import Around, FreePose
 from .law import Law
+from .mutual import Mutual
 from .obstacle import Obstacle
 from .placed import Placed
 from .rigid_step import RigidStep
@@ -58,7 +59,7 @@ class FreeObstacles(Flights):
             for number, each in enumerate(obstacles)
             if isinstance(each, FreeObstacle)
         }
-        self._scheme = scheme
+        self._scheme, self._mutual = scheme, Mutual(self.free, law.barrier) if len(self.free) > 1 else None
         self._settled_at: Values | None = None  # places of the points that poses belong to
         super().__init__(domain, u, obstacles, law)
 
@@ -71,13 +72,15 @@ class FreeObstacles(Flights):
             step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, level.blow.factor)
             self._course.ways[number] = each.begin(step, self._grips[number])
             each.stops.begin(each.flight.pose, self._course.at_start, along=level.blow.along)
+        if self._mutual is not None:
+            self._mutual.begin(along=level.blow.along)
 
     def arrive(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
         super().arrive()
-        found = self.touching()
+        found, others = self.touching(), {} if self._mutual is None else self._mutual.forces()
         for number, each in self.free.items():
-            each.arrive(found[number], self._around(number))
+            each.arrive(found[number], self._around(number), others.get(number, 0.0))
 
     # --- where free obstacles are ---
 
@@ -87,10 +90,19 @@ class FreeObstacles(Flights):
             self.x = self.skin.places(self._at_end())
             if not self.comm.allreduce(_same(self.x, self._settled_at), op=MPI.LAND):
                 self._settled_at = self.x
-                for number, each in self.free.items():
-                    each.settle(self._around(number))
+                self._settle()
                 self._place()
         return super().touching()
+
+    def _settle(self) -> None:
+        """All are where they belong with the points where they are now (collective)."""
+        if self._mutual is not None:
+            return self._mutual.settle(self._arounds())
+        for number, each in self.free.items():
+            each.settle(self._around(number))
+
+    def _arounds(self) -> dict[int, Around]:
+        return {number: self._around(number) for number in self.free}
 
     def _is_under_way(self) -> bool:
         """Whether this is no mere look, and the step that began is not over yet."""
@@ -122,6 +134,8 @@ class FreeObstacles(Flights):
             for each in self.free.values():
                 _, stopped = each.stops.energies(each.placed.pose, self._course.placed)
                 energy += each.step.own(each.z) + level.weight * level.share * stopped
+            if self._mutual is not None:
+                energy += level.weight * level.share * self._mutual.energies()[1]
         return energy
 
     def stored(self) -> float:
@@ -130,6 +144,7 @@ class FreeObstacles(Flights):
         if self.comm.rank == 0:
             placed = self._course.placed
             energy += sum(each.stops.energies(each.placed.pose, placed)[0] for each in self.free.values())
+            energy += 0.0 if self._mutual is None else self._mutual.energies()[0]
         return energy
 
     def low_rank(self) -> list[tuple[Values, Values]]:
@@ -139,6 +154,9 @@ class FreeObstacles(Flights):
         touches = self.touching()
         counts = total(self.comm, np.array([len(touches[number].points) for number in self.free]))
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
+        if self._mutual is not None and touched:
+            U = np.concatenate([self._mixed(number, touches[number]) for number in self.free], axis=1)
+            return [(U, self._mutual.compliance(self._arounds()))]
         return [(self._mixed(number, touches[number]), self._compliance(number)) for number in touched]
 
     def _mixed(self, number: int, found: Touch) -> Values:
@@ -172,6 +190,10 @@ class FreeObstacles(Flights):
     def _taken_along(self, moved: Values) -> list[Values]:
         """As Newton's method moves them together with the points (collective)."""
         ways, found = super()._taken_along(moved), self.touching()
+        if self._mutual is not None:
+            for number, q in self._mutual.taken_along(dict(enumerate(found)), self._arounds(), moved).items():
+                ways[number] = q
+            return ways
         for number, each in self.free.items():
             ways[number] = each.taken_along(found[number], self._around(number), moved)
         return ways
@@ -191,6 +213,8 @@ class FreeObstacles(Flights):
         for number, each in self.free.items():
             taken[number], free = self._first_guess(each, self._around_at(number, x), moved)
             share = min(share, free)
+        if self._mutual is not None:
+            share = min(share, self._mutual.safe_guess(taken))
         for number, z in taken.items():
             self.free[number].put(share * z)
         self._place()
@@ -214,7 +238,7 @@ class FreeObstacles(Flights):
         """Whether every gap is open with the body at u, those between obstacles as well (collective)."""
         placed = self._course.placed
         apart = all(each.stops.are_open(each.placed.pose, placed) for each in self.free.values())
-        return super().clear(u) and apart
+        return super().clear(u) and apart and (self._mutual is None or self._mutual.are_open())
 
     def _go_on(self, x: Values) -> None:
         """As far as free obstacles let others."""

@@ -102,10 +102,13 @@ class FreePose:
         """Whether the step that began is not over yet."""
         return self._of is self.flight
 
-    def arrive(self, found: Touch, around: Around) -> None:
-        """The step is over: it has the momentum that points in touch, and stops, gave it (collective)."""
+    def arrive(self, found: Touch, around: Around, others: Values | float = 0.0) -> None:
+        """The step is over: it has the momentum that points in touch, stops and `others` that are free, by a force and
+        moment (p,), gave it (collective)."""
         pose = self.placed.pose
-        pushed = total(around.skin.comm, on_obstacle(found, around.x, pose)) + self.stops.force(pose, around.placed)
+        pushed = (
+            others + total(around.skin.comm, on_obstacle(found, around.x, pose)) + self.stops.force(pose, around.placed)
+        )
         self.flight = self.step.arrived(self.z, pushed)
         self._found = self.z
 
@@ -127,16 +130,20 @@ class FreePose:
     def settle(self, around: Around) -> None:
         """The pose that belongs to the points where they are now (collective)."""
         self._settled = None
-        for z in self._candidates(around):
+        for z in self.candidates(around):
             self.put(z)
-            if around.is_open(self.placed) and self.stops.are_open(self.placed.pose, around.placed):
+            if self.is_open(around):
                 break
         else:
             return  # the body or a stop is in the obstacle: Newton's method finds no finite force, and fails
-        z, self._settled = self.step.settle(z, partial(self._push, around), partial(self._free, around))
+        z, self._settled = self.step.settle(z, partial(self.push, around), partial(self.free, around))
         self.put(z)
 
-    def _candidates(self, around: Around) -> Iterator[Values]:
+    def is_open(self, around: Around) -> bool:
+        """Whether it lies in nothing (collective)."""
+        return around.is_open(self.placed) and self.stops.are_open(self.placed.pose, around.placed)
+
+    def candidates(self, around: Around) -> Iterator[Values]:
         """Ways z to start from: where a step of Newton's method takes the obstacle along, where it is, where it was
         once this step was solved, and where the step began."""
         here = self.z
@@ -150,13 +157,13 @@ class FreePose:
             yield self._found
         yield np.zeros_like(here)
 
-    def _push(self, around: Around, z: Values) -> Push:
+    def push(self, around: Around, z: Values) -> Push:
         """What contact does to the obstacle at z, of all ranks (collective)."""
         self.put(z)
         mine = push(around.feel(self.placed), around.x, self.placed.pose, self._held, self.step.start.pose)
         return _summed(mine, around.skin.comm) + self.stops.push(self.placed.pose, around.placed)
 
-    def _free(self, around: Around, z: Values, dz: Values) -> float:
+    def free(self, around: Around, z: Values, dz: Values) -> float:
         """Share of the way from z by dz that closes no gap, with the body where it is (collective)."""
         self.put(z)
         q, still = self.step.onward(z, dz), 0 * around.x
@@ -172,14 +179,21 @@ class FreePose:
 
     def resistance(self, around: Around) -> Values:
         """(k, k) second derivative of Phi by z, its positive definite part (collective)."""
-        return self.step.system(self.z, self._settled or self._push(around, self.z))[2]
+        return self.step.system(self.z, self._settled or self.push(around, self.z))[2]
 
     def taken_along(self, found: Touch, around: Around, moved: Values) -> Values:
         """(p,) increment of its pose as Newton's method moves it together with the points, by `moved` (n, d), m
         (collective)."""
+        dz = np.asarray(-np.linalg.solve(self.resistance(around), self.pulled(found, around, moved)))
+        return self.goes(around, moved, dz)
+
+    def pulled(self, found: Touch, around: Around, moved: Values) -> Values:
+        """(k,) change of the gradient of Phi by z with the points, which go by `moved` (n, d), m (collective)."""
         mixed = self.by_z(found, around.x)
-        pushed = total(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
-        dz = np.asarray(-np.linalg.solve(self.resistance(around), pushed))
+        return total(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
+
+    def goes(self, around: Around, moved: Values, dz: Values) -> Values:
+        """(p,) increment of its pose as Newton's method moves it by dz (k,) and the points by `moved` (n, d), m."""
         self._way = _Way(around.x, moved, self.z, dz)
         return self.step.onward(self.z, dz)
 

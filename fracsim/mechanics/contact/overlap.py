@@ -1,4 +1,4 @@
-"""How deep obstacles lie in one another: two that move freely do not feel each other."""
+"""How deep obstacles lie in one another: at the start none may, and in explicit steps they do not feel each other."""
 
 from __future__ import annotations
 

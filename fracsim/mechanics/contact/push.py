@@ -73,6 +73,20 @@ def carried(found: Touch, x: Values, pose: Pose) -> Push:
     return Push(found.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
 
 
+def between_two(found: Touch, x: Values, own: Pose, other: Pose) -> tuple[Values, Values]:
+    """(p, p) second derivative of the energy of points at x (n, d) that one body carries before another one, by
+    increments of both their poses, exact and of the positive part."""
+    at, d = x[found.points], own.dim
+    mine, its = _by_pose(at - own.centre), _by_pose(at - other.centre)
+    turned = its.copy()
+    n, p = len(at), its.shape[2]
+    exact, stiffness = (
+        -mine.reshape(n * d, p).T @ (blocks @ its).reshape(n * d, p) for blocks in (found.exact, found.stiffness)
+    )
+    turned[:, :, :d], turned[:, :, d:] = 0.0, turning(-found.normal)
+    return np.asarray(exact + mine.reshape(n * d, p).T @ turned.reshape(n * d, p)), np.asarray(stiffness)
+
+
 def of_points(energy: float, gradient: Values, exact: csr_matrix, stiff: csr_matrix, arm: Values) -> Push:
     """Of all points that the body carries, with arms (m, d): derivatives (m, d) of the energy by them, and second ones
     (m d, m d), exact and positive semi-definite."""

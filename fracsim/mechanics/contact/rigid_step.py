@@ -25,12 +25,8 @@ from ..blow import given
 from .free_obstacle import Flight, FreeObstacle
 from .pose import Pose, Values
 from .push import Push
+from .together import Pushes, Together
 from .turn import bend, jacobian
-
-ITERATIONS = 100
-SMALL = 1e-18  # share of the energies at play: Newton's decrement where z is found
-ROUND_OFF = 1e-13  # share of the energies at play by which Phi may be wrong
-SHORTEST = 1e-12  # share of a step of Newton's method
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,25 +139,10 @@ class RigidStep:
 
         `contact`: z -> Push, of all ranks.    `free`: share of the way from z by dz on which no gap closes.
         """
-        now, weight = contact(z), self.factor * self.share**2
-        height = self.own(z) + weight * now.energy
-        for _ in range(ITERATIONS):
-            gradient, hessian, stiffness = self.system(z, now)
-            dz: Values = np.asarray(-_solved(hessian, stiffness, gradient) / self.share)
-            decrement, at_play = -self.share * float(gradient @ dz), self.scale(z) + weight * now.energy
-            if not decrement > SMALL * at_play:
-                break
-            step, slack = free(z, dz), ROUND_OFF * (at_play + abs(height))
-            while step > SHORTEST:
-                there = contact(z + step * dz)
-                level = self.own(z + step * dz) + weight * there.energy
-                if level <= height - 1e-4 * step * decrement + slack:
-                    break
-                step /= 2
-            else:
-                break
-            z, now, height = z + step * dz, there, level
-        return z, now
+        found, now = Together([self]).settle(
+            [z], lambda ways: Pushes([contact(ways[0])]), lambda ways, changes: free(ways[0], changes[0])
+        )
+        return found[0], now.each[0]
 
     def arrived(self, z: Values, force: Values) -> Flight:
         """How it moves at the end, which is at z, with force and moment (p,) of the body on it there, N and N m."""
@@ -177,16 +158,6 @@ class RigidStep:
         if pose.dim == 2:
             return self.start.turned + self.increment(z)[2:]
         return pose.turned()
-
-
-def _solved(hessian: Values, stiffness: Values, gradient: Values) -> Values:
-    """H^-1 g with H the Hessian where that is positive definite, else the stiffness."""
-    with np.errstate(all="ignore"):
-        try:
-            np.linalg.cholesky(hessian)
-        except np.linalg.LinAlgError:
-            hessian = stiffness
-        return _over(hessian, gradient)
 
 
 def _over(matrix: Values, values: Values) -> Values:

@@ -20,7 +20,6 @@ from .law import Repulsion
 from .obstacle import Obstacle
 from .placed import Placed
 from .pose import Pose, turned
-from .reach import safe_shares
 from .shape import Shape
 from .skeleton import Grown, Skeleton, skeleton
 from .solids.solid import Solid
@@ -73,23 +72,22 @@ class Stop:
             for (x, placed), area, gap in zip(self.sides(body, other), self.areas, begun, strict=True)
         ]
 
-    def safe_share(self, body: Pose, q: Values, other: Pose, shift: Values) -> float:
-        """Share of the ways q (p,) of the body and `shift` (d,) of the other one that leaves a tenth of each gap."""
+    def safe_share(self, body: Pose, q: Values, other: Pose, its: Values) -> float:
+        """Share of the ways q and `its` (p,) of the body and the other one that leaves a tenth of each gap."""
         (x, there), (y, here) = self.sides(body, other)
-        way = _Way(there, x - body.centre, body.centre, q, shift)
-        back = safe_shares(here, y, np.tile(shift, (len(y), 1)), q)
-        return min(way.safe_share(), float(back.min(initial=1.0)))
+        ways = [_Way(there, x - body.centre, body.centre, q, its), _Way(here, y - other.centre, other.centre, its, q)]
+        return min(way.safe_share() for way in ways)
 
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """Points go with a body, arms (n, d) about its centre, by q (p,), and an obstacle before them by `shift` (d,)."""
+    """Points go with a body, arms (n, d) about its centre, by q (p,), and an obstacle before them by `its` (p,)."""
 
     obstacle: Placed
     arm: Values
     centre: Values
     q: Values
-    shift: Values
+    its: Values
 
     def safe_share(self) -> float:
         """Of the way, that leaves a tenth of each gap; 0 where one is closed."""
@@ -101,19 +99,25 @@ class _Way:
 
     def gap(self, share: Values) -> Values:
         """(n,) after shares (n,) of the way, m."""
-        return self.obstacle.distance(self._at(share))
+        return self.obstacle.shape.distance(self._seen(share))
 
     def speed(self, share: Values) -> Values:
-        """(n,) bounds of how fast gaps close, m per whole way (motion.Motion)."""
-        straight, turn = self._straight(), self.q[len(self.shift) :]
+        """(n,) bounds of how fast gaps close, m per whole way (motion.Motion); a turn of the obstacle closes them by no
+        more than its size times the points' distance from its centre."""
+        d, arm = len(self.centre), np.linalg.norm(self.arm, axis=1)
+        straight, turn, turned_ = self.q[:d] - self.its[:d], np.linalg.norm(self.q[d:]), np.linalg.norm(self.its[d:])
         closing: Values = np.full(len(self.arm), float(np.linalg.norm(straight)))
         if self.obstacle.shape.convex:
-            closing = np.maximum(-self.obstacle.normal(self._at(share)) @ straight, 0.0)
-        return np.asarray(closing + np.linalg.norm(turn) * np.linalg.norm(self.arm, axis=1))
+            v = self._turned(np.tile(straight, (len(self.arm), 1)), share)
+            closing = np.maximum(-np.einsum("ni,ni->n", self.obstacle.shape.normal(self._seen(share)), v), 0.0)
+        away = np.linalg.norm(self.centre - self.obstacle.pose.centre) + np.linalg.norm(straight) + arm
+        return np.asarray(closing + turn * arm + turned_ * away)
 
-    def _straight(self) -> Values:
-        return self.q[: len(self.shift)] - self.shift
+    def _seen(self, share: Values) -> Values:
+        """(n, d) the points in the frame of the obstacle."""
+        d = len(self.centre)
+        along = share[:, None] * (self.q[:d] - self.its[:d]) + turned(self.arm, share[:, None] * self.q[d:])
+        return self._turned(self.centre - self.obstacle.pose.centre + along, share)
 
-    def _at(self, share: Values) -> Values:
-        turn = share[:, None] * self.q[len(self.shift) :]
-        return np.asarray(self.centre + share[:, None] * self._straight() + turned(self.arm, turn))
+    def _turned(self, vectors: Values, share: Values) -> Values:
+        return np.asarray(turned(vectors, -share[:, None] * self.its[len(self.centre) :]) @ self.obstacle.pose.rotation)

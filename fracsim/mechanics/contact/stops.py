@@ -41,8 +41,7 @@ class Stops:
 
     def safe_share(self, pose: Pose, q: Values, ways: dict[int, Going]) -> float:
         """Share of its way q (p,) that closes no gap, where others are and go by their numbers."""
-        d = pose.dim
-        shares = [stop.safe_share(pose, q, ways[n][0].pose, ways[n][1][:d]) for n, stop in self._each.items()]
+        shares = [stop.safe_share(pose, q, ways[n][0].pose, ways[n][1]) for n, stop in self._each.items()]
         return min(shares, default=1.0)
 
     def push(self, pose: Pose, placed: Places) -> Push:

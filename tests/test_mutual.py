@@ -1,0 +1,129 @@
+"""Free obstacles that meet one another: derivatives by differences, momentum, no way through, piles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fracsim.mechanics.contact.barrier import Barrier
+from fracsim.mechanics.contact.free_obstacles import FreeObstacles
+from fracsim.mechanics.contact.obstacle import Obstacle
+from fracsim.mechanics.contact.pose import Pose
+from fracsim.mechanics.contact.push import between_two
+from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from fracsim.mechanics.contact.stop import Stop
+from support.scenes import Scene, Walk, each_step, make_scene, march
+
+Values = npt.NDArray[np.float64]
+SCHEMES = ("backward-euler", "newmark", "generalized-alpha")
+G = 10.0
+
+BESIDE: list[tuple[Shape, Shape]] = [
+    (Sphere(0.3), Box((0.6, 0.4, 0.5), rounding=0.05)),
+    (Cylinder(0.2, 0.5, rounding=0.05), Capsule(0.1, 0.5, axis=(1.0, 0.0, 0.0))),
+    (Box((0.6, 0.4), rounding=0.05), Box((0.5, 0.3), rounding=0.05)),
+]
+
+
+@pytest.mark.parametrize("both", BESIDE, ids=lambda both: "-".join(type(each).__name__ for each in both))
+def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
+    """Second derivative of the energy by an increment of one pose and of the other, by differences."""
+    d, turns = both[0].dim, 1 if both[0].dim == 2 else 3
+    one, other = (Obstacle(name, shape, np.zeros(d)) for name, shape in zip("ab", both, strict=True))
+    stop, barrier = Stop.of(one, other), Barrier(50.0, 0.2)
+    here = Pose.at(np.array([0.05, 0.03, 1.0][3 - d :])).moved(np.concatenate([np.zeros(d), 0.1 * np.ones(turns)]))
+    there = Pose.at(np.zeros(d)).moved(np.concatenate([np.zeros(d), np.linspace(-0.1, 0.1, turns)]))
+    apart = min(gap.min() for gap in stop.gaps(here, there))
+    here = here.moved(np.eye(d + turns)[d - 1] * (0.05 - apart))
+
+    def energy(q: Values, p: Values) -> float:
+        return sum(touch.potential for touch, _ in stop.touches(here.moved(q), there.moved(p), barrier, None))
+
+    (own, x), (its, y) = stop.touches(here, there, barrier, None)
+    found = between_two(own, x, here, there)[0] + between_two(its, y, there, here)[0].T
+    steps, assembled = 1e-4 * np.eye(d + turns), np.zeros_like(found)
+    for i, q in enumerate(steps):
+        for j, p in enumerate(steps):
+            assembled[i, j] = (energy(q, p) - energy(q, -p) - energy(-q, p) + energy(-q, -p)) / 4e-8
+    assert energy(0 * steps[0], 0 * steps[0]) > 1e-4
+    np.testing.assert_allclose(found, assembled, atol=2e-5 * np.abs(assembled).max())
+
+
+def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Scene, Walk, FreeObstacles]:
+    """A block from 0 to 1 in x, up to 0.3, that is held below, and obstacles."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.3] if dim == 2 else [1.0, 1.0, 0.3], "h": 0.3},
+        material={"energy": "neo-hookean", "young": 1e5, "poisson": 0.3, "density": 100.0},
+        boundary=[{"on": "bottom", "fix": "xyz"[:dim]}], solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
+        obstacle=list(obstacles), **more,
+    )  # fmt: skip
+    (term,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacles)]
+    return scene, state, term
+
+
+def gap(term: FreeObstacles) -> float:
+    """The least between free obstacles, m."""
+    assert term._mutual is not None
+    at = [each.flight.pose for each in term.free.values()]
+    return min(float(g.min(initial=9.0)) for (i, j), s in term._mutual._stops.items() for g in s.gaps(at[i], at[j]))
+
+
+def linear(term: FreeObstacles) -> Values:
+    """(d,) momentum of the free obstacles, kg m/s."""
+    return np.asarray(sum(each.flight.momentum[: term._domain.dim] for each in term.free.values()))
+
+
+def disk(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
+    return {"name": name, "shape": "sphere", "radius": 0.1, "at": [x, y], "mass": 5.0} | more
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_two_disks_share_their_momentum(scheme: str) -> None:
+    """Off centre, far from the body: none enters the other, momentum stays to round-off, energy does not grow, and
+    they part; without friction none is turned."""
+    scene, state, term = scene_of(
+        disk("it", 3.0, 0.5, velocity=[1.0, 0.0]),
+        disk("other", 3.3, 0.55),
+        time={"scheme": scheme, "step": 0.01, "end": 0.3},
+    )
+    for report in each_step(scene, state):
+        np.testing.assert_allclose(linear(term), [5.0, 0.0], atol=1e-12)
+        assert gap(term) > 0 and report.kinetic + report.elastic <= 2.5 * (1 + 1e-9)
+    first, second = (each.flight.momentum / 5.0 for each in term.free.values())
+    n = np.array([np.sqrt(0.2**2 - 0.05**2), 0.05]) / 0.2  # where they met
+    assert 0 < second[:2] @ n - first[:2] @ n <= n[0]
+    assert second[0] > 0.4 and abs(second[1] / second[0] - n[1] / n[0]) < 0.1
+    assert abs(first[2]) < 1e-9 and abs(second[2]) < 1e-9
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_fast_ones_do_not_pass_through_each_other(dim: int) -> None:
+    """A plate and a small ball at 100 m/s that would cross it in a tenth of the step: it pushes the plate on."""
+    tail = [0.5] * (dim - 2)
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.02, "at": [3.0, *tail, 0.5], "mass": 1.0,
+            "velocity": [100.0, *[0.0] * (dim - 1)]}  # fmt: skip
+    box = {"name": "box", "shape": "box", "size": [0.1, *[3.0] * (dim - 1)], "at": [3.3, *tail, 0.52], "mass": 10.0}
+    scene, state, term = scene_of(ball, box, dim=dim, time={"scheme": "backward-euler", "step": 0.01, "end": 0.05})
+    for _ in each_step(scene, state):
+        np.testing.assert_allclose(linear(term), [100.0, *[0.0] * (dim - 1)], atol=1e-10)
+        assert gap(term) > 0
+    one, other = (each.flight.pose.centre[0] for each in term.free.values())
+    assert one < other and term.free[1].flight.momentum[0] > 50
+
+
+def test_a_pile_on_a_body_weighs_what_it_weighs() -> None:
+    """A disk on a box on a damped body, guided: at rest the body carries both, and each bears what lies on it."""
+    box = {"name": "box", "shape": "box", "size": [0.5, 0.1], "at": [0.5, 0.37], "mass": 8.0, "guide": "y"}
+    scene, state, term = scene_of(
+        box, disk("it", 0.5, 0.54, guide="y"), load={"gravity": [0.0, -G]}, damping={"stiffness": 0.02},
+        time={"scheme": "backward-euler", "step": 0.05, "end": 0.8},
+    )  # fmt: skip
+    march(scene, state)
+    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    assert told["contact_box_y"] == pytest.approx(13.0 * G, rel=1e-3) and told["contact_it_y"] == 0.0
+    assert term._mutual is not None
+    assert [force[1] for force in term._mutual.forces().values()] == pytest.approx([-5.0 * G, 5.0 * G], rel=1e-3)
+    assert max(abs(told[f"velocity_{name}_y"]) for name in ("box", "it")) < 1e-3
