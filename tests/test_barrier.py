@@ -16,6 +16,7 @@ from fracsim.mechanics.contact.friction import Friction, tangential
 from fracsim.mechanics.contact.motion import Motion
 from fracsim.mechanics.contact.placed import Placed
 from fracsim.mechanics.contact.pose import Pose
+from fracsim.mechanics.contact.reach import safe_shares
 from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
 from fracsim.mechanics.contact.touch import touch
 from support.laws import rotation
@@ -258,3 +259,15 @@ def test_no_slip_no_force() -> None:
     n, rest = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3))
     np.testing.assert_array_equal(FRICTION.gradient(np.ones(1), n, rest), 0)
     np.testing.assert_allclose(FRICTION.hessian(np.ones(1), n, rest)[0], np.diag([800.0, 800.0, 0.0]))
+
+
+def test_a_turn_of_a_ball_is_no_bound() -> None:
+    """Past a ball points may go as far however fast it spins, on and beside their facets; of a box that spins less."""
+    x, moved = np.array([[0.0, 0.12], [0.3, 0.12], [0.15, 0.4]]), np.array([[0.0, -0.01]] * 3)
+    facets = Facets(np.array([[0, 1], [1, 2]]), np.array([0.3, 0.3]), 1e-4)
+    shares = {}
+    for name, shape in (("ball", Sphere(0.1, dim=2)), ("box", Box((0.2, 0.2), rounding=0.02))):
+        placed = Placed(shape, Pose.at(np.zeros(2)))
+        shares[name] = [safe_shares(placed, x, moved, np.array([0.0, 0.0, turn]), facets) for turn in (0.0, 3.0)]
+    np.testing.assert_array_equal(shares["ball"][0], shares["ball"][1])
+    assert (shares["ball"][1] == 1).all() and shares["box"][1][0] < shares["box"][0][0] == 1

@@ -77,6 +77,11 @@ class Sphere(_Swept):
         if self.dim not in (2, 3):
             raise InputError(f"a sphere in {self.dim} dimensions is not known: dim is 2 or 3")
 
+    @property
+    def round(self) -> bool:
+        """It is."""
+        return True
+
     def _core(self) -> tuple[Values, float, float]:
         return np.eye(self.dim)[-1], 0.0, self.radius
 

@@ -31,6 +31,12 @@ class Placed:
     shape: Shape
     pose: Pose
 
+    def felt(self, q: Values) -> Values:
+        """(p,) what gaps feel of an increment of the pose: no turn of what is round."""
+        if not self.shape.round:
+            return q
+        return np.concatenate([q[: self.pose.dim], 0 * q[self.pose.dim :]])
+
     def distance(self, x: Values) -> Values:
         """(n,) signed distance, m."""
         return self.shape.distance(self.pose.to_body(x))

@@ -35,6 +35,11 @@ class Plane:
         return True
 
     @property
+    def round(self) -> bool:
+        """It is not."""
+        return False
+
+    @property
     def least_radius(self) -> float:
         """Infinite."""
         return float("inf")

@@ -26,7 +26,7 @@ ROUNDS = 20  # in which points that follow several nodes are brought back
 def safe_shares(placed: Placed, x: Values, moved: Values, q: Values, facets: Facets | None = None) -> Values:
     """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
     moves by q meanwhile, and of those of their `facets`; 0 where the gap is closed already."""
-    turn = q[placed.pose.dim :]
+    turn = (q := placed.felt(q))[placed.pose.dim :]
     relative = moved - q[: placed.pose.dim]
     reach, swept = np.linalg.norm(relative, axis=1), None
     if turn.any():

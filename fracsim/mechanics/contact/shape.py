@@ -29,6 +29,10 @@ class Shape(Protocol):
         """Whether the obstacle is convex, and so the distance a convex function."""
 
     @property
+    def round(self) -> bool:
+        """Whether no turn about its reference point changes it."""
+
+    @property
     def least_radius(self) -> float:
         """Least radius of curvature of its surface where that is convex, m; infinite where it nowhere is."""
 
@@ -84,6 +88,11 @@ class Body(ABC):
         """Closed surface or polygon; that of a hollow body faces inwards."""
         points, elements = self._outline()
         return points, np.ascontiguousarray(elements[:, ::-1]) if self.hollow else elements
+
+    @property
+    def round(self) -> bool:
+        """A ball alone is."""
+        return False
 
     @property
     def least_radius(self) -> float:

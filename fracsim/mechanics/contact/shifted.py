@@ -28,6 +28,11 @@ class Shifted:
         return self.shape.convex
 
     @property
+    def round(self) -> bool:
+        """Not about a point elsewhere."""
+        return False
+
+    @property
     def least_radius(self) -> float:
         """That of the shape."""
         return self.shape.least_radius

@@ -45,6 +45,11 @@ class Grown:
         """As the shape is."""
         return self.shape.convex
 
+    @property
+    def round(self) -> bool:
+        """As the shape is."""
+        return self.shape.round
+
     def distance(self, x: Values) -> Values:
         """(n,) m."""
         return self.shape.distance(x) - self.by

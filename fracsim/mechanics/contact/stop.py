@@ -75,7 +75,10 @@ class Stop:
     def safe_share(self, body: Pose, q: Values, other: Pose, its: Values) -> float:
         """Share of the ways q and `its` (p,) of the body and the other one that leaves a tenth of each gap."""
         (x, there), (y, here) = self.sides(body, other)
-        ways = [_Way(there, x - body.centre, body.centre, q, its), _Way(here, y - other.centre, other.centre, its, q)]
+        ways = [
+            _Way(there, x - body.centre, body.centre, q, there.felt(its)),
+            _Way(here, y - other.centre, other.centre, its, here.felt(q)),
+        ]
         return min(way.safe_share() for way in ways)
 
 

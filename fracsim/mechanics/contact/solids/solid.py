@@ -26,6 +26,7 @@ class Solid:
     triangles: Ints
     dim: int = 3
     convex: bool = False
+    round: bool = False
     least_radius: float = 0.0
 
     def outline(self) -> Outline:
