@@ -216,15 +216,19 @@ def test_gaps_and_work_are_those_of_the_nodes_and_of_the_force(tmp_path: Path) -
 # --- friction -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("facets", [False, True])
 @pytest.mark.parametrize(("share", "sticks"), [(1.1, True), (0.9, False)])
-def test_a_block_on_a_slope(share: float, sticks: bool) -> None:
+def test_a_block_on_a_slope(share: float, sticks: bool, facets: bool) -> None:
     """tan(theta) = 0.5 and mu = `share` of it: it stays, or slides with g (sin - mu cos); gravity is turned, not the
-    slope. It is laid on without a drop, and left to settle a little before anything is measured."""
+    slope. It is laid on without a drop, and left to settle a little before anything is measured. The slope is a plane,
+    or the side of a box that facets feel, too."""
+    box = {"shape": "box", "size": [2.0, 0.5], "at": [0.75, -0.2595], "rounding": 0.02, "normal": None}
     slope, steps = 0.5, 40
     down = np.array([slope, -1.0]) / np.hypot(1, slope) * G
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT | {"young": 1e6},
-        load={"gravity": down.tolist()}, damping={"stiffness": 0.01}, obstacle=[floor(-0.0095, friction=share * slope)],
+        load={"gravity": down.tolist()}, damping={"stiffness": 0.01},
+        obstacle=[floor(-0.0095, friction=share * slope) | (box if facets else {})],
         contact={"distance": 0.01, "creep": 1e-3}, solver=FINE,
         time={"scheme": "backward-euler", "step": 0.01, "end": steps * 0.01},
     )  # fmt: skip
@@ -236,6 +240,44 @@ def test_a_block_on_a_slope(share: float, sticks: bool) -> None:
         assert abs(after) < 1.5e-3
     else:
         assert (after - before) / (steps / 2 * 0.01) == pytest.approx(down[0] + share * slope * down[1], rel=0.05)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_friction_acts_between_corners(dim: int) -> None:
+    """A ball of a tenth of a facet pressed into the middle of one and dragged over it: what it is held back by is mu
+    times what it presses with (8 %: as it ploughs on what it presses is not quite upright)."""
+    way = [[0.0] * dim, [*[0.0] * (dim - 1), -0.04], [0.1, *[0.0] * (dim - 2), -0.04]]
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 0.5}, material=SOFT | {"poisson": 0.0}, solver=FINE,
+        boundary=[{"on": "bottom", "fix": "xyz"[:dim]}], contact={"itself": False, "creep": 1e-4},
+        obstacle=[{"name": "it", "shape": "sphere", "radius": 0.05, "at": [*[0.33, 0.17][3 - dim :], 1.06],
+                   "displacement": {"time": [0.0, 0.1, 0.6], "value": way}, "friction": 0.3}],
+        time={"scheme": "backward-euler", "step": 0.05, "end": 0.35},
+    )  # fmt: skip
+    march(scene, state)
+    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    *across, pressed = (told[f"contact_it_{axis}"] for axis in "xyz"[:dim])
+    assert pressed > 50 and across[0] < 0 and np.linalg.norm(across) == pytest.approx(0.3 * pressed, rel=0.08)
+
+
+def test_a_ball_that_spins_is_driven_off_by_what_it_presses() -> None:
+    """A free disk that is smaller than a facet dropped on its middle, spinning so fast that it slides all along: mu
+    times the momentum that stops it drives it aside (2 %) and slows its spin, and that of both stays what it was."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT | {"poisson": 0.0}, solver=FINE,
+        obstacle=[{"name": "it", "shape": "sphere", "radius": 0.05, "at": [0.25, 1.08], "mass": 0.5, "friction": 0.2,
+                   "velocity": [0.0, -1.0], "spin": [60.0]}],
+        time={"scheme": "backward-euler", "step": 4e-3, "end": 0.044},
+    )  # fmt: skip
+    march(scene, state)
+    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    given = 0.5 * (told["velocity_it_y"] + 1.0)
+    assert given > 0.5 and 0.5 * told["velocity_it_x"] == pytest.approx(-0.2 * given, rel=0.02)
+    both = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
+    both += 0.5 * np.array([told["velocity_it_x"], told["velocity_it_y"]])
+    np.testing.assert_allclose(both, [0.0, -0.5], atol=1e-8)
+    arm = 0.5 * 0.5 * 0.05**2 * (60.0 - told["spin_it_z"]) / (0.2 * given)
+    assert 0.05 < arm < 0.05 + 0.025  # friction acts a gap away from it
 
 
 # --- speed, geometry, refusals --------------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ class FreePose:
     def under(self, held: Grip, placed: Placed) -> Values:
         """(k, d) way in the step of what is under the points that friction holds, m, with the obstacle at `placed`."""
         then = self.step.start.pose
-        return placed.pose.points_to_space(then.to_body(held.start)) - held.start
+        return placed.pose.points_to_space(then.to_body(held.under)) - held.under
 
     # --- where it is ---
 

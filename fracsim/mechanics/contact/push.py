@@ -52,7 +52,7 @@ def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) ->
     total = np.einsum("ndp,nd->p", J, gradient)
     if held is not None and len(held.points):
         arm = arm.copy()
-        arm[np.searchsorted(found.points, held.points)] = (held.start - start.centre) @ (
+        arm[np.searchsorted(found.points, held.points)] = (held.under - start.centre) @ (
             pose.rotation @ start.rotation.T
         ).T
         J = _by_pose(arm)

@@ -28,12 +28,14 @@ class Grip:
 
     Attributes:
         points: (k,) of the surface.    force: (k,) normal force, N.    normal: (k, d).    start: (k, d) places, m.
+        under: (k, d) places that the obstacle presses at, m.
     """
 
     points: Ints
     force: Values
     normal: Values
     start: Values
+    under: Values
 
 
 class Jointly(Protocol):
@@ -95,7 +97,7 @@ class Touch:
 def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Repulsion) -> Grip:
     """Normal forces at places x (n, d) of the start of a step, with gaps (n,), m."""
     near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
-    return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near])
+    return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near], x[near])
 
 
 def touch(

@@ -16,6 +16,7 @@ from .bent import Start
 from .course import Course
 from .facets import Facets, between, matters
 from .friction import Friction
+from .gripped import gripped_between
 from .joined import joined
 from .law import Law
 from .obstacle import Obstacle
@@ -129,7 +130,6 @@ class Touching:
         x = self.skin.places(self._level.u)
         gaps = [placed.distance(x) for placed in at]
         held = [grip(x, gap, self.skin.area, placed, self.law.barrier) for gap, placed in zip(gaps, at, strict=True)]
-        self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
         if self._level.blow.along:
             self._begun = [
                 Start(gap, each.points, each.normal, each.start) for gap, each in zip(gaps, held, strict=True)
@@ -138,6 +138,9 @@ class Touching:
         for number in self._sharp:
             found, _ = between(self.skin.facets, at[number], x, self.law.barrier)
             self._pushed[number] = self._pushed[number] + found.forces.sum(axis=(0, 1))
+            if self.obstacles[number].friction:
+                held[number] = gripped_between(held[number], found, x)
+        self._grips = [each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)]
         self._began = x
 
     def _forget_start(self) -> None:
