@@ -172,5 +172,38 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     time = {"scheme": "explicit", "step": 0.05, "end": 1.0}
     tables: dict[str, Any] = RUNS["rammed"] | {"output": {"picture": False, "interval": 1.0}, "time": time}
     going, stopped, again = going_stopped_resumed(tables, tmp_path, 20, 4)
-    assert stopped.breaks.figures[0] > 0
+    assert stopped > 0
     assert_alike(again, going, 1e-9)
+
+
+def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two blocks that fly at each other, and meet: few steps before look for anything, and all numbers are those of a
+    run that looks in every step."""
+    ends, looks = [], []
+    for always in (False, True):
+        if always:
+            monkeypatch.setattr(ExplicitSelfContact, "_look", lambda self: None)
+        scene, state = make_scene(
+            mesh={"file": two_blocks(tmp_path, 2, 0.1)}, material=SOFT, contact={},
+            time={"scheme": "explicit", "step": 0.02, "end": 0.6},
+        )  # fmt: skip
+        contact, _ = contact_of(scene)
+        X, gathered, m = positions(scene), contact._gathered, scene.balance.mass.lumped.reshape(-1, 2)
+        v = np.zeros_like(X)
+        v[X[:, 0] < 1.01, 0] = 0.2
+        state.v = v.reshape(-1)
+        state.settle()
+        count = [0]
+
+        def counted(u: Values, gathered: Any = gathered, count: list[int] = count) -> Values | None:
+            count[0] += 1
+            return gathered(u)
+
+        monkeypatch.setattr(contact, "_gathered", counted)
+        march(scene, state, 10)
+        looks.append(count[0])
+        march(scene, state)
+        ends.append(np.concatenate([state.u, state.v]))
+        assert (m * state.v.reshape(-1, 2))[X[:, 0] > 1.01, 0].sum() > 0.02  # they have met
+    np.testing.assert_array_equal(*ends)
+    assert abs(ends[0][: len(ends[0]) // 2]).max() > 0.1 and looks[0] < looks[1] / 2

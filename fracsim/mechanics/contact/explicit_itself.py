@@ -11,11 +11,13 @@ from typing import ClassVar, cast
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from ...mesh.domain import Domain
 from ...mesh.ranks import from_root, on_root
 from ...mesh.split.identity import found_again
 from ...mesh.split.skeleton import Skeleton
+from ..term import Level
 from .crowd import Law, Surface
 from .itself import SelfContact
 from .pairs import areas
@@ -23,6 +25,9 @@ from .pushing import NONE, Pushing, rates
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+
+
+type _Idle = tuple[Values | None, float, int]
 
 
 class Pushes(Surface):
@@ -77,6 +82,11 @@ class ExplicitSelfContact(SelfContact):
     """A body that explicit steps keep apart from itself."""
 
     _surface: Pushes | None
+    # displacements (owned dofs,) where nothing was near, m; None: something was; and how far from there nothing is, m
+    _since: Values | None = None
+    _room = 0.0
+    _age = 0  # surfaces that there have been
+    _idle: bool | None = None  # at the current u; None: not known yet
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law, mass: Values, most: float) -> None:
         """`mass`: (owned dofs,) lumped, kg; `most`: what contact may add to the square of the highest frequency, 1/s^2.
@@ -91,8 +101,72 @@ class ExplicitSelfContact(SelfContact):
         assert self._skeleton is not None and self._mass is not None
         return Pushes(self._skeleton, pattern, self.law, u, self._surface, self._mass, self._most)
 
+    # --- where nothing is near, nothing is gathered until nodes have gone far enough to change that ---
+
+    def begin(self, level: Level) -> None:
+        """As of SelfContact."""
+        if not self._is_idle():
+            return super().begin(level)
+        self._level, self._moved, self._idle = level, True, None
+
+    def displaced(self) -> None:
+        """What touches has to be found anew."""
+        super().displaced()
+        self._idle = None
+
+    def _is_idle(self) -> bool:
+        """Whether nothing can be in touch with the body where it is (collective)."""
+        if self._idle is None:
+            self._idle = self._since is not None and self._gone(self._since) <= self._room
+        return self._idle
+
+    def _gone(self, since: Values) -> float:
+        """m, by how much any two nodes may have come closer: the diagonal of a box around their ways (collective)."""
+        way = (self._u.x.array[: self._owned] - since).reshape(-1, self._domain.dim)
+        ends = np.concatenate([way.min(axis=0, initial=np.inf), -way.max(axis=0, initial=-np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
+        return float(np.linalg.norm(ends.reshape(2, -1).sum(axis=0)))
+
+    def _look(self) -> None:
+        """Note by how much nodes may come closer from here on before anything is near (collective)."""
+        x = self._places()
+
+        def room() -> float:
+            assert self._surface is not None and x is not None
+            share, out, _ = self._surface.memory()
+            if len(out) or np.any(share < 1):
+                return 0.0
+            return self._surface.pairs.room(x) / float(abs(self._surface.at.weights).sum(axis=1).max())
+
+        self._room = from_root(self.comm, room)
+        self._since = self._u.x.array[: self._owned].copy() if self._room else None
+
+    def _rebuild(self) -> None:
+        self._since, self._idle, self._age = None, None, self._age + 1
+        super()._rebuild()
+
+    # --- what it adds to the balance ---
+
+    def struck(self) -> Values | None:  # type: ignore[override]
+        """(owned dofs,) forces at the end of the step, N; None: nothing is near (collective)."""
+        if self._is_idle():
+            return None
+        forces = super().struck()
+        self._look()
+        return forces
+
+    def scale(self) -> Values | None:  # type: ignore[override]
+        """(owned dofs,) the same as they enter r, N (collective)."""
+        return None if self._is_idle() else super().scale()
+
+    def stored(self) -> float:
+        """Energy of the penalty at the current u, on rank 0, J (collective)."""
+        return 0.0 if self._is_idle() else super().stored()
+
     def frequency(self) -> float:
         """What contact adds at most, were all points in touch that are near, 1/s^2 (collective)."""
+        if self._is_idle():
+            return 0.0
         x = self._places()
 
         def found() -> float:
@@ -103,6 +177,8 @@ class ExplicitSelfContact(SelfContact):
 
     def arrive(self) -> None:
         """The step is over: what is pushed is known from here on (collective)."""
+        if self._is_idle():
+            return
         x = self._places()
 
         def noted() -> None:
@@ -113,14 +189,19 @@ class ExplicitSelfContact(SelfContact):
 
     def memory(self) -> object:
         """With what is pushed."""
-        return super().memory(), self._surface and (self._surface.pairs.by, self._surface.pairs.held)
+        pushed = self._surface and (self._surface.pairs.by, self._surface.pairs.held)
+        return super().memory(), pushed, (self._since, self._room, self._age)
 
     def recall(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
-        surface, pushed = cast("tuple[object, tuple[Ints, Values] | None]", memory)
+        surface, pushed, idle = cast("tuple[object, tuple[Ints, Values] | None, _Idle]", memory)
         super().recall(surface)
-        if self._surface is not None and pushed is not None:
+        if self._surface is not None and pushed is not None and pushed[1] is not self._surface.pairs.held:
             self._surface.pairs.hold(*pushed)
+        self._since, self._room, age = idle
+        if age != self._age:  # edges have broken since: it is another surface
+            self._since = None
+        self._idle = None
 
     def saved(self) -> dict[str, Values]:
         """With the facets that push points."""
@@ -131,6 +212,7 @@ class ExplicitSelfContact(SelfContact):
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
+        self._since = self._idle = None
         super().restore(saved)
         if self._surface is not None and "by" in saved:
             self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"])

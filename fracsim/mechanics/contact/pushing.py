@@ -116,6 +116,11 @@ class Pushing(Pairs):
         load = size.T @ (near.rate * np.asarray(size.sum(axis=1)).ravel())
         return float((load / mass).max(initial=0.0))
 
+    def room(self, x: Values) -> float:
+        """By how much any two points at x (n, d) may come closer before a look is due, m: 0 unless none are near."""
+        idle = not self.held.any() and not len(self._may_meet(x))
+        return (FARTHEST - AHEAD) * self._width if idle else 0.0
+
     def _met(self, x: Values) -> Pushed:
         """What is pushed."""
         if self._met_at is None or self._met_at[0] is not self._facing(x):
