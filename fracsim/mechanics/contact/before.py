@@ -43,6 +43,12 @@ def nearer(x: Values, points: Ints, corners: Ints, reach: float) -> Flags:
     return np.asarray(np.einsum("kd,kd->k", way, way) < reach**2)
 
 
+def nearest(x: Values, points: Ints, corners: Ints, most: float) -> float:
+    """The least of points to facets (k, d), `most` at most, m, with points at x (n, d)."""
+    _, way = _nearest(x, points, corners)
+    return min(most, float(np.linalg.norm(way, axis=1).min(initial=most)))
+
+
 def before(x: Values, points: Ints, corners: Ints, reach: float, alike: float) -> Before:
     """Those nearer than `reach`, m, one facet for each place: of facets that share it, at distances `alike` but
     for so many m, the one that looks most towards the point or away from it, which tells the side."""

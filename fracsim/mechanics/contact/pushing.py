@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .before import Before, before, nearer
+from .before import Before, before, nearer, nearest
 from .carried import SOME
 from .near import Kind, Near, centred, longest
 from .pairs import Pairs
@@ -33,6 +33,7 @@ FARTHEST = 3.0  # distances D: gaps that are looked at; what is deeper has gone 
 MARGIN = 1.0  # distances D: how far points may go before candidates are looked for again
 ALIKE = 1e-9  # of the mean edge: distances to the same place, by several facets
 LITTLE = 1e-3  # share of a corner that takes nothing worth speaking of
+SEEN = 10.0  # distances D: gaps that are looked for where nothing is within reach
 AHEAD = 2.0  # distances D: gaps of points that may be pushed a step later
 NONE = -1  # corners of facets that push nothing
 
@@ -118,8 +119,12 @@ class Pushing(Pairs):
 
     def room(self, x: Values) -> float:
         """By how much any two points at x (n, d) may come closer before a look is due, m: 0 unless none are near."""
-        idle = not self.held.any() and not len(self._may_meet(x))
-        return (FARTHEST - AHEAD) * self._width if idle else 0.0
+        if self.held.any() or len(self._may_meet(x)):
+            return 0.0
+        on, found, reach = centred(self._mesh.vertices(x)), ipctk.Candidates(), SEEN * self._width
+        found.build(self._mesh, on, on, reach / 2, ipctk.LBVH())
+        points, facets = self._numbers(found).T
+        return max(0.0, nearest(x, points, self._elements[facets], reach) - AHEAD * self._width)
 
     def _met(self, x: Values) -> Pushed:
         """What is pushed."""
@@ -160,17 +165,21 @@ class Pushing(Pairs):
         (found,) = self._near.candidates(on)
         here = centred(on)
         if found is not self._found:
-            solid = x.shape[1] == 3
-            ids = [(each.vertex_id, each.face_id) for each in found.fv_candidates] if solid else \
-                  [(each.vertex_id, each.edge_id) for each in found.ev_candidates]  # fmt: skip
-            pairs = np.array(ids, np.int64).reshape(-1, 2)
-            self._found, self._every = found, np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
+            self._found, self._every = found, self._numbers(found)
         elif longest(here - self._from) <= MARGIN * self._width:
             return self._some
         points, facets = self._every.T
         reach = (FARTHEST + 2 * MARGIN) * self._width
         self._some, self._from = self._every[nearer(x, points, self._elements[facets], reach)], here
         return self._some
+
+    def _numbers(self, found: ipctk.Candidates) -> Ints:
+        """(k, 2) points and facets of ipctk's candidates."""
+        solid = self.by.shape[1] == 3
+        ids = [(each.vertex_id, each.face_id) for each in found.fv_candidates] if solid else \
+              [(each.vertex_id, each.edge_id) for each in found.ev_candidates]  # fmt: skip
+        pairs = np.array(ids, np.int64).reshape(-1, 2)
+        return np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
 
 
 def rates(weights: csr_matrix, area: Values, mass: Values, pressure: float, most: float) -> Values:
