@@ -216,7 +216,7 @@ def test_gaps_and_work_are_those_of_the_nodes_and_of_the_force(tmp_path: Path) -
 # --- friction -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("facets", [False, True])
+@pytest.mark.parametrize("facets", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("share", "sticks"), [(1.1, True), (0.9, False)])
 def test_a_block_on_a_slope(share: float, sticks: bool, facets: bool) -> None:
     """tan(theta) = 0.5 and mu = `share` of it: it stays, or slides with g (sin - mu cos); gravity is turned, not the

@@ -328,6 +328,7 @@ def test_a_weight_dropped_on_a_body_comes_to_rest(tmp_path: Path) -> None:
     assert found["contact_block_z"] == pytest.approx(20.0 * G, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_free_solid_rests_on_a_floor_and_hangs_on_a_hinge(tmp_path: Path) -> None:
     """Away from the body: dropped on a plane, turned, it comes to lie flat on it; a quarter of a swing on a hinge takes
     the energy that it falls by, m g l, into its spin: I w^2 / 2 (Newmark's, 1 %)."""
