@@ -110,8 +110,11 @@ def mesh(
 
 @app.command()
 def render(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
-    png: Annotated[Path | None, typer.Option("-o", "--out", help=".png, or .gif of all frames (OUT/last.png)")] = None,
+    outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="output folders of runs, side by side")],
+    png: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help=".png, .gif or .mp4 of all frames, a folder for PNGs of them (OUT/last.png)"),
+    ] = None,
     colour: Annotated[
         str, typer.Option("--colour", "--field", help="crack, piece, age, or a field of the run: strain, stress:xx")
     ] = "crack",
@@ -119,14 +122,31 @@ def render(
     view: Annotated[str, typer.Option(help="iso, front, back, left, right, top, or x,y,z to look from")] = "iso",
     zoom: Annotated[float, typer.Option(min=0.01, help="above 1 is nearer")] = 1.0,
     frame: Annotated[int, typer.Option(help="which frame, from 0; -1 is the last")] = -1,
+    look: Annotated[
+        str,
+        typer.Option(help="bread, porcelain, jade, granite, steel, wood, plain, or skin and inside: #b9712c,#f0deb6"),
+    ] = "",
+    floor: Annotated[bool, typer.Option("--floor", help="where an obstacle plane is, else below the body")] = False,
+    size: Annotated[str, typer.Option(help="of a picture in pixels; half of it each on a sheet")] = "1400x900",
+    limits: Annotated[str, typer.Option("--range", help="LOW,HIGH of the colours; default: of what is shown")] = "",
+    magnify: Annotated[float, typer.Option(min=0, help="displacements so many times as large")] = 1.0,
+    sheet: Annotated[str, typer.Option(help="so many frames on one picture, or which: 0,18,-1")] = "",
+    fps: Annotated[int, typer.Option(min=1, max=120, help="frames a second of a film")] = 12,
+    title: Annotated[str | None, typer.Option(help="in place of the study's")] = None,
+    bare: Annotated[bool, typer.Option("--bare", help="no title, time, scale bar or legend")] = False,
 ) -> None:
-    """Draw the split surface of a run off-screen: a picture, or an animation where the name ends in .gif."""
+    """Draw the split surface of runs off-screen: a picture, a sheet of several, or a film of all frames."""
     if not _is_root():
         return
-    from .report.picture import Look, render
+    from .report.pictures.look import Look, limits_of, size_of
+    from .report.pictures.picture import render
 
     gc.enable()
-    print(f"saved {render(out, png, Look(colour, explode, view, zoom), frame=frame)}")
+    how = Look(
+        colour, explode, view, zoom, skin=look, size=size_of(size), limits=limits_of(limits) if limits else None,
+        magnify=magnify, floor=floor, title=title, bare=bare,
+    )  # fmt: skip
+    print(f"saved {render(outs, png, how, frame=frame, sheet=sheet, fps=fps)}")
 
 
 @app.command()

@@ -418,7 +418,7 @@ def _check(
 
 def _draw(folder: Path) -> None:
     """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
-    from .report.picture import render
+    from .report.pictures.picture import render
 
     try:
         render(folder)

@@ -230,7 +230,7 @@ def test_a_killed_run_leaves_whole_files(tmp_path: Path) -> None:
 def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    from fracsim.report.picture import render
+    from fracsim.report.pictures.picture import render
 
     pixels = imread(render(output.folder, tmp_path / "shot.png"))[..., :3]
     assert pixels.shape == (900, 1400, 3)
@@ -241,20 +241,7 @@ def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
 
 def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
     """Not on which other pieces there are, so that it stays from frame to frame; the palette of 20 starts again."""
-    import pyvista
+    from fracsim.report.pictures.colouring import colours
 
-    from fracsim.report.picture import _add_coloured
-    from fracsim.report.screen import display
-
-    corners = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.2, 1, 0.3]])
-    points = np.concatenate([corners + shift for shift in np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 1.5, 0]])])
-    mesh = pyvista.PolyData(points, np.insert(np.arange(9).reshape(3, 3), 0, 3, axis=1).ravel())
-    mesh.point_data["piece"] = np.repeat([10, 0, 20], 3)
-    with display():
-        plotter = pyvista.Plotter(off_screen=True, window_size=(400, 300))
-        plotter.set_background("white")
-        _add_coloured(plotter, mesh, "piece", lighting=False)
-        pixels = plotter.screenshot(return_img=True)
-        plotter.close()
-    _, count = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
-    assert np.count_nonzero(count > 200) == 3  # white; 10; 0 and 20, which share one
+    ten, zero, twenty = colours(np.array([10.0, 0.0, 20.0]), None, "#000000").tolist()
+    assert zero == twenty != ten == colours(np.array([10.0]), None, "#000000")[0].tolist()

@@ -26,6 +26,7 @@ Path = tuple[str | int, ...]
 # every table that there is, each with what it requires
 FULL: Data = changed(
     STRIP,
+    output={"look": {"skin": "#b9712c", "inside": "#f0deb6"}},
     material={"stiff": {"young": 1e7}},
     fracture={"heterogeneity": {"modulus": 5.0}, "fibre": {"direction": [1.0, 0.0]}},
     plasticity={"yield_stress": 1e4},

@@ -14,8 +14,11 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError, Stopped
-from fracsim.report.colouring import select, shown_range
-from fracsim.report.picture import Look, Shot, exploded, find_frames, load, render
+from fracsim.report.pictures.body import exploded
+from fracsim.report.pictures.colouring import select, shown_range
+from fracsim.report.pictures.look import Look
+from fracsim.report.pictures.picture import render
+from fracsim.report.pictures.shots import Shot, find_frames, load
 from fracsim.run import Run
 from fracsim.scene import build_scene
 
@@ -184,7 +187,9 @@ def test_an_animation_moves(tmp_path: Path) -> None:
         (Look(view="below"), -1, "a.png", "--view below: must be one of iso, front"),
         (Look(view="0,0,0"), -1, "a.png", "--view 0,0,0: a direction must be finite and not zero"),
         (Look(), 99, "a.png", "--frame 99: "),
-        (Look(), -1, "a.mp4", "pictures are .png and animations .gif"),
+        (Look(), -1, "a.jpg", "pictures are .png, films .gif or .mp4"),
+        (Look(skin="bred"), -1, "a.png", "--look bred: must be one of plain, bread"),
+        (Look(skin="#b9712c,red"), -1, "a.png", "--look: red is no colour"),
     ),
 )
 def test_what_cannot_be_drawn(torn: Run, look: Look, frame: int, name: str, message: str, tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """What is made of the folders of runs: pictures, sweeps, and one page that needs nothing else.
 
 runs                a run folder as it is read
-picture, colouring  `fracsim render`: the split surface off-screen, and which numbers colour it
-obstacles           obstacles in a picture
-screen              a screen for VTK on machines that have none
+pictures            `fracsim render`: the split surface off-screen
 sweep, outcome      `fracsim sweep`: a run for each combination of values; how each ended
 make                `fracsim report`
 compare, pareto     sections about runs; which settings are worth their cost

@@ -28,6 +28,7 @@ _WORDS = {
     "tuple_type": "must be a list",
 }
 _PATTERNS = {
+    "^#[0-9a-fA-F]{6}$": 'must be a colour as "#rrggbb"',
     "^[xyz]+$": 'must name components, such as "xyz" or "x"',
     "^[A-Za-z][A-Za-z0-9-]*$": "must be letters, digits and -, a letter first",
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, create_model, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
 
 from ..forms.schemes import SCHEMES, Scheme
 from .loading import Where
@@ -126,6 +126,22 @@ FIELDS = (
 FRACTURE_FIELDS = ("damage", "chi", "piece")
 
 
+LOOKS = ("plain", "bread", "porcelain", "jade", "granite", "steel", "wood")
+Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
+
+
+class Colours(Table):
+    """[output] look: own colours."""
+
+    skin: Colour  # of what was the boundary
+    inside: Colour  # of what cracks lay open
+
+
+def _look(value: Any) -> str:
+    """Tag of a look."""
+    return "<colours>" if isinstance(value, dict | Colours) else "<name>"
+
+
 class Output(Table):
     """[output]: what is written, and how often."""
 
@@ -135,6 +151,10 @@ class Output(Table):
     surface: Flag | None = None  # the split surface and pieces.csv; default: with [fracture] or an [[obstacle]]
     cut: Literal["middle", "forces"] = "middle"  # where broken edges are cut: in proportion to the nodal forces
     picture: Flag = True  # a PNG of the last frame
+    look: Annotated[  # type: ignore[valid-type]
+        Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[Colours, Tag("<colours>")],
+        Discriminator(_look),
+    ] = "plain"  # of pictures
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
 
     @field_validator("fields")

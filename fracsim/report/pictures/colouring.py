@@ -7,14 +7,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
-from ..output.fields_file import TENSOR
+from ...errors import InputError
+from ...output.fields_file import TENSOR
 
 Values = npt.NDArray[np.float64]
 
+UNITS = {
+    "displacement": "m", "velocity": "m/s", "stress": "Pa", "von_mises": "Pa", "energy_density": "J/m³", "age": "s",
+}  # fmt: skip
+PALETTE = 20  # colours of pieces
 # number of components -> their names
 COMPONENTS = {3: ("x", "y", "z"), len(TENSOR): TENSOR}
-HIDDEN = ("origin", "cell")  # of the surface: for ParaView, not for colouring
+HIDDEN = ("origin", "cell", "rest")  # of the surface: for ParaView, not for colouring
 SHOWN = 98.0  # percent of the values that the colours tell apart; a few cells beside a crack would take them all
 
 
@@ -52,3 +56,46 @@ def shown_range(values: Values, *, signed: bool = False) -> tuple[float, float] 
         most = float(max(-low, high))
         return -most, most
     return (float(low), float(high)) if high > low else (float(values.min()), float(values.max()))
+
+
+def titled(field: str) -> str:
+    """A field or component in words, with its unit."""
+    unit = UNITS.get(field.partition(":")[0], "")
+    return field.replace("_", " ").replace(":", " ").replace("von mises", "von Mises") + (f" ({unit})" if unit else "")
+
+
+def map_of(limits: tuple[float, float]) -> str:
+    """The colours of a range: of two branches where it has both signs."""
+    return "coolwarm" if limits[0] < 0 < limits[1] else "viridis"
+
+
+def colours(
+    values: npt.NDArray[np.floating], limits: tuple[float, float] | None, missing: str
+) -> npt.NDArray[np.uint8]:
+    """(n, 3) of values (n,) between `limits`; `missing` "#rrggbb" of what is no number. Limits None: numbers of pieces,
+    each with the colour that it has wherever it is seen."""
+    import matplotlib
+
+    if limits is None:
+        of = matplotlib.colormaps["tab20"](values.astype(np.int64) % PALETTE)
+        return np.asarray(np.rint(255 * of[:, :3]), np.uint8)
+    low, high = limits
+    share = np.clip((values - low) / (high - low), 0, 1) if high > low else np.full(len(values), 0.5)
+    table = np.rint(255 * matplotlib.colormaps[map_of(limits)](np.where(np.isfinite(share), share, 0))[:, :3])
+    table[~np.isfinite(share)] = rgb(missing)
+    return np.asarray(table, np.uint8)
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """#rrggbb -> (r, g, b)."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def merged(ranges: list[tuple[float, float] | None]) -> tuple[float, float] | None:
+    """One range for several frames, symmetric where one of them is; None where none has anything to show."""
+    found = [each for each in ranges if each is not None]
+    if not found:
+        return None
+    low, high = min(each[0] for each in found), max(each[1] for each in found)
+    most = max(-low, high)
+    return (-most, most) if low < 0 < high else (low, high)

@@ -1,0 +1,155 @@
+"""Pictures, sheets and animations of runs, off-screen: their split surface where there is one, else their mesh."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import InputError
+from .camera import bounds_of, is_flat, union
+from .colouring import merged
+from .look import Look
+from .screen import display
+from .shots import Shot, find_frames, study_of
+from .stage import Stage, range_of
+
+Pixels = npt.NDArray[np.uint8]
+FILMS = (".gif", ".mp4")
+FPS = 12
+TILE = 0.5  # of the size of a picture: one of several on a sheet
+GAP = 8  # pixels between pictures of a sheet
+
+
+def render(
+    folder: Path | Sequence[Path],
+    target: Path | None = None,
+    look: Look | None = None,
+    *,
+    frame: int = -1,
+    sheet: str = "",
+    fps: int = FPS,
+) -> Path:
+    """Draw one frame as a PNG, or all of them as a GIF, an MP4 or, where `target` has no suffix, PNGs in a folder;
+    returns what was written.
+
+    Several folders: that frame of each, side by side.    `sheet`: so many frames of one folder, or which: "0,18,-1".
+    """
+    folders = [folder] if isinstance(folder, Path) else list(folder)
+    target, look = target or folders[0] / "last.png", look or Look()
+    look.direction()
+    if target.suffix not in ("", ".png", *FILMS):
+        raise InputError(f"-o {target}: pictures are .png, films .gif or .mp4, and a name without a suffix is a folder")
+    every = [find_frames(each) for each in folders]
+    if target.suffix == ".png":
+        shots = chosen_of(every, folders, frame, sheet)
+    elif sheet or len(folders) > 1:
+        raise InputError(f"-o {target}: a sheet, or pictures of several runs, is a .png")
+    else:
+        shots = every[0]
+    single = target.suffix == ".png"
+    if len(shots) > 1:
+        look = replace(look, fine=look.fine and single)
+    if single and len(shots) > 1:
+        look = replace(look, size=(round(TILE * look.size[0]), round(TILE * look.size[1])))
+    with display():
+        pictures = _shoot(shots, look, titled=len(folders) > 1)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if single:
+            _save(target, tiled(list(pictures)))
+        else:
+            _film(target, pictures, fps)
+    return target
+
+
+def chosen_of(every: list[list[Shot]], folders: list[Path], frame: int, sheet: str) -> list[Shot]:
+    """The frames of a picture: one a folder, or those of a sheet."""
+    for frames, folder in zip(every, folders, strict=True):
+        if not -len(frames) <= frame < len(frames):
+            raise InputError(f"--frame {frame}: {folder} has {len(frames)} frames, counted from 0 (-1 is the last)")
+    if not sheet:
+        return [frames[frame] for frames in every]
+    if len(every) > 1:
+        raise InputError("--sheet: frames of one run; give one folder")
+    frames = every[0]
+    try:
+        which = [int(part) for part in sheet.split(",")]
+    except ValueError:
+        raise InputError(f"--sheet {sheet}: must be how many frames, or which: 0,18,-1") from None
+    if len(which) == 1:
+        if which[0] < 1:
+            raise InputError(f"--sheet {sheet}: must be 1 or more")
+        count = min(which[0], len(frames))
+        which = np.unique(np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)).tolist() if count > 1 else [-1]
+    if wrong := [each for each in which if not -len(frames) <= each < len(frames)]:
+        raise InputError(f"--sheet {sheet}: {folders[0]} has {len(frames)} frames, counted from 0, and no {wrong[0]}")
+    return [frames[each] for each in which]
+
+
+def _shoot(shots: Sequence[Shot], look: Look, *, titled: bool) -> Iterator[Pixels]:
+    """All from one place, in one range of colours. `titled`: each by the name of its run."""
+    bounds = union([bounds_of(shot, look) for shot in shots])
+    limits = look.limits or merged([range_of(shot, look.colour) for shot in shots])
+    if look.floor and is_flat(bounds):
+        raise InputError("--floor: a body in 2D has none")
+    with Stage(look, bounds, limits, study_of(shots[0].folder)) as stage:
+        for shot in shots:
+            yield stage.shoot(shot, shot.folder.name if titled else None)
+
+
+def tiled(pictures: Sequence[Pixels]) -> Pixels:
+    """Up to three in a row, more of them in rows as long as there are."""
+    columns = len(pictures) if len(pictures) <= 3 else math.ceil(math.sqrt(len(pictures)))
+    height, width, _ = pictures[0].shape
+    rows = math.ceil(len(pictures) / columns)
+    sheet = np.full((rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
+    for place, each in enumerate(pictures):
+        y, x = (height + GAP) * (place // columns), (width + GAP) * (place % columns)
+        sheet[y : y + height, x : x + width] = each
+    return sheet
+
+
+def _save(target: Path, pixels: Pixels) -> None:
+    from PIL import Image
+
+    Image.fromarray(pixels).save(target, optimize=True)
+
+
+def _film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
+    """All pictures, as the name says."""
+    if target.suffix:
+        with _writer(target, fps) as append:
+            for each in pictures:
+                append(each)
+        return
+    target.mkdir(parents=True, exist_ok=True)
+    for number, each in enumerate(pictures):
+        _save(target / f"frame_{number:06d}.png", each)
+
+
+class _writer:
+    """A film as it is written; an MP4 has sides of even length, as its coding asks."""
+
+    def __init__(self, target: Path, fps: int) -> None:
+        import imageio.v2
+
+        how: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
+        if target.suffix == ".mp4":
+            try:
+                import imageio_ffmpeg  # noqa: F401
+            except ImportError:
+                message = f"-o {target}: films in MP4 need imageio-ffmpeg (pip install imageio-ffmpeg); .gif does not"
+                raise InputError(message) from None
+            how = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2}
+        self._file = imageio.v2.get_writer(str(target), **how)
+
+    def __enter__(self) -> Callable[[Pixels], None]:
+        return self._file.append_data
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()

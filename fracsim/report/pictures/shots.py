@@ -1,0 +1,90 @@
+"""The frames of a run: where their data are, and what its study says of how they look."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ...errors import InputError
+from ...output.surface.collection import Entry, read_entries
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame to draw: where its data are."""
+
+    t: float
+    file: Path
+    index: int  # of the frame in fields.h5, -1: a VTU of the surface
+    beside: tuple[Path, ...] = ()  # VTUs of the obstacles
+    names: tuple[str, ...] = ()  # of the obstacles
+
+    @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.file.parent if self.index >= 0 else self.file.parent.parent
+
+
+def find_frames(folder: Path) -> list[Shot]:
+    """Frames of surface.pvd, or else of fields.h5. InputError where there are none."""
+    pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
+    if pvd.exists():
+        shots = _of_surface(folder, read_entries(pvd))
+        if shots:
+            return shots
+    if not h5.exists():
+        raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
+    with h5py.File(h5) as file:
+        times = [float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])]
+    if not times:
+        raise InputError(f"{h5} has no frame yet")
+    return [Shot(t, h5, index) for index, t in enumerate(times)]
+
+
+def _of_surface(folder: Path, entries: list[Entry]) -> list[Shot]:
+    beside: dict[float, list[Entry]] = {}
+    for entry in entries:
+        if entry.part:
+            beside.setdefault(entry.t, []).append(entry)
+    bodies = [entry for entry in entries if not entry.part]
+    shots = []
+    for each in bodies:
+        others = beside.get(each.t, [])
+        files, names = tuple(folder / other.file for other in others), tuple(other.name for other in others)
+        shots.append(Shot(each.t, folder / each.file, -1, files, names))
+    return shots
+
+
+def load(shot: Shot) -> Any:
+    """The frame as a grid of displaced points with its fields."""
+    import pyvista
+
+    if shot.index < 0:
+        return pyvista.read(shot.file)
+    with h5py.File(shot.file) as file:
+        frame = file["frames"][sorted(file["frames"])[shot.index]]
+        cells = file["cells"][()]
+        kind = pyvista.CellType.TRIANGLE if cells.shape[1] == 3 else pyvista.CellType.TETRA
+        grid = pyvista.UnstructuredGrid({kind: cells}, file["points"][()] + frame["displacement"][()])
+        for name, data in frame.items():
+            (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = data[()]
+    return grid
+
+
+def study_of(folder: Path) -> dict[str, Any]:
+    """What study.toml says, as it stands there; nothing where there is none."""
+    try:
+        return tomllib.loads((folder / "study.toml").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return {}
+
+
+def planes_of(study: dict[str, Any]) -> dict[str, Any]:
+    """Names of obstacles that are planes -> their normals."""
+    found = [each for each in study.get("obstacle", []) if each.get("shape") == "plane"]
+    return {each["name"]: np.array(each["normal"], float) for each in found if "normal" in each and "name" in each}

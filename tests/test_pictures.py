@@ -1,0 +1,241 @@
+"""Pictures by what is on them: a skin, an inside and a crack where they are, colours, lengths, shadows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fracsim.errors import InputError
+from fracsim.mechanics.drawn import Drawn
+from fracsim.output.fields_file import Field
+from fracsim.output.surface.files import SurfaceFiles
+from fracsim.output.surface.frame import Surface
+from fracsim.report.pictures.lettering import in_seconds, in_words, nice
+from fracsim.report.pictures.look import SIZE, Look, limits_of, size_of
+from fracsim.report.pictures.obstacles import COLOUR
+from fracsim.report.pictures.picture import GAP, render
+from fracsim.report.pictures.rims import opening
+from fracsim.report.pictures.skins import SKINS
+from fracsim.study.running import LOOKS
+from support.solids import lattice, patterns, separated
+
+Pixels = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+SMALL = (420, 300)
+FRONT = Look(view="front", size=SMALL, skin="#ff0000,#00ff00", bare=True)
+CUT = 3.5  # m: where the bar of 6 x 1 x 1 m is cut
+
+
+def shown(path: Path) -> Pixels:
+    from imageio.v3 import imread
+
+    return np.asarray(imread(path))[..., :3].astype(int)
+
+
+def written(
+    folder: Path, *gaps: float, cut: bool = True, dim: int = 3, fields: Callable[[Values], Any] | None = None
+) -> Path:
+    """A bar along x, a frame for each of the gaps (m) of its crack."""
+    mesh = lattice(6, 1, 1) if dim == 3 else lattice(6, 2)
+    surface, files = Surface(mesh, 1.0), SurfaceFiles(folder, dim)
+    skeleton = surface.skeleton
+    if cut:
+        surface.update(patterns(skeleton, separated(skeleton, (mesh.points[:, 0] > CUT).astype(int))))
+    for t, gap in enumerate(gaps):
+        u = np.zeros_like(mesh.points)
+        u[mesh.points[:, 0] > CUT, 0] = gap
+        middles = mesh.points[mesh.cells].mean(axis=1)
+        more = fields(middles[:, 0]) if fields is not None else []
+        files.write(surface.at(float(t), u, np.zeros_like(u), fields=more))
+    return folder
+
+
+def of_hue(pixels: Pixels, channel: int) -> npt.NDArray[np.bool_]:
+    """Lit or in the shade, of one of the pure colours of FRONT."""
+    rest = np.delete(pixels, channel, axis=2).max(axis=2)
+    return (pixels[..., channel] > 40) & (rest < 0.6 * pixels[..., channel])
+
+
+# --- skin, inside, cracks ---
+
+
+def test_the_inside_has_its_own_colour_and_is_seen_in_the_gap(tmp_path: Path) -> None:
+    """From aslant a wall of the open crack, green, between skins, red; nothing green before it is cut."""
+    look = Look(view="1,-2,0.3", size=SMALL, skin=FRONT.skin, bare=True)
+    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), look=look))
+    torn = shown(render(written(tmp_path / "torn", 1.0), look=look))
+    assert of_hue(whole, 0).mean() > 0.05 and not of_hue(whole, 1).any()
+    green, red = of_hue(torn, 1), of_hue(torn, 0)
+    assert green.mean() > 0.003
+    columns = np.flatnonzero(green.any(axis=0))
+    assert red[:, : columns.min()].any() and red[:, columns.max() + 1 :].any()
+
+
+def test_a_crack_that_opens_by_less_than_a_pixel_is_a_line(tmp_path: Path) -> None:
+    """Dark pixels where the bar is cut, over its whole height, and nowhere else on it."""
+    pixels = shown(render(written(tmp_path, 1e-5), look=FRONT))
+    red = of_hue(pixels, 0)
+    rows, columns = (np.flatnonzero(red.any(axis=axis)) for axis in (1, 0))
+    inside = pixels[rows.min() + 3 : rows.max() - 2, columns.min() + 3 : columns.max() - 2]
+    dark = inside.max(axis=2) < 110
+    found = np.flatnonzero(dark.any(axis=0)) / (inside.shape[1] - 1) * 6
+    assert dark.any(axis=1).mean() > 0.95
+    assert found.min() > 2.9 and found.max() < 4.1  # the cut winds between the nodes at 3 and at 4
+    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), look=FRONT))
+    assert not (whole[of_hue(whole, 0)].max(axis=1) < 110).any()
+
+
+def test_the_opening_is_the_distance_of_what_was_at_one_place() -> None:
+    rest = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0]])
+    at = rest + np.array([[0.5, 0, 0], [0, 0, 0], [3e-3, 0, 0], [0, 4e-3, 0]])
+    np.testing.assert_allclose(opening(at, rest), [0.0, 5e-3, 5e-3, 5e-3])
+
+
+def test_magnified_displacements(tmp_path: Path) -> None:
+    """A gap of 1 mm, too narrow for a pixel, is 2 m wide at 2000 times: a third of the bar."""
+    folder = written(tmp_path, 1e-3)
+    pixels = shown(render(folder, look=Look(view="front", size=SMALL, skin=FRONT.skin, bare=True, magnify=2000.0)))
+    row = of_hue(pixels, 0)[SMALL[1] // 2]
+    columns = np.flatnonzero(row)
+    gap = np.count_nonzero(~row[columns.min() : columns.max()])
+    assert gap / np.ptp(columns) == pytest.approx(2 / 8, abs=0.08)
+
+
+# --- colours and what is to be read ---
+
+
+@pytest.mark.parametrize(("value", "limits", "colours"), ((0.5, (0.0, 1.0), "viridis"), (0.0, (-1.0, 1.0), "coolwarm")))
+def test_colours_in_2d_are_those_of_the_legend(
+    value: float, limits: tuple[float, float], colours: str, tmp_path: Path
+) -> None:
+    """To a unit in 255, light or no light; zero between two signs is grey and the paper white."""
+    folder = written(tmp_path, 0.0, cut=False, dim=2, fields=lambda x: [Field("heat", "Cell", np.full(len(x), value))])
+    pixels = shown(render(folder, look=Look("heat", size=SMALL, bare=True, limits=limits)))
+    wanted = np.rint(255 * np.array(matplotlib.colormaps[colours](0.5)[:3]))
+    inner = pixels[SMALL[1] // 2, SMALL[0] // 2]
+    assert np.abs(inner - wanted).max() <= 1 and inner.min() < 240
+    assert (pixels[0, 0] == 255).all()
+    legend = shown(render(folder, look=Look("heat", size=SIZE, limits=limits)))[-120:]  # the bar, in its middle
+    assert np.abs(legend[:, SIZE[0] // 2] - wanted).max(axis=1).min() <= 2
+
+
+def test_one_range_for_all_frames(tmp_path: Path) -> None:
+    """What is 1 in every frame has one colour in all, though another part goes from 1 to 5; alone a frame fills it."""
+    level = iter((1.0, 5.0))
+    folder = written(
+        tmp_path, 0.0, 0.0, cut=False, dim=2,
+        fields=lambda x: [Field("heat", "Cell", np.where(x < 3, 1.0, next(level)))],
+    )  # fmt: skip
+    look = Look("heat", size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
+    sheet = shown(render(folder, tmp_path / "sheet.png", look, sheet="0,1"))
+    assert sheet.shape == (SMALL[1], 2 * SMALL[0] + GAP, 3)
+    quarter, step = SMALL[0] // 3, SMALL[0] + GAP
+    row = sheet[SMALL[1] // 2]
+    assert (row[quarter] == row[quarter + step]).all()
+    assert (row[quarter] == row[2 * quarter]).all() and (row[quarter + step] != row[2 * quarter + step]).any()
+
+
+def test_the_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
+    """Beside a bar of 6 m, in a flat picture: 1 m of a width of some 7."""
+    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), look=Look(size=SIZE)))
+    ink = (np.abs(pixels - [34, 38, 44]).max(axis=2) < 4)[-60:, : SIZE[0] // 3]
+    length = ink.sum(axis=1).max()
+    body = np.flatnonzero(np.any(pixels[SIZE[1] // 2] < 250, axis=1))
+    assert length == pytest.approx(np.ptp(body) / 6, abs=2.5)
+
+
+def test_numbers_in_words() -> None:
+    assert [nice(x) for x in (0.0123, 0.7, 49.0)] == pytest.approx([0.01, 0.5, 20.0])
+    assert [in_words(x) for x in (0.01, 0.005, 2e-5, 5.0, 0.5)] == ["1 cm", "5 mm", "20 µm", "5 m", "50 cm"]
+    assert [in_seconds(t) for t in (0.0, 1.2e-4, 0.45, 2.0)] == ["t = 0 s", "t = 120 µs", "t = 450 ms", "t = 2 s"]
+
+
+# --- floor ---
+
+
+def test_a_floor_has_the_shadow_of_what_stands_on_it(tmp_path: Path) -> None:
+    """Darker than the floor, beside the body; without one there is none."""
+    folder = written(tmp_path, 0.0, cut=False)
+    look = Look(view="0.3,-1.5,1.2", size=SMALL, skin=FRONT.skin, bare=True)
+    plain, floor = (shown(render(folder, look=each)) for each in (look, Look(**{**vars(look), "floor": True})))
+    backdrop = floor[0, 0]
+
+    def grey(pixels: Pixels) -> float:
+        """Share that is the backdrop's colour, but darker than it."""
+        share = pixels / backdrop
+        return float(((np.ptp(share, axis=2) < 0.02) & (share.max(axis=2) < 0.93)).mean())
+
+    assert grey(plain) == 0 and grey(floor) > 0.005
+
+
+def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
+    """In place of its slab: nothing of its colour is left, and the shadow lies where the plane is, below the bar."""
+    folder = written(tmp_path, 0.0, cut=False)
+    frame = Surface(lattice(6, 1, 1), 1.0)
+    x = np.array([[-9.0, -9, -2], [9, -9, -2], [0, 9, -2]])
+    none = np.zeros_like(frame.skeleton.points)
+    drawn = {"table": Drawn(x, np.array([[0, 1, 2]]), np.empty((0, 2), int))}
+    SurfaceFiles(folder, 3).write(frame.at(0.0, none, none), drawn)
+    (folder / "study.toml").write_text('[[obstacle]]\nname = "table"\nshape = "plane"\nnormal = [0.0, 0.0, 1.0]\n')
+    look = Look(view="0.3,-1.5,1.2", size=SMALL, skin=FRONT.skin, bare=True)
+    slab, floor = (shown(render(folder, look=each)) for each in (look, Look(**{**vars(look), "floor": True})))
+    solid = [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]
+    assert (np.abs(slab - solid).max(axis=2) < 60).mean() > (np.abs(floor - solid).max(axis=2) < 60).mean() + 0.02
+    shadow = (floor.max(axis=2) < 0.93 * floor[0, 0].max()) & ~of_hue(floor, 0)
+    body = of_hue(floor, 0)
+    assert np.nonzero(shadow)[0].mean() > np.nonzero(body)[0].mean() + 20
+
+
+# --- what is written, and what cannot be ---
+
+
+def test_a_folder_of_pictures_and_runs_side_by_side(tmp_path: Path) -> None:
+    first, second = written(tmp_path / "first", 0.0, 0.5), written(tmp_path / "second", 1.0)
+    look = Look(size=SMALL)
+    made = render(first, tmp_path / "frames", look)
+    assert [path.name for path in sorted(made.iterdir())] == ["frame_000000.png", "frame_000001.png"]
+    both = shown(render([first, second], tmp_path / "both.png", look))
+    assert both.shape == (SMALL[1] // 2, SMALL[0] + GAP, 3)
+    assert np.any(both[:, : SMALL[0] // 2] != both[:, -(SMALL[0] // 2) :])
+
+
+def test_a_film_in_mp4_has_every_frame(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    import imageio.v2
+
+    made = render(written(tmp_path, 0.0, 0.5, 1.0), tmp_path / "film.mp4", Look(size=(161, 121)), fps=5)
+    with imageio.v2.get_reader(made) as film:
+        assert film.count_frames() == 3 and film.get_meta_data()["fps"] == pytest.approx(5)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    (
+        (lambda folder: render(folder, sheet="0,9"), "--sheet 0,9: .* has 2 frames, counted from 0, and no 9"),
+        (lambda folder: render(folder, sheet="some"), "--sheet some: must be how many frames, or which"),
+        (lambda folder: render([folder, folder], sheet="2"), "--sheet: frames of one run"),
+        (lambda folder: render([folder, folder], folder / "a.gif"), "pictures of several runs, is a .png"),
+        (lambda folder: size_of("big"), "--size big: must be WIDTHxHEIGHT"),
+        (lambda folder: size_of("4x90000"), "--size 4x90000"),
+        (lambda folder: limits_of("2,1"), "--range 2,1: must be two numbers, the lower first"),
+        (lambda folder: limits_of("0,nan"), "--range 0,nan"),
+    ),
+)
+def test_what_cannot_be_drawn_is_said(call: Callable[[Path], Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        call(written(tmp_path, 0.0, 0.1))
+
+
+def test_a_flat_body_has_no_floor(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--floor: a body in 2D has none"):
+        render(written(tmp_path, 0.0, dim=2), look=Look(floor=True, size=SMALL))
+
+
+def test_a_study_names_the_looks_that_there_are() -> None:
+    assert set(LOOKS) == set(SKINS)
