@@ -10,7 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
 
@@ -67,8 +67,13 @@ def run(
         print(
             f"{summary['title']}: {summary['steps']} steps to t = {summary['time']:g} s in {summary['wall']:.1f} s on "
             f"{summary['ranks']} rank{'s'[: summary['ranks'] > 1]}; {summary['broken_edges']} broken edges, "
-            f"{summary['pieces']} piece{'s'[: summary['pieces'] != 1]}. Results in {folder}"
+            f"{summary['pieces']} piece{'s'[: summary['pieces'] != 1]}{_dust(summary)}. Results in {folder}"
         )
+
+
+def _dust(summary: dict[str, Any]) -> str:
+    """How many of the pieces are single nodes."""
+    return f", {dust} of them dust (single nodes)" if (dust := summary.get("dust")) else ""
 
 
 @app.command()
@@ -133,6 +138,7 @@ def render(
     sheet: Annotated[str, typer.Option(help="so many frames on one picture, or which: 0,18,-1")] = "",
     fps: Annotated[int, typer.Option(min=1, max=120, help="frames a second of a film")] = 12,
     title: Annotated[str | None, typer.Option(help="in place of the study's")] = None,
+    dust: Annotated[bool, typer.Option("--dust/--no-dust", help="draw pieces of a single node")] = True,
     bare: Annotated[bool, typer.Option("--bare", help="no title, time, scale bar or legend")] = False,
 ) -> None:
     """Draw the split surface of runs off-screen: a picture, a sheet of several, or a film of all frames."""
@@ -144,7 +150,7 @@ def render(
     gc.enable()
     how = Look(
         colour, explode, view, zoom, skin=look, size=size_of(size), limits=limits_of(limits) if limits else None,
-        magnify=magnify, floor=floor, title=title, bare=bare,
+        magnify=magnify, floor=floor, title=title, bare=bare, dust=dust,
     )  # fmt: skip
     print(f"saved {render(outs, png, how, frame=frame, sheet=sheet, fps=fps)}")
 

@@ -286,10 +286,11 @@ class Run:
         state, domain, thick = self.state, self.scene.domain, self.scene.study.thickness
         broken, split, pieces = self.breaks.figures
         sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
+        dust, dust_mass = self.breaks.dust(self.scene.balance.stress.material.density * domain.volumes * thick)
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": int(sizes[0]), "cells": int(sizes[1]),
-            "broken_edges": broken, "split_cells": split, "pieces": pieces,
+            "broken_edges": broken, "split_cells": split, "pieces": pieces, "dust": dust, "dust_mass": dust_mass,
             "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.monitors.summary(),
         }  # fmt: skip
 

@@ -97,6 +97,13 @@ def test_noise_belongs_to_the_edge(results: Results, ranks: int) -> None:
     assert np.array_equal(results(ranks)["edges-noise"], results(1)["edges-noise"])
 
 
+@pytest.mark.parametrize("ranks", RANKS[1:])
+def test_what_holds_a_node_is_the_same_at_any_number_of_ranks(ranks: int, results: Results) -> None:
+    """And so which edges are spared, ties and all."""
+    found, serial = (results(count)["held-broken"] for count in (ranks, 1))
+    assert np.array_equal(found, serial) and len(found)
+
+
 # --- pieces ---
 
 

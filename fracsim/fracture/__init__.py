@@ -2,6 +2,7 @@
 
 breaking          a pass: a criterion, a law of the edge and a degradation, one after the other
 criterion         which edges fail
+holding           which of them are spared, for a node would be left without a whole cell
 edge_law          what is left of an edge under a load
 degradation       what broken edges take out of the elastic energy
 edge_stress       normal stress along edges, and what the intact ones carry

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
+from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
 from .ranks import total
@@ -76,7 +77,7 @@ class EdgeGraph:
 
         Returns how many edges broke, and how many lost anything.
         """
-        least = np.minimum(self.integrity, self._least_of_ranks(integrity))
+        least = np.minimum(self.integrity, self.least(integrity))
         less, new = least < self.integrity, (least == 0) & ~self.broken
         self.integrity[:] = least
         self._note_broken(new)
@@ -100,15 +101,16 @@ class EdgeGraph:
         self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
         self.damaged[touched] = True
 
-    def _least_of_ranks(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(edges,) the least value that any rank gives an edge (collective)."""
+    def least(self, values: npt.NDArray[np.float64], of: IndexMap | None = None) -> npt.NDArray[np.float64]:
+        """(n,) the least value that any rank gives an edge, or an entity of another index map (collective)."""
         if self.domain.comm.size == 1:
             return values
-        every, first = self.domain.comm.allgather(values[self.edge_count :]), self.index_map.local_range[0]
-        result = la.vector(self.index_map, 1, np.float64)
+        of = of or self.index_map
+        every, first = self.domain.comm.allgather(values[of.size_local :]), of.local_range[0]
+        result = la.vector(of, 1, np.float64)
         result.array[:] = values
-        for ghosts, ghost_values in zip(self.domain.comm.allgather(self.index_map.ghosts), every, strict=True):
-            own = (ghosts >= first) & (ghosts < first + self.edge_count)
+        for ghosts, ghost_values in zip(self.domain.comm.allgather(of.ghosts), every, strict=True):
+            own = (ghosts >= first) & (ghosts < first + of.size_local)
             np.minimum.at(result.array, ghosts[own] - first, ghost_values[own])
         result.scatter_forward()
         return np.asarray(result.array)

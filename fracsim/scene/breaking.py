@@ -90,7 +90,12 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     assert study.fracture is not None
     strength, average = strength_of(study, stress.domain, graph), average_of(study, stress.domain)
     if study.brittle is None:
-        return OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+        failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+        if study.fracture.crumbs:
+            return failing
+        from ..fracture.holding import Holding
+
+        return Holding(failing, stress, graph)
     from ..fracture.brittle.surfaces import BrittleSurfaces
 
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))

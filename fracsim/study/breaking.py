@@ -44,6 +44,7 @@ class Fracture(Table):
     # most times that a step is solved and broken; default: 1, in quasi-static studies until nothing changes
     passes: Annotated[int, Field(ge=1, strict=True)] | None = None
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
+    crumbs: Flag = True  # false: a node that would lose its last whole cell stays with the neighbours that hold it best
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None
 

@@ -131,6 +131,8 @@ class Study(Table):
             raise ValueError(
                 "fracture.cap is a share of edges, [brittle] breaks surfaces: set brittle.per_pass instead"
             )
+        if not self.fracture.crumbs:
+            raise ValueError("fracture.crumbs = false spares edges, [brittle] breaks surfaces: remove crumbs")
         if self.output.cut == "forces":
             raise ValueError(
                 'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'
@@ -147,6 +149,7 @@ class Study(Table):
             "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
             "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
             "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
+            "fracture.crumbs": (not table.crumbs, "a crack leaves none: remove it"),
             'output.cut = "forces"': (self.output.cut == "forces", "cracks say where they cut: remove it"),
             "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
             "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),

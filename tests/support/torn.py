@@ -12,6 +12,7 @@ from dolfinx.fem import IntegralType
 from mpi4py import MPI
 
 from fracsim.fracture import nonlocal_average as average_module
+from fracsim.fracture.holding import Holding
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hashed
 from fracsim.mesh.domain import Domain
@@ -21,6 +22,7 @@ from fracsim.mesh.ranks import total
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping.state import State
 
+from .failing import Failing
 from .scenes import Values, break_across, each_step, make_scene, make_study
 from .surface_run import WrittenSurface
 
@@ -129,6 +131,19 @@ def edges(domain: Domain) -> Found:
         order = np.lexsort(keys.T[::-1])
         found |= {"edges-keys": keys[order], "edges-noise": noise[order]}
     return found
+
+
+def held(scene: Scene) -> Found:
+    """What breaks of a body in 3D where all edges in the middle fail and nodes keep a cell, by loads of a place."""
+    domain, graph = scene.domain, EdgeGraph(scene.domain)
+    ends = domain.nodes[graph.edge_nodes][..., 0]
+    failing = Failing(np.flatnonzero(((ends > 0.3) & (ends < 0.7)).any(axis=1)))
+    own = 3.0 + 2.5 * cell_field(domain.nodes[domain.cell_nodes].mean(axis=1))[:, :1]
+    stress = own * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    flags = np.zeros(len(graph.broken), bool)
+    flags[Holding(failing, scene.balance.stress, graph)(stress, own)[0]] = True  # type: ignore[arg-type]
+    graph.break_edges(flags)
+    return {"held-broken": graph.broken_keys()}
 
 
 def weakened(comm: MPI.Intracomm) -> tuple[npt.NDArray[Any] | None, int]:
@@ -362,7 +377,7 @@ def compared(folder: Path) -> Found:
         scene, _ = make_scene(mesh=MESHES[name])
         found |= averages(scene.domain, name)
         if name == "3d":
-            found |= edges(scene.domain)
+            found |= edges(scene.domain) | held(scene)
     for label in LABELS:
         found |= pieces(label)
     for name in RUNS:

@@ -93,12 +93,13 @@ def columns(dim: int, *, turning: bool = False) -> list[str]:
     vectors = [f"{what}_{axis}" for what in ("centre", "velocity") for axis in axes]
     spin = [f"spin_{axis}" for axis in ("xyz" if dim == 3 else "z")]
     turn = [f"turn_{axis}" for axis in "xyz"] if turning else []
-    return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn]
+    return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn, "dust"]
 
 
 def _rows(t: float, pieces: Fragments) -> list[list[str]]:
     turn = [] if pieces.turn is None else [pieces.turn]
-    values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin, *turn])
+    dust = pieces.nodes == 1
+    values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin, *turn, dust])
     return [
         [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
         for piece in np.argsort(pieces.name)

@@ -162,7 +162,9 @@ class Surface:
         cell = np.concatenate([made.fill_cell, made.cell])
         origin = np.concatenate([np.full(len(made.fill), BODY), made.origin])
         piece = self._piece[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
-        fixed = {"piece": piece, "origin": origin, "cell": cell}
+        alone = np.bincount(made.piece_of_node)[made.piece_of_point] == 1
+        dust = alone[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
+        fixed = {"piece": piece, "origin": origin, "cell": cell, "dust": dust}
         return triangles, segments, cell, {name: values.astype(np.int32) for name, values in fixed.items()}
 
     def _ages(self, t: float, broken_at: Values | None) -> Values:

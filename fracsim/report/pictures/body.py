@@ -82,6 +82,15 @@ def shaded(surface: Any) -> Any:
     return made if made.n_points else surface
 
 
+def without_dust(grid: Any) -> Any:
+    """The elements of pieces that have more than a node."""
+    if "dust" not in grid.cell_data or not np.any(grid.cell_data["dust"]):
+        return grid
+    made = grid.extract_cells(np.flatnonzero(np.asarray(grid.cell_data["dust"]) == 0))
+    made.field_data["origins"] = list(grid.field_data["origins"])
+    return made
+
+
 def moved(grid: Any, explode: float, magnify: float) -> Any:
     """The grid with displacements `magnify` times as large and pieces apart by the share `explode`; "rest" of its
     points is where they were before all, m."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .body import moved
+from .body import moved, without_dust
 from .look import Look
 from .obstacles import with_obstacles
 from .shots import Shot, load
@@ -29,8 +29,13 @@ def worth_seeing(grid: Any) -> Values:
 
 def bounds_of(shot: Shot, look: Look) -> Values:
     """(6,) what is worth seeing of a frame, m."""
-    grid = moved(load(shot), look.explode, look.magnify)
-    return with_obstacles(worth_seeing(grid), shot.beside)
+    return with_obstacles(worth_seeing(drawn_of(shot, look)), shot.beside)
+
+
+def drawn_of(shot: Shot, look: Look) -> Any:
+    """The grid of a frame as a look has it."""
+    grid = load(shot)
+    return moved(grid if look.dust else without_dust(grid), look.explode, look.magnify)
 
 
 def union(bounds: Sequence[Values]) -> Values:

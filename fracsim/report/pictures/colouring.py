@@ -18,7 +18,7 @@ UNITS = {
 PALETTE = 20  # colours of pieces
 # number of components -> their names
 COMPONENTS = {3: ("x", "y", "z"), len(TENSOR): TENSOR}
-HIDDEN = ("origin", "cell", "rest")  # of the surface: for ParaView, not for colouring
+HIDDEN = ("origin", "cell", "rest", "dust")  # of the surface: for ParaView, not for colouring
 SHOWN = 98.0  # percent of the values that the colours tell apart; a few cells beside a crack would take them all
 
 

@@ -35,6 +35,7 @@ class Look:
         floor: draw one, where an obstacle plane is, else below the body.
         title: None: that of the study; "": none.
         bare: no title, time, scale bar, legend.
+        dust: draw pieces of a single node.
         fine: supersampled; costs some three times as much.
     """
 
@@ -49,6 +50,7 @@ class Look:
     floor: bool = False
     title: str | None = None
     bare: bool = False
+    dust: bool = True
     fine: bool = True
 
     def direction(self) -> tuple[float, ...]:

@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from .body import Body, body_of, moved, shaded
-from .camera import aim, is_flat, pixel
+from .body import Body, body_of, shaded
+from .camera import aim, drawn_of, is_flat, pixel
 from .colouring import colours, rgb, select, shown_range, titled
 from .floor import add_floor, add_shadow
 from .lettering import Legend, in_seconds, lettered
@@ -25,7 +25,7 @@ Pixels = npt.NDArray[np.uint8]
 LAMPS = (((-1.0, 1.1, 1.2), 0.68), ((1.2, -0.3, 1.2), 0.42), ((0.3, 1.5, -1.2), 0.3))
 AMBIENT = 0.26  # light in the shade
 OCCLUSION = 0.05  # of the body's size: how far corners are dark
-FINER = 4  # pixels of VTK's supersampling to one of the picture, along each side
+FINER = 2  # pixels of VTK's supersampling to one of the picture, along each side
 HAIR = 1.5  # pixels: what opens by less is drawn as a line
 
 
@@ -56,7 +56,7 @@ class Stage:
         plotter.suppress_rendering = True  # or all that is added would be drawn at once
         plotter.clear_actors()
         aim(plotter, self._bounds, look)  # before what is drawn: the width of hairlines is in pixels
-        grid = moved(load(shot), look.explode, look.magnify)
+        grid = drawn_of(shot, look)
         self._add(body_of(grid))
         if not self._flat:
             self._add_hairlines(grid)
