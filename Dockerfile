@@ -20,7 +20,7 @@ ENV LANG=C.UTF-8 \
 FROM system AS build
 COPY . /src
 RUN python3 -m venv --system-site-packages --without-pip /opt/fracsim \
-    && python3 -m pip --python /opt/fracsim/bin/python install --no-cache-dir --no-deps --requirement /src/wheels.txt \
+    && python3 -m pip --python /opt/fracsim/bin/python install --no-cache-dir --no-deps --requirement /src/wheels.txt --requirement /src/files.txt \
     && python3 -m pip --python /opt/fracsim/bin/python install --no-cache-dir --no-index --no-deps --no-build-isolation /src
 
 FROM system

@@ -156,6 +156,24 @@ def render(
 
 
 @app.command()
+def export(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
+    kind: Annotated[str, typer.Option("--format", help="ply, obj, glb (a file a frame), usd (one with all of them)")],
+    target: Annotated[Path | None, typer.Option("-o", "--out", help="folder for the files (OUT/export)")] = None,
+    frame: Annotated[int | None, typer.Option(help="this one alone, from 0; -1 is the last")] = None,
+    dust: Annotated[bool, typer.Option("--dust/--no-dust", help="with pieces of a single node")] = True,
+    look: Annotated[str, typer.Option(help="colours, as of render")] = "",
+) -> None:
+    """Write the split surface of a run for Blender, Houdini and others: closed, in m."""
+    if not _is_root():
+        return
+    from .report.export import export
+
+    made = export(out, kind, target, frame=frame, dust=dust, look=look)
+    print(f"saved {made[0]}" + (f" and {len(made) - 1} more" if len(made) > 1 else ""))
+
+
+@app.command()
 def report(
     outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="folders of runs, sweeps, or of evidence")],
     html: Annotated[Path | None, typer.Option("-o", "--out", help="the page (OUT/report.html)")] = None,

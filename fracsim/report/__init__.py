@@ -2,6 +2,7 @@
 
 runs                a run folder as it is read
 pictures            `fracsim render`: the split surface off-screen
+export              `fracsim export`: surfaces for other programs
 sweep, outcome      `fracsim sweep`: a run for each combination of values; how each ended
 make                `fracsim report`
 compare, pareto     sections about runs; which settings are worth their cost

@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from ...mechanics.drawn import Drawn
 from ..own_files import FRAME
@@ -15,6 +16,8 @@ from .collection import Entry, collection_text, read_entries
 from .fragments import Fragments
 from .frame import Frame
 from .vtu import grid_of, grid_of_elements, write_vtu
+
+Values = npt.NDArray[np.float64]
 
 
 class SurfaceFiles:
@@ -92,15 +95,23 @@ def columns(dim: int, *, turning: bool = False) -> list[str]:
     axes = "xyz"[:dim]
     vectors = [f"{what}_{axis}" for what in ("centre", "velocity") for axis in axes]
     spin = [f"spin_{axis}" for axis in ("xyz" if dim == 3 else "z")]
-    turn = [f"turn_{axis}" for axis in "xyz"] if turning else []
+    turn = [*(f"turn_{axis}" for axis in "xyz"), *(f"quaternion_{part}" for part in "wxyz")] if turning else []
     return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn, "dust"]
 
 
 def _rows(t: float, pieces: Fragments) -> list[list[str]]:
-    turn = [] if pieces.turn is None else [pieces.turn]
+    turn = [] if pieces.turn is None else [pieces.turn, quaternions(pieces.turn)]
     dust = pieces.nodes == 1
     values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin, *turn, dust])
     return [
         [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
         for piece in np.argsort(pieces.name)
     ]
+
+
+def quaternions(turn: Values) -> Values:
+    """(p, 4) unit quaternions w, x, y, z, w >= 0, of rotation vectors (p, 3), rad: (cos a/2, sin(a/2) n)."""
+    half = np.linalg.norm(turn, axis=1, keepdims=True) / 2
+    vector = turn / 2 * np.sinc(half / np.pi)
+    made = np.concatenate([np.cos(half), vector], axis=1)
+    return np.asarray(np.where(made[:, :1] < 0, -made, made))

@@ -1,0 +1,187 @@
+"""`fracsim export`: the split surface of a run as files for Blender, Houdini and others, read from what a run wrote.
+
+Skin and inside have the colours of the study's look. PLY, OBJ and GLB by trimesh, a file a frame; USD by usd-core, one
+file with all frames in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from .pictures.body import is_crack, without_dust
+from .pictures.colouring import rgb
+from .pictures.shots import Shot, find_frames, load, study_of
+from .pictures.skins import Skin, skin_of
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+FORMATS = ("ply", "obj", "glb", "usd")
+USD_RATE = 24.0  # frames a second of its time
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A closed surface.
+
+    Attributes:
+        name: piece_000012.    points: (n, 3) m.    triangles: (k, 3), outwards.    crack: (k,) of the inside.
+    """
+
+    name: str
+    points: Values
+    triangles: Ints
+    crack: npt.NDArray[np.bool_]
+
+
+def export(
+    folder: Path, kind: str, target: Path | None = None, *, frame: int | None = None, dust: bool = True, look: str = ""
+) -> list[Path]:
+    """Write all frames, or one, into the folder `target` (OUT/export); returns the files. Without `dust`: no pieces of
+    a single node."""
+    if kind not in FORMATS:
+        raise InputError(f"--format {kind}: must be one of {', '.join(FORMATS)}")
+    shots = find_frames(folder)
+    if shots[0].index >= 0:
+        raise InputError(f"{folder} has no surface.pvd: set output.surface = true in the study, and run it again")
+    if frame is not None and not -len(shots) <= frame < len(shots):
+        raise InputError(f"--frame {frame}: {folder} has {len(shots)} frames, counted from 0 (-1 is the last)")
+    chosen = list(range(len(shots))) if frame is None else [frame % len(shots)]
+    target = target or folder / "export"
+    skin = skin_of(look or study_of(folder).get("output", {}).get("look", "plain"))
+    frames = ((number, pieces_of(shots[number], dust)) for number in chosen)
+    name = folder.resolve().name
+    target.mkdir(parents=True, exist_ok=True)
+    if kind == "usd":
+        return [_usd(target / f"{name}.usdc", frames, skin)]
+    write = {"ply": _ply, "obj": _obj, "glb": _glb}[kind]
+    made = []
+    for number, pieces in frames:
+        made.append(target / f"{name}_{number:06d}.{kind}")
+        write(made[-1], pieces, skin)
+    return made
+
+
+def pieces_of(shot: Shot, dust: bool = True) -> list[Piece]:
+    """The pieces of a frame, by their numbers. InputError of a body in 2D, which has no surface."""
+    grid = load(shot) if dust else without_dust(load(shot))
+    if not np.all(grid.celltypes == 5):
+        raise InputError(f"{shot.folder}: a body in 2D has no closed surface to export")
+    triangles, crack = np.asarray(grid.cell_connectivity).reshape(-1, 3), is_crack(grid)
+    points, of = np.asarray(grid.points, float), np.asarray(grid.cell_data["piece"])
+    order = np.argsort(of, kind="stable")
+    numbers, first = np.unique(of[order], return_index=True)
+    parts = zip(numbers, np.split(order, first[1:]), strict=True)
+    return [_piece(f"piece_{number:06d}", points, triangles[part], crack[part]) for number, part in parts]
+
+
+def _piece(name: str, points: Values, triangles: Ints, crack: npt.NDArray[np.bool_]) -> Piece:
+    used, numbered = np.unique(triangles, return_inverse=True)
+    return Piece(name, points[used], numbered.reshape(-1, 3), crack)
+
+
+# --- formats ---
+
+
+def _needed(name: str, package: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"--format: this one needs {package} (pip install {package})") from None
+
+
+def _colours(piece: Piece, skin: Skin) -> npt.NDArray[np.uint8]:
+    """(k, 4) of the triangles."""
+    table = np.array([[*rgb(each), 255] for each in (skin.skin, skin.inside)], np.uint8)
+    return np.asarray(table[piece.crack.astype(int)])
+
+
+def _mesh(piece: Piece, skin: Skin, points: Values | None = None) -> Any:
+    """As trimesh has it, with colours of faces."""
+    trimesh = _needed("trimesh", "trimesh")
+    at = piece.points if points is None else points
+    return trimesh.Trimesh(at, piece.triangles, face_colors=_colours(piece, skin), process=False)
+
+
+def _together(pieces: list[Piece]) -> Piece:
+    """All as one surface."""
+    start = np.cumsum([0, *(len(each.points) for each in pieces)])
+    triangles = [each.triangles + first for each, first in zip(pieces, start[:-1], strict=True)]
+    points, crack = np.concatenate([p.points for p in pieces]), np.concatenate([p.crack for p in pieces])
+    return Piece("body", points, np.concatenate(triangles), crack)
+
+
+def _ply(path: Path, pieces: list[Piece], skin: Skin) -> None:
+    """One surface; double precision."""
+    path.write_bytes(_mesh(_together(pieces), skin).export(file_type="ply", vertex_normal=False))
+
+
+def _obj(path: Path, pieces: list[Piece], skin: Skin) -> None:
+    """An object a piece: OBJ has no colours of faces, so groups say what is skin and what inside."""
+    lines, first = ["# m"], 1
+    for piece in pieces:
+        lines.append(f"o {piece.name}")
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*point) for point in piece.points]
+        for group, which in (("skin", ~piece.crack), ("inside", piece.crack)):
+            lines += [f"g {piece.name}_{group}"] if which.any() else []
+            lines += ["f {} {} {}".format(*corners) for corners in piece.triangles[which] + first]
+        first += len(piece.points)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _glb(path: Path, pieces: list[Piece], skin: Skin) -> None:
+    """A node a piece, at its middle: in single precision small pieces far away keep their shape. GLB has y upwards."""
+    trimesh = _needed("trimesh", "trimesh")
+    scene = trimesh.Scene()
+    upright = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+    for piece in pieces:
+        middle = (piece.points.min(axis=0) + piece.points.max(axis=0)) / 2
+        place = upright @ trimesh.transformations.translation_matrix(middle)
+        mesh = _mesh(piece, skin, piece.points - middle)
+        scene.add_geometry(mesh, node_name=piece.name, geom_name=piece.name, transform=place)
+    path.write_bytes(scene.export(file_type="glb"))
+
+
+def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin) -> Path:
+    """One mesh whose points and triangles are of their time, in m, z upwards; `piece` of each triangle beside them."""
+    Usd, UsdGeom, Sdf, Vt = (_needed(f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "Sdf", "Vt"))
+    stage = Usd.Stage.CreateNew(str(path)) if not path.exists() else Usd.Stage.Open(str(path))
+    stage.GetRootLayer().Clear()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(USD_RATE)
+    mesh = UsdGeom.Mesh.Define(stage, "/body")
+    stage.SetDefaultPrim(mesh.GetPrim())
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    api = UsdGeom.PrimvarsAPI(mesh)
+    colour = api.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.uniform)
+    piece_of = api.CreatePrimvar("piece", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+    attributes: list[tuple[Any, Callable[[Piece], Any]]] = [
+        (mesh.CreatePointsAttr(), lambda one: Vt.Vec3fArray.FromNumpy(one.points.astype(np.float32))),
+        (
+            mesh.CreateFaceVertexCountsAttr(),
+            lambda one: Vt.IntArray([3] * len(one.triangles)),
+        ),
+        (mesh.CreateFaceVertexIndicesAttr(), lambda one: Vt.IntArray.FromNumpy(one.triangles.astype(np.int32).ravel())),
+        (colour, lambda one: Vt.Vec3fArray.FromNumpy(_colours(one, skin)[:, :3].astype(np.float32) / 255)),
+    ]
+    numbers = []
+    for number, pieces in frames:
+        numbers.append(number)
+        one = _together(pieces)
+        for attribute, values in attributes:
+            attribute.Set(values(one), number)
+        of = np.repeat([int(each.name.split("_")[1]) for each in pieces], [len(each.triangles) for each in pieces])
+        piece_of.Set(Vt.IntArray.FromNumpy(of.astype(np.int32)), number)
+    stage.SetStartTimeCode(numbers[0])
+    stage.SetEndTimeCode(numbers[-1])
+    stage.GetRootLayer().Save()
+    return path
