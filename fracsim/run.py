@@ -108,8 +108,8 @@ class Run:
         self._watch(notes)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
-            fields=wanted_fields(study), surface=wants_surface(study), passing=self.passing, resume_at=t,
-            thickness=study.thickness,
+            fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
+            passing=self.passing, resume_at=t, thickness=study.thickness,
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
@@ -334,6 +334,13 @@ def wants_surface(study: Study) -> bool:
 
 
 def run_study(
+def wants_smooth(study: Study) -> bool:
+    """Whether cracks are drawn smooth: as the study says, or where it has a look and nothing touches what is drawn."""
+    if study.output.cut is None:
+        return study.output.look != "plain" and study.contact is None and not study.obstacle
+    return study.output.cut == "smooth"
+
+
     comm: MPI.Comm,
     study: Study,
     folder: Path,

@@ -138,7 +138,7 @@ def test_every_default_is_written() -> None:
         "beta": 0.25, "gamma": 0.5, "rho": 0.8
     }  # fmt: skip
     assert data["fracture"] == {
-        "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6,
+        "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6, "crumbs": True,
             "unilateral": False,
     }  # fmt: skip
     assert "plasticity" not in data

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from fracsim.mesh.split.build import Split, split
 from fracsim.mesh.split.follow import Rotations
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.mesh.split.skeleton import CRACK, Skeleton
+from fracsim.mesh.split.smooth import KEPT, smooth_cuts
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import boundary_facets, signed_measures
 from support.solids import (
@@ -137,6 +138,34 @@ def test_fill_covers_the_body_once(dim: int) -> None:
 
 
 # --- cuts with a place ---
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_smooth_cuts_make_a_crack_flat(dim: int) -> None:
+    """A random mesh cut between the nodes on both sides of a plane: half of the roughness of cuts in the middle and
+    less, away from the boundary; closed and with the volume of the mesh, each end with its share of the edge."""
+    mesh = cloud(dim, 3, nodes=1000)
+    skeleton = Skeleton(mesh)
+    broken = separated(skeleton, (mesh.points[:, 0] > 0.5).astype(int))
+    cut = smooth_cuts(skeleton, broken)
+    assert np.array_equal(~np.isnan(cut), broken) and cut[broken].min() >= KEPT and cut[broken].max() <= 1 - KEPT
+    rough, smooth = (torn(mesh, broken, each) for each in (None, cut))
+    crack = [made.points[np.unique(made.elements[made.origin == CRACK])] for made in (rough, smooth)]
+    inner = [each[(np.abs(each[:, 1:] - 0.5) < 0.3).all(axis=1), 0] for each in crack]
+    assert np.std(inner[1]) < 0.5 * np.std(inner[0])
+    assert_closed(smooth)
+    assert_volume(mesh, smooth)
+
+
+def test_smooth_cuts_leave_a_place_that_is_known() -> None:
+    mesh = cloud(3, 5, nodes=100)
+    skeleton = Skeleton(mesh)
+    broken = separated(skeleton, (mesh.points[:, 0] > 0.5).astype(int))
+    known = np.where(broken & (np.arange(len(broken)) % 3 == 0), 0.21, np.nan)
+    cut = smooth_cuts(skeleton, broken, known)
+    given = ~np.isnan(known)
+    assert (cut[given] == 0.21).all() and np.isfinite(cut[broken]).all() and np.unique(cut[broken & ~given]).size > 9
+    assert np.isnan(smooth_cuts(skeleton, np.zeros_like(broken))).all()
 
 
 @pytest.mark.parametrize("dim", DIMS)

@@ -34,12 +34,14 @@ class FrameFiles:
         *,
         fields: list[str],
         surface: bool,
+        smooth: bool = False,
         passing: Passing | None = None,
         resume_at: float | None = None,
         thickness: float = 1.0,
     ) -> None:
-        """`fields`: by the names of output.fields; `passing`: watches pieces that nothing keeps apart; `resume_at`:
-        keep the frames up to this time, s; `thickness`: m, of a 2D body (collective).
+        """`fields`: by the names of output.fields; `smooth`: cracks are drawn so; `passing`: watches
+        pieces that nothing keeps apart; `resume_at`: keep the frames up to this time, s; `thickness`: m, of a 2D body
+        (collective).
 
         Raises CannotWrite.
         """
@@ -47,7 +49,9 @@ class FrameFiles:
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
         self._values, source = Frames(stress, fields, breaking), stress.domain.source
         self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
-        self.surface = _surface(folder, balance, breaks, passing, resume_at, thickness) if surface else None
+        self.surface = None
+        if surface:
+            self.surface = _surface(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
 
     def write(self, state: State) -> None:
         """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
@@ -62,13 +66,20 @@ class FrameFiles:
 
 
 def _surface(
-    folder: Path, balance: Balance, breaks: Breaks, passing: Passing | None, resume_at: float | None, thickness: float
+    folder: Path,
+    balance: Balance,
+    breaks: Breaks,
+    passing: Passing | None,
+    resume_at: float | None,
+    thickness: float,
+    *,
+    smooth: bool,
 ) -> SurfaceOutput:
     """The split surface: imported, built and kept only where it is wanted."""
     from .surface.output import SurfaceOutput
 
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
-        folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at,
+        folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at, smooth=smooth,
         apart=[term.apart for term in terms if term.keeps_apart], beside=[term for term in terms if term.visible],
     )  # fmt: skip

@@ -149,7 +149,9 @@ class Output(Table):
     interval: Positive | None = None  # s
     fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
     surface: Flag | None = None  # the split surface and pieces.csv; default: with [fracture] or an [[obstacle]]
-    cut: Literal["middle", "forces"] = "middle"  # where broken edges are cut: in proportion to the nodal forces
+    # where broken edges are cut: in proportion to the nodal forces, or so that cracks are smooth; default: smooth where
+    # there is a look and nothing touches, else in the middle
+    cut: Literal["middle", "forces", "smooth"] | None = None
     picture: Flag = True  # a PNG of the last frame
     look: Annotated[  # type: ignore[valid-type]
         Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[Colours, Tag("<colours>")],

@@ -13,6 +13,7 @@ from ...mesh.split.build import Split, split
 from ...mesh.split.follow import Rotations
 from ...mesh.split.places import Places, whole
 from ...mesh.split.skeleton import BODY, Skeleton
+from ...mesh.split.smooth import smooth_cuts
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
 from ..fields_file import Field
@@ -60,8 +61,10 @@ class Surface:
 
     split: Split
 
-    def __init__(self, mesh: MeshData, density: Values | float) -> None:
-        """`density`: kg/m^3, one number or (C,)."""
+    def __init__(self, mesh: MeshData, density: Values | float, *, smooth: bool = False) -> None:
+        """`density`: kg/m^3, one number or (C,).    `smooth`: edges without a place of their cut get one that makes
+        cracks smooth."""
+        self._smooth = smooth
         self.skeleton = Skeleton(mesh)
         volume = signed_measures(mesh.points, mesh.cells)
         share = np.broadcast_to((density * volume / (mesh.dim + 1))[:, None], mesh.cells.shape)
@@ -91,6 +94,8 @@ class Surface:
             self._names.update(count, piece, self.mass)
 
     def _build(self, cut: Values | None) -> None:
+        if self._smooth:
+            cut = smooth_cuts(self.skeleton, self.skeleton.broken_edges(self._pattern), cut)
         made = split(self.skeleton, self._pattern, cut)
         self.split = made
         self.names = self._names.update(made.pieces, made.piece_of_node, self.mass)

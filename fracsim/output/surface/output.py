@@ -41,11 +41,13 @@ class SurfaceOutput:
         apart: Sequence[Apart] = (),
         beside: Sequence[Term] = (),
         passing: Passing | None = None,
+        smooth: bool = False,
         resume_at: float | None = None,
     ) -> None:
         """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint.
 
         `beside`: terms that are drawn with the body.    `passing`: where nothing keeps its pieces apart.
+        `smooth`: cracks are drawn so.
         """
         self._domain, self.record, self._apart, self._beside, self._passing = domain, record, apart, beside, passing
         everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
@@ -54,7 +56,7 @@ class SurfaceOutput:
         def begin() -> tuple[Surface, SurfaceFiles]:
             assert domain.source is not None
             files = SurfaceFiles(folder, domain.dim, resume_at)
-            surface = Surface(domain.source, everywhere)  # type: ignore[arg-type]
+            surface = Surface(domain.source, everywhere, smooth=smooth)  # type: ignore[arg-type]
             if broken is not None and resume_at is not None:
                 surface.replay(surface.skeleton.of_edges(broken[0], broken[1][:, 0]), files.times)
             return surface, files
