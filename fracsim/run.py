@@ -88,8 +88,9 @@ class Run:
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.restored()
         self.state = scene.stepper.resume(state)
-        if notes.values()["time"]["step"] != scene.study.time.step:  # else the size of the last step goes on
-            self.state = replace(self.state, dt=scene.study.time.step)
+        asked = scene.study.model_dump(mode="json")["time"]["step"]
+        if notes.values()["time"]["step"] != asked:  # else the size of the last step goes on
+            self.state = replace(self.state, dt=scene.study.time.longest)
         return notes
 
     def _prepare(self, notes: Notes | None) -> None:
@@ -333,7 +334,6 @@ def wants_surface(study: Study) -> bool:
     return study.output.surface
 
 
-def run_study(
 def wants_smooth(study: Study) -> bool:
     """Whether cracks are drawn smooth: as the study says, or where it has a look and nothing touches what is drawn."""
     if study.output.cut is None:
@@ -341,6 +341,7 @@ def wants_smooth(study: Study) -> bool:
     return study.output.cut == "smooth"
 
 
+def run_study(
     comm: MPI.Comm,
     study: Study,
     folder: Path,

@@ -30,7 +30,7 @@ from ..stepping.state import State
 from ..stepping.stepper import Stepper, StepSizes
 from ..study import Study, Time
 from ..study.check import checked_mesh
-from ..study.conditions import initial_motion, obstacles, of_size, place_of
+from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course
 from .breaking import breaking_of, flow_of
 from .material import material_of
 from .terms import TERMS, Parts, balance_of
@@ -100,8 +100,10 @@ def make_scheme(timing: Time) -> Scheme:
 
 def make_stepper(balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None) -> Stepper:
     """What steps a balance of this scheme."""
-    sizes = StepSizes(timing.step, timing.end, timing.smallest or timing.step / 1024, timing.adapt,
-                      timing.breaking_step or math.inf)  # fmt: skip
+    smallest, course = timing.smallest or timing.shortest / 1024, step_course(timing)
+    sizes = StepSizes(
+        timing.longest, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course
+    )  # fmt: skip
     if solver is None:
         from ..stepping.explicit import ExplicitStepper
 

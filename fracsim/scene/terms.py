@@ -158,4 +158,4 @@ def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialF
     stress = Stress(assembler, u, material, weakening, floor=floor)
     parts = Parts(study, scheme, assembler, u, density, stress, mass, motion, entries)
     others = [term for make in TERMS.values() if (term := make(parts)) is not None]
-    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.step)
+    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.longest)

@@ -50,7 +50,7 @@ class ExplicitStepper(BalanceStepper):
         stable = SAFETY * stable_step(highest, self._a, self._b)
         left = self.sizes.end - state.t
         # equal steps to the end rather than a sliver: rounding up never exceeds the bound
-        dt = min(state.dt, stable)
+        dt = min(state.dt, stable, self.sizes.at(state.t))
         return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
 
     def _of_edges(self) -> EdgeFrequencies | None:

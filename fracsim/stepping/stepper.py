@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ..errors import NotConverged
 from ..mechanics.balance import Balance
+from ..mechanics.time_functions import Tabulated
 from ..mesh.ranks import total
 from .after_step import Breaking, Flow, PassResult
 from .energy_book import acting, work_done
@@ -54,13 +55,21 @@ class StepReport:
 @dataclass(frozen=True)
 class StepSizes:
     """Sizes of steps, s: the largest, the end of the run, the smallest; `adapt`: halve a step that fails; `breaking`:
-    the longest in which edges may break."""
+    the longest in which edges may break; `course`: the largest at a time, where it is not the same all the time."""
 
     step: float
     end: float
     smallest: float
     adapt: bool = True
     breaking: float = math.inf
+    course: Tabulated | None = None
+
+    def at(self, t: float) -> float:
+        """The largest step from time t (s) on: steps end where the course has a corner, or one would leap over it."""
+        if self.course is None:
+            return self.step
+        later = self.course.times[self.course.times > t * (1 + 1e-9) + 1e-9 * self.smallest]
+        return min(float(self.course(t)[0]), float(np.min(later - t, initial=math.inf)))
 
 
 class TooLong(Exception):
@@ -207,8 +216,8 @@ class BalanceStepper:
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end, and no sliver left over before it."""
-        left = self.sizes.end - state.t
-        return left if left < state.dt * (1 + 1e-9) else state.dt
+        left, dt = self.sizes.end - state.t, min(state.dt, self.sizes.at(state.t))
+        return left if left < dt * (1 + 1e-9) else dt
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
         """Solve the step: the balance is left at what was found, whether that is a solution or not."""

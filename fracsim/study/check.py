@@ -234,9 +234,12 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         price = _PRICE_OF_CONTACT[study.time.kind.implicit]
         yield f"contact     {of}, friction {study.contact.friction:g}; {price}"
         yield f"            its surface has {anatomy.surface()}, {_MORE}"
-    steps = study.time.end / study.time.step
+    timing = study.time
+    steps = f"{timing.end / timing.longest:.0f} steps of {timing.longest:g} s"
+    if timing.shortest < timing.longest:
+        steps = f"steps of {timing.shortest:g} to {timing.longest:g} s"
     halving = "halved where a step fails" if study.time.adapt else "fixed"
-    yield f"time        {study.time.scheme}, {steps:.0f} steps of {study.time.step:g} s, {halving}"
+    yield f"time        {study.time.scheme}, {steps}, {halving}"
     if study.time.breaking_step is not None:
         yield f"            steps in which edges break are {study.time.breaking_step:g} s at most"
     if (until := study.time.until) is not None:
@@ -266,7 +269,7 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     lasting = "Hertz's time" if contact.contact_time is None else f"{contact.contact_time:g} s"
     restitution = contact.restitution or 0.0
     yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, a blow lasts {lasting}"
-    yield f"time        rigid, {study.time.end / study.time.step:.0f} steps of {study.time.step:g} s"
+    yield f"time        rigid, {study.time.end / study.time.longest:.0f} steps of {study.time.longest:g} s"
 
 
 # Measured of boxes of 25,000 and 207,000 tetrahedra, of which nothing touched anything: two obstacles and a body alone.
@@ -305,7 +308,7 @@ def _may_ring(study: Study) -> bool:
     h, material = study.mesh.parameters.get("h"), study.material
     if study.time.scheme != "newmark" or material.energy == "linear" or not isinstance(h, int | float):
         return False
-    return study.time.step * float(np.sqrt(material.young / material.density)) > RINGS * h
+    return study.time.longest * float(np.sqrt(material.young / material.density)) > RINGS * h
 
 
 def _size(anatomy: Anatomy) -> str:

@@ -19,7 +19,7 @@ from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
 from ..mesh.cracks import Crack, plane, polygon, segment
 from ..mesh.places import Group, InBox, OnPlane, Place
 from ..meshes.words import AXES
-from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, TimeTable
+from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, Time, TimeTable
 from .breaking import Crack as CrackTable
 
 Flags = npt.NDArray[np.bool_]
@@ -279,6 +279,11 @@ def fibre_direction(study: Study, dim: int) -> Values | None:
     """(d,) of [fracture.fibre]; None without the table."""
     fibre = study.fracture.fibre if study.fracture is not None else None
     return None if fibre is None else of_size(fibre.direction, dim, "fracture.fibre.direction")
+
+
+def step_course(timing: Time) -> Tabulated | None:
+    """The longest step, s, at a time; None where it is the same all the time."""
+    return in_time(timing.step, "time.step", 1) if isinstance(timing.step, TimeTable) else None
 
 
 def in_time(value: Any, key: str, size: int) -> Tabulated:

@@ -9,7 +9,7 @@ from pydantic import Discriminator, Field, Tag, create_model, field_validator, m
 
 from ..forms.schemes import SCHEMES, Scheme
 from .loading import Where
-from .values import Finite, Flag, NonNegative, Positive, Seconds, Table, Vector
+from .values import Finite, Flag, InTime, NonNegative, Positive, Seconds, Table, TimeTable, Vector
 
 
 class Until(Table):
@@ -24,7 +24,7 @@ class Timing(Table):
     """[time]: scheme and steps, without the parameters of the schemes."""
 
     scheme: str = "generalized-alpha"
-    step: Seconds  # s
+    step: InTime[Seconds]  # s; a table: of the time at which a step begins
     end: Seconds  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
     smallest: Seconds | None = None  # s; default step / 1024
@@ -38,16 +38,28 @@ class Timing(Table):
         return SCHEMES[self.scheme]
 
     @property
+    def longest(self) -> float:
+        """The longest step, s."""
+        return max(self.step.value) if isinstance(self.step, TimeTable) else self.step
+
+    @property
+    def shortest(self) -> float:
+        """The shortest step that a study asks for, s."""
+        return min(self.step.value) if isinstance(self.step, TimeTable) else self.step
+
+    @property
     def parameters(self) -> dict[str, float]:
         """What the scheme takes: the table has the parameters of all schemes, whichever it is."""
         return {each.name: getattr(self, each.name) for each in fields(self.kind)}
 
     @model_validator(mode="after")
     def _order(self) -> Timing:
-        if self.step > self.end:
-            raise ValueError(f"step = {self.step:g} s is longer than the run: end = {self.end:g} s")
-        if self.smallest is not None and self.smallest > self.step:
-            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.step:g} s")
+        if self.longest > self.end:
+            raise ValueError(f"step = {self.longest:g} s is longer than the run: end = {self.end:g} s")
+        if self.smallest is not None and self.smallest > self.shortest:
+            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.shortest:g} s")
+        if self.scheme == "rigid" and isinstance(self.step, TimeTable):
+            raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
         if self.breaking_step is not None:
             self._check_breaking_step(self.breaking_step)
         self.kind(**self.parameters).check()
@@ -58,10 +70,10 @@ class Timing(Table):
     def _check_breaking_step(self, step: float) -> None:
         if not self.kind.implicit:
             raise ValueError(f'breaking_step is for implicit and quasi-static steps, not scheme = "{self.scheme}"')
-        if not (self.smallest or self.step / 1024) <= step <= self.step:
+        smallest = self.smallest or self.shortest / 1024
+        if not smallest <= step <= self.longest:
             raise ValueError(
-                f"breaking_step = {step:g} s must lie between smallest = {self.smallest or self.step / 1024:g} s and "
-                f"step = {self.step:g} s"
+                f"breaking_step = {step:g} s must lie between smallest = {smallest:g} s and step = {self.longest:g} s"
             )
 
 
