@@ -244,6 +244,9 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield f"            steps in which edges break are {study.time.breaking_step:g} s at most"
     if (until := study.time.until) is not None:
         yield f"            ends where the force on {study.watched} has fallen by {until.drop:.0%} from its peak"
+    if study.fracture is not None and study.material.energy == "linear" and study.time.kind.inertia:
+        yield '            note: with energy = "linear" pieces that come off and turn swell by 1/cos of their angle;'
+        yield '            "corotated" costs little more, and turns them as they are'
     if _may_ring(study):
         yield "            note: in steps this long Newmark's method may gain energy at large strains;"
         yield '            scheme = "generalized-alpha" does not'
