@@ -91,8 +91,8 @@ class RigidRun:
         state, split = self.state, stepper.copies.split_cells
         lost = self._start + state.work - report.kinetic
         self.history.append_row([
-            state.step, state.t, self.scene.study.time.longest, report.kinetic, 0.0, lost, state.work, self.broken, split,
-            len(state.bodies), report.blows + report.loads, report.krylov, report.seconds,
+            state.step, state.t, self.scene.study.time.longest, report.kinetic, 0.0, lost, state.work, self.broken,
+            split, len(state.bodies), report.blows + report.loads, report.krylov, report.seconds,
             *map(float, report.pushed.flat), *map(float, report.worked),
         ])  # fmt: skip
         return report

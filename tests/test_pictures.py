@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,22 @@ def test_magnified_displacements(tmp_path: Path) -> None:
     columns = np.flatnonzero(row)
     gap = np.count_nonzero(~row[columns.min() : columns.max()])
     assert gap / np.ptp(columns) == pytest.approx(2 / 8, abs=0.08)
+
+
+def test_dust_is_hidden_on_request(tmp_path: Path) -> None:
+    """A corner of the bar that flew off to the left is red on the picture, or it is not; the bar is."""
+    mesh = lattice(6, 1, 1)
+    surface = Surface(mesh, 1.0)
+    corner = int(np.argmin(mesh.points.sum(axis=1)))
+    part = (np.arange(len(mesh.points)) == corner).astype(int)
+    surface.update(patterns(surface.skeleton, separated(surface.skeleton, part)))
+    u = np.zeros_like(mesh.points)
+    u[corner, 0] = -1.0
+    SurfaceFiles(tmp_path, 3).write(surface.at(0.0, u, np.zeros_like(u)))
+    far = Look(view="front", size=SMALL, skin=FRONT.skin, bare=True, zoom=0.6)
+    shown_all, without = (shown(render(tmp_path, look=each)) for each in (far, replace(far, dust=False)))
+    with_dust, bar = (np.flatnonzero(of_hue(each, 0).any(axis=0)) for each in (shown_all, without))
+    assert np.diff(with_dust).max() > 8 and np.diff(bar).max() == 1
 
 
 # --- colours and what is to be read ---
