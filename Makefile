@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all readers bench table report report-full lint format clean
+.PHONY: demo test test-all readers bench table report report-full gallery lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -49,6 +49,10 @@ report:
 report-full:
 	./env python3 -m fracsim.studies.evidence out/evidence --full
 	./env fracsim report out/evidence
+
+# Pictures of docs/gallery.md: what has been run is not run again.
+gallery:
+	./env python3 -m fracsim.studies.gallery
 
 # mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
 lint:

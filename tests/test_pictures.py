@@ -192,14 +192,20 @@ def test_a_floor_has_the_shadow_of_what_stands_on_it(tmp_path: Path) -> None:
 
 
 def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
-    """In place of its slab: nothing of its colour is left, and the shadow lies where the plane is, below the bar."""
+    """In place of its slab, not of a wall, and the shadow lies where the plane is, below the bar."""
     folder = written(tmp_path, 0.0, cut=False)
     frame = Surface(lattice(6, 1, 1), 1.0)
     x = np.array([[-9.0, -9, -2], [9, -9, -2], [0, 9, -2]])
     none = np.zeros_like(frame.skeleton.points)
-    drawn = {"table": Drawn(x, np.array([[0, 1, 2]]), np.empty((0, 2), int))}
+    behind = np.array([[-1.0, 3, 0], [1, 3, 0], [0, 3, 1]])
+    drawn = {
+        name: Drawn(each, np.array([[0, 1, 2]]), np.empty((0, 2), int))
+        for name, each in (("wall", behind), ("table", x))
+    }
     SurfaceFiles(folder, 3).write(frame.at(0.0, none, none), drawn)
-    (folder / "study.toml").write_text('[[obstacle]]\nname = "table"\nshape = "plane"\nnormal = [0.0, 0.0, 1.0]\n')
+    wall = '[[obstacle]]\nname = "wall"\nshape = "plane"\nnormal = [0.0, -1.0, 0.0]\n'
+    table = '[[obstacle]]\nname = "table"\nshape = "plane"\nnormal = [0.0, 0.0, 1.0]\n'
+    (folder / "study.toml").write_text(wall + table)
     look = Look(view="0.3,-1.5,1.2", size=SMALL, skin=FRONT.skin, bare=True)
     slab, floor = (shown(render(folder, look=each)) for each in (look, Look(**{**vars(look), "floor": True})))
     solid = [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]

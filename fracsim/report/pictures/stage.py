@@ -25,6 +25,7 @@ Pixels = npt.NDArray[np.uint8]
 LAMPS = (((-1.0, 1.1, 1.2), 0.68), ((1.2, -0.3, 1.2), 0.42), ((0.3, 1.5, -1.2), 0.3))
 AMBIENT = 0.26  # light in the shade
 OCCLUSION = 0.05  # of the body's size: how far corners are dark
+LEVEL = 0.5  # least share of its normal that is upwards, of a floor
 FINER = 2  # pixels of VTK's supersampling to one of the picture, along each side
 HAIR = 1.5  # pixels: what opens by less is drawn as a line
 
@@ -121,11 +122,13 @@ class Stage:
     # --- around it ---
 
     def _add_floor(self, shot: Shot, body: Body) -> list[str]:
-        """One where an obstacle plane is, else below all; returns the obstacles that it stands for."""
+        """One where the most level obstacle plane is, else below all; returns the obstacles that it stands for."""
         import pyvista
 
         planes = planes_of(self._study)
-        floors = [(file, name) for file, name in zip(shot.beside, shot.names, strict=True) if name in planes]
+        there = [(file, name) for file, name in zip(shot.beside, shot.names, strict=True) if name in planes]
+        floors = sorted(there, key=lambda each: -_level(planes[each[1]]))[:1]
+        floors = [each for each in floors if _level(planes[each[1]]) > LEVEL]
         normal, point = np.array([0.0, 0, 1]), np.array([*self._bounds.reshape(3, 2).mean(axis=1)[:2], self._lower])
         if floors:
             normal = planes[floors[0][1]] / np.linalg.norm(planes[floors[0][1]])
@@ -178,6 +181,11 @@ class Stage:
         wide = pixel(self._plotter, look.size[1])
         time = in_seconds(shot.t) + (f", displacements x {look.magnify:g}" if look.magnify != 1 else "")
         return lettered(pixels, title=chosen, time=time, pixel=wide, legend=legend, keys=keys)
+
+
+def _level(normal: Values) -> float:
+    """1 of what faces upwards, 0 of a wall."""
+    return float(normal[2] / np.linalg.norm(normal))
 
 
 def range_of(shot: Shot, colour: str) -> tuple[float, float] | None:

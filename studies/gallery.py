@@ -1,0 +1,140 @@
+"""The gallery: pictures of studies, made by the commands that stand below them. `make gallery` makes all of them again.
+
+    python3 -m fracsim.studies.gallery [NAME ...] [--again]
+
+A run that is there and has ended is not run again, unless --again says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+LARGEST = 300_000  # bytes of a picture
+PAGE = Path("docs/gallery.md")
+RUNS = Path("out/gallery")
+HEAD = """# Gallery
+
+Each picture is made by the commands below it; `make gallery` makes all of them again. Seconds are of processor time,
+on one rank.
+
+"""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A picture.
+
+    Attributes:
+        name: of its file.    text: what is seen.    runs: arguments of `fracsim run` with the name of the folder first.
+        render: arguments of `fracsim render` but for its folders and files.
+    """
+
+    name: str
+    text: str
+    runs: tuple[tuple[str, str], ...]
+    render: str
+
+
+def one(study: str, text: str, render: str) -> Entry:
+    """A picture of a study as it comes."""
+    return Entry(study, text, ((study, study),), render)
+
+
+CUTS = "--set mesh.h=0.012 --set time.end=0.2 --set output.cut="
+ENTRIES = (
+    one("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,15,20,-1 --floor"),
+    Entry(
+        "cuts", "Edges cut in the middle, by nodal forces, and so that the crack is smooth (M22 fig. 12).",
+        tuple((f"cut-{each}", f"loaf {CUTS}{each}") for each in ("middle", "forces", "smooth")),
+        "--view 1.1,-1.0,0.5 --zoom 1.4 --size 1400x1100",
+    ),
+    one("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
+    one("notched-bar", "A bar bent over its notch, displacements ten times as large.", "--magnify 10"),
+    one("cylinder", "Granite snapped beside its grips, cracks as lines that hardly open.", "--view 0.6,-1.6,0.5"),
+    one("struck-vase", "A porcelain vase, struck on its belly: at most 150 surfaces.", "--floor --zoom 1.2"),
+    one("wall", "A wall of adobe, struck and broken along its grains.", "--view 0.5,-1.6,0.5 --floor"),
+    one("rigid-wall", "The same of rigid bodies, later.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor --zoom 1.3"),
+    one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor --zoom 1.3"),
+    one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor --zoom 1.6"),
+    one("brazilian", "A disk of granite split between platens.", "--field stress:xx"),
+    one("doormat", "A doormat torn along one line.", "--view=-1.2,-0.5,0.35"),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Run what has not run, draw, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(entry.name for entry in ENTRIES)}")
+    parser.add_argument("--again", action="store_true", help="also what has run")
+    asked = parser.parse_args()
+    if unknown := set(asked.names) - {entry.name for entry in ENTRIES}:
+        sys.exit(f"no picture is called {', '.join(sorted(unknown))}")
+    for entry in ENTRIES:
+        if not asked.names or entry.name in asked.names:
+            make(entry, again=asked.again)
+    PAGE.write_text(HEAD + "".join(text_of(entry) for entry in ENTRIES if picture_of(entry).exists()))
+
+
+def make(entry: Entry, *, again: bool) -> None:
+    """Its runs and its picture."""
+    for folder, arguments in entry.runs:
+        if again or not has_ended(RUNS / folder):
+            command = ["fracsim", "run", *shlex.split(arguments), "-o", str(RUNS / folder), "--overwrite"]
+            subprocess.run([*command, "--set", "output.picture=false"], check=True)
+    folders = [str(RUNS / folder) for folder, _ in entry.runs]
+    target = picture_of(entry)
+    subprocess.run(["fracsim", "render", *folders, "-o", str(target), *shlex.split(entry.render)], check=True)
+    make_small(target)
+
+
+def has_ended(folder: Path) -> bool:
+    """A run is there, to its end."""
+    try:
+        return bool(json.loads((folder / "summary.json").read_text())["outcome"] == "done")
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def make_small(path: Path) -> None:
+    """In 256 colours where it is larger than LARGEST."""
+    from PIL import Image
+
+    if path.stat().st_size > LARGEST:
+        with Image.open(path) as image:
+            small = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        small.save(path, optimize=True)
+
+
+def picture_of(entry: Entry) -> Path:
+    """Beside the page."""
+    return PAGE.parent / "gallery" / f"{entry.name}.png"
+
+
+def text_of(entry: Entry) -> str:
+    """Its part of the page."""
+    seconds = sum(cpu_of(RUNS / folder) for folder, _ in entry.runs)
+    lines = [f"    ./env fracsim run {arguments} -o {RUNS / folder}" for folder, arguments in entry.runs]
+    folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
+    lines.append(f"    ./env fracsim render {folders} {entry.render}")
+    body = "\n".join(lines)
+    return (
+        f"## {entry.name}\n\n![{entry.text}](gallery/{entry.name}.png)\n\n{entry.text} {seconds:.0f} s.\n\n{body}\n\n"
+    )
+
+
+def cpu_of(folder: Path) -> float:
+    """s of processor time."""
+    try:
+        return float(json.loads((folder / "summary.json").read_text())["cpu"])
+    except (OSError, ValueError, KeyError):
+        return 0.0
+
+
+if __name__ == "__main__":
+    main()
