@@ -21,7 +21,7 @@ import ufl
 from ufl.core.expr import Expr
 from ufl.form import Form
 
-from .balance import ONE_POINT
+from .balance import points_of_stress
 from .energies import Around, Energy
 from .kinematics import deformation_gradient, embed, symmetric_components
 
@@ -94,7 +94,8 @@ class ImplicitFlow:
     def work(self, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
         """int chi (tau_t - beta s) : grad w F^-1 dX in N m; grad w F_p^-1 is the variation of F_e."""
         trial = Trial(self.energy, u, rotation)
-        return chi * ufl.inner(trial.P - self._flow(trial)[0] * trial.s, self._part(w)) * dx(metadata=ONE_POINT)
+        stress = trial.P - self._flow(trial)[0] * trial.s
+        return chi * ufl.inner(stress, self._part(w)) * dx(metadata=points_of_stress(w))
 
     def tangent(self, u: Expr, v: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
         """Its derivative in direction v, for d tau_t = C : d with C = 2 mu dev + kappa I x I at small elastic strain:
@@ -113,7 +114,7 @@ class ImplicitFlow:
         total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes
         if self.frobenius:
             total -= rising * kappa * ufl.inner(trial.pull, of_v) * ufl.inner(trial.s, of_w)
-        return chi * total * dx(metadata=ONE_POINT)
+        return chi * total * dx(metadata=points_of_stress(w))
 
     def _part(self, field: Expr) -> Expr:
         """grad field F_p^-1, 3 x 3."""

@@ -109,7 +109,7 @@ class Balance:
         """Owned cells with a prescribed dof."""
         touched = np.zeros(len(self.domain.nodes), bool)
         touched[self.motion.dofs // self.domain.dim] = True
-        return np.flatnonzero(touched[self.domain.cell_nodes].any(axis=1)).astype(np.int32)
+        return np.flatnonzero(touched[self.domain.all_cell_nodes].any(axis=1)).astype(np.int32)
 
     # --- a step, or a look at a state ---
 

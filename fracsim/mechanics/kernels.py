@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import basix
+import basix.ufl
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -18,6 +20,7 @@ from dolfinx import fem
 from dolfinx.jit import get_options
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
+from ufl.algorithms import extract_coefficients
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
@@ -148,25 +151,72 @@ def labelled_anew(expression: Expr) -> Expr:
 
 
 class CellExpression:
-    """A UFL expression that is constant in each cell, evaluated by a compiled kernel into an array that is kept."""
+    """A UFL expression as its mean over each cell, evaluated by a compiled kernel into an array that is kept.
 
-    def __init__(self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int) -> None:
+    What depends on F alone is constant in a cell with linear displacement, and asked for at its centre; with quadratic
+    displacement at the points where stress is integrated, which have equal weights.
+
+    Attributes:
+        width: components of the expression.    count: points of a cell.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int, points: npt.NDArray[np.float64] | None = None
+    ) -> None:
+        """`points`: (count, d) of the reference cell; None: by the fields that the expression is made of."""
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
+        points = _points_of(mesh, expression) if points is None else points
+        self.count = len(points)
         self._compiled = compile_together(
             comm,
-            lambda: fem.Expression(
-                labelled_anew(expression), _CENTRE[mesh.topology.dim], comm=comm, jit_options=jit_options()
-            ),
+            lambda: fem.Expression(labelled_anew(expression), points, comm=comm, jit_options=jit_options()),
         )
         self._all = np.arange(cells, dtype=np.int32)
         self._values: npt.NDArray[np.float64] | None = None
 
     def __call__(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
         """(cells, width) values on all owned cells (an array that the next such call overwrites) or on those given."""
+        values = self.at_points(cells)
+        return values if self.count == 1 else values.reshape(-1, self.count, self.width).mean(axis=1)
+
+    def at_points(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
+        """(cells, count width) the same at each of the points."""
         if cells is None:
             if self._values is None:
-                self._values = np.empty((len(self._all), self.width))
+                self._values = np.empty((len(self._all), self.count * self.width))
             return evaluate(self._compiled, self.mesh, self._all, self._values)
-        return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.width)))
+        return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.count * self.width)))
+
+
+def point_expression(domain: Domain, expression: Expr) -> CellExpression:
+    """An expression whose `at_points` are those of a `point_field`."""
+    points = stress_points(domain.mesh) if domain.order == 2 else _CENTRE[domain.dim]
+    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points)
+
+
+def _points_of(mesh: Mesh, expression: Expr) -> npt.NDArray[np.float64]:
+    """(count, d) points of the reference cell that do for an expression."""
+    fields = [field.ufl_element() for field in extract_coefficients(expression)]
+    quadratic = any(element.embedded_superdegree > 1 for element in fields)
+    return stress_points(mesh) if quadratic else _CENTRE[mesh.topology.dim]
+
+
+def stress_points(mesh: Mesh) -> npt.NDArray[np.float64]:
+    """(3 or 4, d) points of the reference cell where stress is integrated with quadratic displacement
+    (forms.balance.points_of_stress)."""
+    points: npt.NDArray[np.float64] = np.asarray(basix.make_quadrature(mesh.basix_cell(), STRESS_DEGREE)[0])
+    return points
+
+
+STRESS_DEGREE = 2  # of the quadrature of a stress where displacement is quadratic
+
+
+def point_field(domain: Domain, shape: tuple[int, ...], name: str) -> fem.Function:
+    """A field of scalars or tensors with a value at each point where stress is integrated, those of a cell one after
+    the other in `x.array`; DG0 with linear displacement."""
+    if domain.order == 1:
+        return fem.Function(fem.functionspace(domain.mesh, ("DG", 0, shape)), name=name)
+    element = basix.ufl.quadrature_element(domain.mesh.basix_cell(), shape, degree=STRESS_DEGREE)
+    return fem.Function(fem.functionspace(domain.mesh, element), name=name)

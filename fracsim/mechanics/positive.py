@@ -1,4 +1,4 @@
-"""What makes the tangent of the stress positive: the negative eigenvalues of each cell's moduli taken away.
+"""What makes the tangent of the stress positive: the negative eigenvalues of its moduli taken away.
 
     A = d(chi P)/dF,   A+ = A + C,   C = - sum of its negative eigenvalues times their projectors
 
@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem
 
+from ..forms.balance import points_of_stress
 from ..forms.kinematics import deformation_gradient
-from .kernels import CellExpression, CellForm, cells_measure
+from .kernels import CellForm, cells_measure, point_expression, point_field
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
@@ -34,26 +34,26 @@ class Positive:
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
         P = stress.remaining_stiffness_of_energy * ufl.diff(stress.energy.psi(F, stress.R), F)
-        self._moduli = CellExpression(domain.comm, domain.mesh, ufl.diff(P, F), domain.cell_count)
-        self._field = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (d * d, d * d))))
+        self._moduli = point_expression(domain, ufl.diff(P, F))
+        self._field = point_field(domain, (d * d, d * d), "what makes moduli positive")
         self._size = d * d
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         each = [(i, j) for i in range(d) for j in range(d)]
         row, column = (ufl.as_vector([ufl.grad(field)[i, j] for i, j in each]) for field in (w, v))
-        form = ufl.dot(row, self._field * column) * cells_measure(domain)(metadata={"quadrature_degree": 0})
+        form = ufl.dot(row, self._field * column) * cells_measure(domain)(metadata=points_of_stress(w))
         self.form = CellForm(form)
 
     def update(self, small: float) -> None:
-        """Bring C to the current u; cells stay as they are without an eigenvalue below - `small` of their mean modulus:
+        """Bring C to the current u; moduli stay as they are without an eigenvalue below - `small` of their mean:
         whatever is pressed has such (not collective)."""
-        A = self._moduli().reshape(-1, self._size, self._size)
+        A = self._moduli.at_points().reshape(-1, self._size, self._size)
         mean = A.trace(axis1=1, axis2=2) / self._size
         shifted = A + (small * mean)[:, None, None] * np.eye(self._size)
-        cells = np.flatnonzero((least_pivots(shifted) < 0) & (mean != 0))
-        values, vectors = np.linalg.eigh(A[cells])
+        points = np.flatnonzero((least_pivots(shifted) < 0) & (mean != 0))
+        values, vectors = np.linalg.eigh(A[points])
         C = self._field.x.array.reshape(-1, self._size, self._size)
         C[:] = 0.0
-        C[cells] = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        C[points] = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
 
 
 def least_pivots(A: Values) -> Values:

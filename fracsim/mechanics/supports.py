@@ -27,7 +27,7 @@ def _check(mesh: MeshData | None, held: npt.NDArray[np.bool_] | None) -> None:
     bodies, body = bodies_of(mesh)
     for number in range(bodies):
         nodes = body == number
-        free = free_motion(mesh.points[nodes], held[nodes])
+        free = free_motion(mesh.points[nodes], held[: len(body)][nodes])
         if free:
             where = f"the body around {middle_of(mesh.points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import dolfinx
 import numpy as np
@@ -19,6 +20,10 @@ from .dolfinx_calls import coordinate_element, create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
 from .ranks import Gather, total
+from .simplices import local_edges
+
+if TYPE_CHECKING:
+    from .middles import Middles
 
 Ints = npt.NDArray[np.int32]
 Values = npt.NDArray[np.float64]
@@ -28,6 +33,8 @@ Values = npt.NDArray[np.float64]
 class Domain:
     """A partitioned simplex mesh without ghost cells: every cell belongs to one rank.
 
+    Nodes are those of the displacement: the corners of cells and, where it is quadratic, the middles of their edges.
+
     Attributes:
         mesh: DOLFINx mesh of P1 geometry.
         facets: group name -> local facet indices.
@@ -35,6 +42,7 @@ class Domain:
         region: (cells,) index into region_names of each owned cell, -1 outside every region.
         source: the mesh as it was built or read, on rank 0 only (for output and checkpoints, which keep its order).
         lower, upper: corners of the bounding box, m.
+        middles: of the edges of the input mesh, where displacement is quadratic; None: it is linear.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -44,6 +52,7 @@ class Domain:
     lower: npt.NDArray[np.float64]
     upper: npt.NDArray[np.float64]
     source: MeshData | None = None
+    middles: Middles | None = None
 
     @property
     def comm(self) -> MPI.Intracomm:
@@ -64,10 +73,15 @@ class Domain:
         """Owned cells."""
         return int(self.mesh.topology.index_map(self.dim).size_local)
 
+    @property
+    def order(self) -> int:
+        """Of the displacement: 1 or 2."""
+        return 1 if self.middles is None else 2
+
     @cached_property
     def space(self) -> fem.FunctionSpace:
-        """P1 displacement."""
-        return fem.functionspace(self.mesh, ("Lagrange", 1, (self.dim,)))
+        """P1 or P2 displacement."""
+        return fem.functionspace(self.mesh, ("Lagrange", self.order, (self.dim,)))
 
     @cached_property
     def cell_scalar(self) -> fem.FunctionSpace:
@@ -80,8 +94,29 @@ class Domain:
 
     @property
     def cell_nodes(self) -> Ints:
-        """(cells, d + 1) node (blocked dof) indices of the owned cells."""
+        """(cells, d + 1) node (blocked dof) indices of the corners of the owned cells."""
+        return self.space.dofmap.list if self.middles is None else self._parts_of_cells[0]
+
+    @property
+    def all_cell_nodes(self) -> Ints:
+        """(cells, n) the same of all nodes of the owned cells; n = d + 1, or with the middles of edges 6 or 10."""
         return self.space.dofmap.list
+
+    @property
+    def cell_middles(self) -> Ints:
+        """(cells, 3 or 6) node indices of the middles of local edges; none where displacement is linear."""
+        return self._parts_of_cells[1]
+
+    @cached_property
+    def _parts_of_cells(self) -> tuple[Ints, Ints]:
+        corners, middles = np.split(self.space.dofmap.list, [self.dim + 1], axis=1)
+        return np.ascontiguousarray(corners), np.ascontiguousarray(middles)
+
+    @cached_property
+    def middle_ends(self) -> tuple[Ints, Ints]:
+        """(m,) nodes of this rank that are middles, ghosts too, and (m, 2) the ends of their edges."""
+        nodes, first = np.unique(self.cell_middles, return_index=True)
+        return nodes, self.cell_nodes[:, local_edges(self.dim)].reshape(-1, 2)[first]
 
     @cached_property
     def node_count(self) -> int:
@@ -95,19 +130,33 @@ class Domain:
         count = self.node_count + self.space.dofmap.index_map.num_ghosts
         result = np.empty((count, self.dim))
         result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+        if self.middles is not None:
+            between, ends = self.middle_ends
+            result[between] = result[ends].mean(axis=1)
         return result
 
     @cached_property
     def node_input(self) -> npt.NDArray[np.int64]:
-        """Index in the input mesh of every owned and ghost node."""
+        """Index in the input mesh of every owned and ghost node; middles of edges come after its points."""
         result = np.full(len(self.nodes), -1, np.int64)
         result[self.cell_nodes] = self.mesh.geometry.input_global_indices[self.mesh.geometry.dofmap]
+        if self.middles is not None:
+            between, ends = self.middle_ends
+            result[between] = self.middles.named(result[ends])
         return result
 
     @cached_property
     def cell_input(self) -> npt.NDArray[np.int64]:
         """Index in the input mesh of every owned cell."""
         return np.asarray(self.mesh.topology.original_cell_index[: self.cell_count], np.int64)
+
+    def mesh_of_nodes(self) -> MeshData | None:
+        """`source`, in cells of 6 or 10 nodes where displacement is quadratic (rank 0; None elsewhere)."""
+        if self.middles is None or self.source is None:
+            return self.source
+        from .middles import with_middles
+
+        return with_middles(self.source, self.middles)
 
     def with_ghosts(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned and ghost dofs,) values from those of the owned dofs of the displacement space (collective)."""
@@ -209,8 +258,9 @@ class Domain:
         return f"{format_point(self.lower)} to {format_point(self.upper)}"
 
 
-def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
-    """Partition a mesh that rank 0 holds (None elsewhere). Cells are not ghosted; groups follow their facets."""
+def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
+    """Partition a mesh that rank 0 holds (None elsewhere). Cells are not ghosted; groups follow their facets. `order`:
+    of the displacement, 1 or 2."""
     head = None
     if data is not None:
         bounds = data.points.min(axis=0), data.points.max(axis=0)
@@ -224,7 +274,14 @@ def distribute(comm: MPI.Comm, data: MeshData | None) -> Domain:
     facets = _group_facets(mesh, groups, None if data is None else [np.asarray(data.facet_groups[k]) for k in groups])
     owned = mesh.topology.index_map(dim).size_local
     local = region[mesh.topology.original_cell_index[:owned]] if region_names else np.full(owned, -1, np.int32)
-    return Domain(mesh, facets, region_names, local, lower, upper, data)
+    middles = _middles(comm, data) if order == 2 else None
+    return Domain(mesh, facets, region_names, local, lower, upper, data, middles)
+
+
+def _middles(comm: MPI.Comm, data: MeshData | None) -> Middles:
+    from .middles import middles_of
+
+    return middles_of(comm, data)
 
 
 def _region_index(data: MeshData) -> npt.NDArray[np.int32] | None:

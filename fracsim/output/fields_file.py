@@ -20,6 +20,7 @@ from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text, replacin
 Values = npt.NDArray[np.float64]
 TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
 _KINDS = {1: "Scalar", 3: "Vector", 6: "Tensor6"}
+_CELLS = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}  # by their nodes
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
     '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
@@ -98,7 +99,7 @@ class FieldsFile:
         """The XML of one frame, which counts from now on."""
         self.times.append(t)
         attributes = "".join(self._attribute(name, field) for field in fields)
-        kind = "Triangle" if self._mesh.dim == 2 else "Tetrahedron"
+        kind = _CELLS[self._mesh.cells.shape[1]]
         return (
             f'      <Grid Name="body" GridType="Uniform">\n        <Time Value="{t:.12g}"/>\n'
             f'        <Topology TopologyType="{kind}" NumberOfElements="{len(self._mesh.cells)}">'

@@ -47,7 +47,7 @@ class FrameFiles:
         """
         stress = balance.stress
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
-        self._values, source = Frames(stress, fields, breaking), stress.domain.source
+        self._values, source = Frames(stress, fields, breaking), stress.domain.mesh_of_nodes()
         self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
         self.surface = None
         if surface:

@@ -42,6 +42,9 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
     """A phrase for each key that may not differ and does."""
     old, new = dict(_leaves(then)), dict(_leaves(now))
     moved = _moved(then, now)
+    orders = [each["mesh"].get("order", 1) for each in (then, now)]  # all else of it is compared by what it makes
+    if orders[0] != orders[1]:
+        yield f"mesh.order was {orders[0]}, is {orders[1]}"
     for key in dict.fromkeys([*old, *new]):
         if old.get(key) != new.get(key) and not _within(key, FREE) and not _of_moved(key, moved):
             yield f"{key} was {_said(old, key)}, is {_said(new, key)}"

@@ -75,7 +75,7 @@ class Scene:
 
 def build_scene(comm: MPI.Comm, study: Study) -> Scene:
     """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
-    return scene_on(distribute(comm, on_root(comm, lambda: checked_mesh(study))), study)
+    return scene_on(distribute(comm, on_root(comm, lambda: checked_mesh(study)), study.mesh.order), study)
 
 
 def scene_on(domain: Domain, study: Study, material: MaterialFields | None = None) -> Scene:

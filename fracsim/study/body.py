@@ -23,6 +23,7 @@ class Mesh(BaseModel):
     surface: Path | None = None
     outline: Path | None = None
     shell: Path | None = None
+    order: Literal[1, 2] = 1  # of the displacement in a cell: linear or quadratic
 
     @model_validator(mode="after")
     def _one_source(self) -> Mesh:

@@ -185,12 +185,18 @@ def _extent(anatomy: Anatomy) -> str:
     return f"{format_point(anatomy.lower)} to {format_point(anatomy.upper)}"
 
 
+NODES = {2: "4 times", 3: "7 to 8 times"}  # of a mesh with linear displacement: its edges have nodes, too
+
+
 def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     if study.time.scheme == "rigid":
         yield from _rigid_description(study, anatomy)
         return
     source = study.mesh.source
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
+    if study.mesh.order == 2:
+        nodes = 6 if anatomy.dim == 2 else 10
+        yield f"            quadratic displacement: cells of {nodes} nodes, {NODES[anatomy.dim]} as many nodes"
     yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
         yield f"            note: {note}"

@@ -11,6 +11,7 @@ from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .materials import filled
 from .moving import Body, check_rigid
+from .order import check_order
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
 from .touching import Contact, Obstacle
@@ -213,6 +214,11 @@ class Study(Table):
                 f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
                 'choose time.scheme = "backward-euler", or drive it by displacement'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _order_fits(self) -> Study:
+        check_order(self)
         return self
 
     @model_validator(mode="after")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,13 +77,23 @@ class SurfaceOutput:
             surface, files = self.made
             if state.t in files.times:
                 return
+            at_corners, nodal = self._of_points(gathered, fields)
             at = cut = None
             if broken is not None and pattern is not None:
                 at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
                 surface.update(pattern, cut)
             beside = {name: drawn for term in self._beside for name, drawn in term.drawn(state.t).items()}
-            files.write(surface.at(state.t, *gathered, broken_at=at, fields=fields, apart=self._apart), beside)
+            files.write(surface.at(state.t, *at_corners, broken_at=at, fields=nodal, apart=self._apart), beside)
             if self._passing is not None:
-                self._passing.look(state.t, surface, gathered[0])
+                self._passing.look(state.t, surface, at_corners[0])
 
         written(domain.comm, self._path, work)
+
+    def _of_points(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
+        """Nodal values without those in the middles of edges: the surface is that of straight cells (rank 0)."""
+        source = self._domain.source
+        if self._domain.middles is None or source is None:
+            return gathered, fields
+        count = len(source.points)
+        nodal = [replace(each, values=each.values[:count]) if each.centre == "Node" else each for each in fields]
+        return [each[:count] for each in gathered], nodal

@@ -1,0 +1,32 @@
+"""What quadratic displacement ([mesh] order = 2) goes with: everything else is refused, not answered wrongly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .whole import Study
+
+ORDER = "mesh.order = 2 (quadratic displacement)"
+
+
+def check_order(study: Study) -> None:
+    """ValueError where a table of the study takes linear displacement."""
+    if study.mesh.order == 1:
+        return
+    for key, given, why in _refused(study):
+        if given:
+            raise ValueError(f"{ORDER} does not go with {key}: {why}; choose order = 1, or leave that out")
+
+
+def _refused(study: Study) -> list[tuple[str, bool, str]]:
+    """(key, whether it is given, why not) of all that needs linear displacement."""
+    fracture, contact = study.fracture, study.contact
+    return [
+        ('time.scheme = "rigid"', study.time.scheme == "rigid", "bodies are solved for with linear displacement"),
+        ("[plasticity]", study.plasticity is not None, "cells have one state of flow each"),
+        ("[fracture]", fracture is not None, "not done"),
+        ("[brittle]", study.brittle is not None, "level sets cut straight cells whose stress is one value"),
+        ("[[obstacle]]", bool(study.obstacle), "points of the surface follow the corners of cells alone"),
+        ("[contact]", contact is not None, "points of the surface follow the corners of cells alone"),
+    ]

@@ -1,0 +1,90 @@
+"""A body with a smooth displacement that is known: its own stress is put on it as a load.
+
+int (P(u) - P(u_m)) : grad w dX = 0,   u = u_m on the whole boundary
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from ufl.core.expr import Expr
+
+import fracsim.scene as scene_module
+from fracsim.forms.energies import first_piola_kirchhoff
+from fracsim.forms.kinematics import deformation_gradient
+from fracsim.mechanics.term import Form, Term
+from fracsim.scene import Parts, Scene, build_scene
+from support.scenes import make_study
+
+Values = npt.NDArray[np.float64]
+SIZE = 0.15  # of the displacement, m: strains of 0.3, rotations of 0.2
+
+
+def wanted(x: Any, m: Any = np) -> list[Any]:
+    """u_m of coordinates, by the functions of NumPy or UFL."""
+    if len(x) == 2:
+        return [SIZE * m.sin(x[0] + 2 * x[1]), SIZE * m.cos(2 * x[0] - x[1])]
+    return [SIZE * m.sin(x[0] + 2 * x[1]), SIZE * m.cos(2 * x[1] - x[2]), SIZE * m.sin(x[2] + x[0])]
+
+
+class Load(Term):
+    """-int P(u_m) : grad w dX."""
+
+    name = "load"
+    linear = True
+
+    def __init__(self, parts: Parts) -> None:
+        domain = parts.domain
+        x = ufl.SpatialCoordinate(domain.mesh)
+        F = deformation_gradient(ufl.as_vector(wanted([x[i] for i in range(domain.dim)], ufl)))
+        energy = parts.stress.material.energy
+        self._P = first_piola_kirchhoff(energy, F, turn(F) if energy.needs_rotation else None)
+
+    def work(self, w: Expr, dx: ufl.Measure) -> Form:
+        """Virtual work, N m."""
+        return -ufl.inner(self._P, ufl.grad(w)) * dx(metadata={"quadrature_degree": 6})
+
+
+def turn(F: Expr) -> Expr:
+    """R of F = R U in the plane: that of F11 + F22 and F21 - F12."""
+    a, b = F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]
+    return ufl.as_tensor([[a, -b], [b, a]]) / ufl.sqrt(a**2 + b**2)
+
+
+def solved(energy: str, order: int, dim: int, cells: int, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """The scene on 1/cells with its solution in u."""
+    monkeypatch.setitem(scene_module.TERMS, "load", Load)
+    sides = ["left", "right", "bottom", "top", "front", "back"]
+    study = make_study(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 1.0 / cells, "order": order},
+        material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
+        boundary=[{"on": side, "fix": "xyz"[:dim]} for side in sides[: 2 * dim]],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )
+    scene = build_scene(MPI.COMM_SELF, study)
+    motion, nodes = scene.balance.motion, scene.domain.nodes
+    values = np.stack(wanted(nodes.T), axis=1).reshape(-1)[motion.dofs]
+    motion.at = lambda t: t * values  # type: ignore[method-assign]
+    _, report = scene.stepper.advance(scene.start())
+    assert report.solve.converged
+    return scene
+
+
+def errors(scene: Scene) -> Values:
+    """(|u - u_m|, |grad(u - u_m)|) in L2, over those of u_m."""
+    domain, u = scene.domain, scene.balance.u
+    x = ufl.SpatialCoordinate(domain.mesh)
+    exact = ufl.as_vector(wanted([x[i] for i in range(domain.dim)], ufl))
+    dx = ufl.dx(domain=domain.mesh, metadata={"quadrature_degree": 6})
+
+    def norm(of: Callable[[Expr], Expr], what: Expr) -> float:
+        return float(np.sqrt(fem.assemble_scalar(fem.form(ufl.inner(of(what), of(what)) * dx))))
+
+    return np.array([norm(of, u - exact) / norm(of, exact) for of in (lambda a: a, ufl.grad)])
