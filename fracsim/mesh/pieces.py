@@ -31,7 +31,7 @@ class Pieces:
 def find_pieces(graph: EdgeGraph) -> Pieces:
     """Components within each rank, joined where ranks share nodes: one exchange, however they wind (collective)."""
     domain = graph.domain
-    local_count, local = components(graph.edge_nodes[~graph.broken], len(domain.nodes))
+    local_count, local = components(_joined(graph), len(domain.nodes))
     first = offset(domain.comm, local_count)
     label = local + first
     ghosts = slice(domain.node_count, None)
@@ -55,6 +55,17 @@ def hold_together(graph: EdgeGraph, before: npt.NDArray[np.bool_]) -> bool:
     joined[graph.cell_edges[cells][group[:, first] == group[:, second]]] = True
     other = (before & ~graph.broken) | (new & ~graph.on_any_rank(joined))
     return not total(graph.domain.comm, np.count_nonzero(other))[0]
+
+
+def _joined(graph: EdgeGraph) -> npt.NDArray[np.int32]:
+    """(n, 2) nodes of intact edges. A middle goes with the end of its edge that comes first in the input mesh: where
+    the edge is broken it is anywhere between them, and a piece is known by its corners."""
+    domain, edges = graph.domain, graph.edge_nodes[~graph.broken]
+    if domain.order == 1:
+        return edges
+    between, ends = domain.middle_ends
+    first = np.argmin(domain.node_input[ends], axis=1)
+    return np.concatenate([edges, np.stack([between, ends[np.arange(len(ends)), first]], axis=1)])
 
 
 def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

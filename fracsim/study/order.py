@@ -25,7 +25,18 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
     return [
         ('time.scheme = "rigid"', study.time.scheme == "rigid", "bodies are solved for with linear displacement"),
         ("[plasticity]", study.plasticity is not None, "cells have one state of flow each"),
-        ("[fracture]", fracture is not None, "not done"),
+        ("fracture.energy", fracture is not None and fracture.energy is not None, "tips go by linear displacement"),
+        (
+            'fracture.approach = "edge"',
+            fracture is not None and fracture.approach == "edge",
+            "the middle of a broken edge would hold on to both of its ends",
+        ),
+        (
+            "fracture.unilateral",
+            fracture is not None and fracture.unilateral,
+            "springs between the ends of an edge would press its middle, which is free once the cell is cut",
+        ),
+        ('output.cut = "forces"', study.output.cut == "forces", "corners carry no share of a uniform stress"),
         ("[brittle]", study.brittle is not None, "level sets cut straight cells whose stress is one value"),
         ("[[obstacle]]", bool(study.obstacle), "points of the surface follow the corners of cells alone"),
         ("[contact]", contact is not None, "points of the surface follow the corners of cells alone"),
