@@ -41,6 +41,7 @@ class MeshData:
         regions: name -> (k,) cell indices. Empty: the body is of one material.
         notes: what was mended while reading, one sentence each, to be told to the user.
         shell: of what it is the thickness; None: a solid.
+        middles: (k, d) where the middles of topology.edges_of the cells belong, in metres; None: half-way.
     """
 
     points: Points
@@ -49,6 +50,7 @@ class MeshData:
     regions: dict[str, Indices] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     shell: Shell | None = None
+    middles: Points | None = None
 
     @property
     def dim(self) -> int:

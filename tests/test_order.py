@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+import xdmf_reader
+from fracsim.run import run_study
 from support.manufactured import errors, solved
+from support.scenes import make_scene, make_study, march
+
+SOFT = {"energy": "corotated", "young": 1.0, "poisson": 0.0, "density": 1.0}
 
 
 def orders(energy: str, order: int, dim: int, cells: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> list[float]:
@@ -24,3 +35,78 @@ def test_orders_of_convergence(energy: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_orders_of_convergence_in_space(monkeypatch: pytest.MonkeyPatch) -> None:
     assert orders("neo-hookean", 2, 3, (3, 6), monkeypatch) == pytest.approx([3, 2], abs=0.2)
+
+
+# --- round faces ---
+
+
+def disk(**tables: Any) -> Any:
+    """A round plate of radius 1 in 2 x 6 cells or so, free."""
+    mesh = {"builder": "disk", "radius": 1.0, "h": 0.5, "arc": 60.0, "order": 2}
+    return make_scene(**({"mesh": mesh, "time": {"scheme": "newmark", "step": 0.1, "end": 0.1}} | tables))
+
+
+def test_round_faces_are_round() -> None:
+    """Parabolas through three points of a circle of radius 1: the area is pi but for some s^4 / 180 of itself, s the
+    angle of a facet (straight sides: s^2 / 6)."""
+    scene, _ = disk()
+    straight = scene.domain.volumes.sum()
+    s = np.sqrt(6 * (1 - straight / np.pi))
+    assert scene.balance.mass.lumped.sum() / 2 == pytest.approx(np.pi, rel=s**4 / 90)
+    assert straight < np.pi * (1 - 0.015)
+    radius = np.linalg.norm(scene.domain.nodes, axis=1)
+    assert np.count_nonzero(np.abs(radius - 1) < 1e-12) == 2 * len(np.concatenate([*scene.domain.facets.values()]))
+
+
+def test_a_force_on_a_round_face_is_the_force_given() -> None:
+    scene, state = disk(boundary=[{"on": "top", "force": [0.0, 3.0]}])
+    march(scene, state)
+    assert scene.balance.applied().reshape(-1, 2).sum(axis=0) == pytest.approx([0.0, 3.0], abs=1e-12)
+
+
+def test_a_body_that_breaks_has_straight_sides() -> None:
+    scene, _ = disk(fracture={"strength": 1.0})
+    assert not scene.domain.is_bent
+    assert scene.balance.mass.lumped.sum() / 2 == pytest.approx(scene.domain.volumes.sum())
+
+
+# --- files ---
+
+
+def test_vtk_reads_curved_cells(tmp_path: Path) -> None:
+    """VTK's own reader: middles of the round side on the circle, and displacement in all 6 nodes."""
+    study = make_study(
+        mesh={"builder": "disk", "radius": 1.0, "h": 0.5, "order": 2},
+        initial={"velocity": [1.0, 0.0]},
+        time={"scheme": "explicit", "step": 1e-3, "end": 1e-3},
+        output={"surface": True, "picture": False},
+    )
+    run_study(MPI.COMM_SELF, study, tmp_path / "out")
+    target = tmp_path / "read.npz"
+    command = [sys.executable, xdmf_reader.__file__, str(tmp_path / "out" / "fields.xdmf"), str(target)]
+    if subprocess.run(command).returncode == xdmf_reader.NO_READER:
+        pytest.skip("there is no VTK that reads XDMF: make readers")
+    with np.load(target) as found:
+        points, moved, kinds = found["0/points"], found["1/warped"], found["0/kinds"]
+    assert set(kinds) == {22}  # VTK_QUADRATIC_TRIANGLE
+    rim = np.count_nonzero(np.abs(np.linalg.norm(points, axis=1) - 1) < 1e-12)
+    assert rim % 2 == 0 and rim >= 24
+    np.testing.assert_allclose(moved - points, np.broadcast_to([1e-3, 0.0, 0.0], points.shape), atol=1e-12)
+
+
+# --- what it does not go with ---
+
+
+@pytest.mark.parametrize(
+    ("tables", "key"),
+    [
+        ({"plasticity": {"yield_stress": 1.0}, "material": SOFT}, "plasticity"),
+        ({"fracture": {"strength": 1.0, "approach": "edge"}}, "fracture.approach"),
+        ({"fracture": {"strength": 1.0, "unilateral": True}}, "fracture.unilateral"),
+        ({"fracture": {"strength": 1.0, "energy": 1.0}}, "fracture.energy"),
+        ({"contact": {}, "fracture": {"strength": 1.0}}, "contact"),
+    ],
+)
+def test_what_needs_straight_cells_is_refused(tables: dict[str, Any], key: str) -> None:
+    with pytest.raises(ValueError, match=rf"mesh.order = 2 .* does not go with .*{key}.*choose order = 1"):
+        make_study(**({"mesh": {"builder": "box", "size": [1.0, 1.0], "h": 0.5, "order": 2}} | tables))

@@ -39,6 +39,7 @@ def fields(grid: Any) -> dict[str, Any]:
 
     assert grid.GetClassName() == "vtkUnstructuredGrid"  # one grid, no blocks
     found = {"points": vtk_to_numpy(grid.GetPoints().GetData()), "cells": np.array(grid.GetNumberOfCells())}
+    found["kinds"] = np.array([grid.GetCellType(k) for k in range(grid.GetNumberOfCells())])
     for centre, data in (("Node", grid.GetPointData()), ("Cell", grid.GetCellData())):
         for k in range(data.GetNumberOfArrays()):
             found[f"{centre}/{data.GetArrayName(k)}"] = vtk_to_numpy(data.GetArray(k))

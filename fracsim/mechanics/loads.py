@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -143,6 +144,11 @@ class Pressure(Term):
 
 def area(domain: Domain, facets: Ints) -> float:
     """Of local exterior facets in the body at rest, on all ranks, m^2; in 2D their length, m (collective)."""
+    if domain.is_bent:
+        (ds,) = surface_measures(domain, [facets])
+        along_x: Any = fem.Constant(domain.mesh, np.eye(domain.dim)[0])
+        shares = fem.assemble_vector(compile_form(traction_work(along_x, ufl.TestFunction(domain.space), ds)))
+        return float(total(domain.comm, np.sum(shares.array))[0])
     cell, opposite = exterior_facets(domain.mesh, facets).reshape(-1, 2).T
     nodes = domain.cell_nodes[cell]
     corners = nodes[np.arange(nodes.shape[1]) != opposite[:, None]].reshape(len(nodes), domain.dim)

@@ -55,10 +55,10 @@ class KeptCell(_BlockedElement):
         return super().cell
 
 
-def coordinate_element(dim: int) -> KeptCell:
-    """Linear simplices."""
+def coordinate_element(dim: int, degree: int = 1) -> KeptCell:
+    """Straight simplices; of degree 2 bent ones."""
     shape = "triangle" if dim == 2 else "tetrahedron"
-    return KeptCell(basix.ufl.element("Lagrange", shape, 1, dtype=np.float64), (dim,))
+    return KeptCell(basix.ufl.element("Lagrange", shape, degree, dtype=np.float64), (dim,))
 
 
 def create_mesh(

@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.topology import distinct_rows, signed_measures
 from ..meshes.words import format_point
-from .dolfinx_calls import coordinate_element, create_mesh, facets_of_nodes
+from .dolfinx_calls import KeptCell, coordinate_element, create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
 from .ranks import Gather, total
@@ -129,17 +129,30 @@ class Domain:
         # the bits of the input: tabulated dof coordinates depend in the last digit on the cell, and so on the partition
         count = self.node_count + self.space.dofmap.index_map.num_ghosts
         result = np.empty((count, self.dim))
+        if self.is_bent:
+            result[self.all_cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+            return result
         result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
         if self.middles is not None:
             between, ends = self.middle_ends
             result[between] = result[ends].mean(axis=1)
         return result
 
+    @property
+    def is_bent(self) -> bool:
+        """Whether cells have round sides."""
+        return self.middles is not None and self.middles.bent
+
+    @property
+    def corner_geometry(self) -> Ints:
+        """(cells, d + 1) places of the corners of the owned cells in the geometry of `mesh`."""
+        return self.mesh.geometry.dofmap[:, : self.dim + 1]
+
     @cached_property
     def node_input(self) -> npt.NDArray[np.int64]:
         """Index in the input mesh of every owned and ghost node; middles of edges come after its points."""
         result = np.full(len(self.nodes), -1, np.int64)
-        result[self.cell_nodes] = self.mesh.geometry.input_global_indices[self.mesh.geometry.dofmap]
+        result[self.cell_nodes] = self.mesh.geometry.input_global_indices[self.corner_geometry]
         if self.middles is not None:
             between, ends = self.middle_ends
             result[between] = self.middles.named(result[ends])
@@ -156,7 +169,7 @@ class Domain:
             return self.source
         from .middles import with_middles
 
-        return with_middles(self.source, self.middles)
+        return with_middles(self.source, self.middles, written=True)
 
     def with_ghosts(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned and ghost dofs,) values from those of the owned dofs of the displacement space (collective)."""
@@ -235,8 +248,8 @@ class Domain:
         chosen = np.zeros(len(self.nodes), bool)
         chosen[nodes] = True
         of_geometry = np.zeros(len(self.mesh.geometry.x), bool)
-        of_geometry[self.mesh.geometry.dofmap] = chosen[self.cell_nodes]
-        return exterior[of_geometry[geometry].all(axis=1)]
+        of_geometry[self.corner_geometry] = chosen[self.cell_nodes]
+        return exterior[of_geometry[geometry[:, : self.dim]].all(axis=1)]
 
     @cached_property
     def sides_outside(self) -> npt.NDArray[np.bool_]:
@@ -266,16 +279,27 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
         bounds = data.points.min(axis=0), data.points.max(axis=0)
         head = (data.dim, list(data.facet_groups), _region_index(data), list(data.regions), *bounds)
     dim, groups, region, region_names, lower, upper = comm.bcast(head)
-    cells = data.cells if data is not None else np.empty((0, dim + 1), np.int64)
-    points = data.points if data is not None else np.empty((0, dim))
-    mesh = create_mesh(comm, cells, points, coordinate_element(dim))
+    middles = _middles(comm, data) if order == 2 else None
+    mesh = create_mesh(comm, *_drawn(data, middles, dim))
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim - 1, dim)
     facets = _group_facets(mesh, groups, None if data is None else [np.asarray(data.facet_groups[k]) for k in groups])
     owned = mesh.topology.index_map(dim).size_local
     local = region[mesh.topology.original_cell_index[:owned]] if region_names else np.full(owned, -1, np.int32)
-    middles = _middles(comm, data) if order == 2 else None
     return Domain(mesh, facets, region_names, local, lower, upper, data, middles)
+
+
+def _drawn(data: MeshData | None, middles: Middles | None, dim: int) -> tuple[npt.NDArray[np.int64], Values, KeptCell]:
+    """Cells, points and the coordinate element: of straight cells where none are bent."""
+    element, nodes = coordinate_element(dim), dim + 1
+    if middles is not None and middles.bent:
+        from .middles import with_middles
+
+        element, nodes = coordinate_element(dim, 2), (dim + 1) * (dim + 2) // 2
+        data = data and with_middles(data, middles, written=False)
+    if data is None:
+        return np.empty((0, nodes), np.int64), np.empty((0, dim)), element
+    return data.cells, data.points, element
 
 
 def _middles(comm: MPI.Comm, data: MeshData | None) -> Middles:

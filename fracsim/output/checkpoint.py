@@ -200,7 +200,7 @@ def fingerprint(mesh: MeshData | None) -> str:
     """A short name of a mesh's nodes, cells, groups and regions (rank 0, where the mesh is)."""
     assert mesh is not None
     digest = hashlib.sha256()
-    for values in (mesh.points, mesh.cells):
+    for values in (mesh.points, mesh.cells, *([] if mesh.middles is None else [mesh.middles])):
         digest.update(np.ascontiguousarray(values).tobytes())
     for name, members in sorted([*mesh.facet_groups.items(), *mesh.regions.items()], key=lambda each: each[0]):
         digest.update(name.encode())

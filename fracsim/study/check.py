@@ -26,6 +26,7 @@ from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .lengths import fits
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
+from .order import bent
 from .resultants import resultants
 from .tearing import tearing
 
@@ -66,7 +67,7 @@ def checked_mesh(study: Study) -> MeshData:
     mesh = build_mesh(study.mesh, surface)
     if study.mesh.builder is None:
         _check(study, anatomy_of(mesh))
-    return mesh
+    return bent(study, mesh, find_builder(study.mesh))
 
 
 def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from ..meshes.data import MeshData
 
 if TYPE_CHECKING:
     from .whole import Study
@@ -41,3 +44,13 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
         ("[[obstacle]]", bool(study.obstacle), "points of the surface follow the corners of cells alone"),
         ("[contact]", contact is not None, "points of the surface follow the corners of cells alone"),
     ]
+
+
+def bent(study: Study, mesh: MeshData, builder: Any) -> MeshData:
+    """The mesh with the middles of edges on the round faces that its builder knows of, where cells are to have nodes
+    there: straight sides would cost what quadratic displacement gains. What breaks stays straight: cells are cut."""
+    if study.mesh.order == 1 or study.fracture is not None or not getattr(builder, "rounds", ()):
+        return mesh
+    from ..meshes.rounds import middles_on
+
+    return replace(mesh, middles=middles_on(mesh, builder.rounds))

@@ -11,6 +11,7 @@ import numpy as np
 from ..data import MeshData
 from ..gmsh_session import meshed
 from ..parameters import affordable, one_of, positive, require
+from ..rounds import Round
 from ..sizing import Sizing, cells_for
 from ..topology import boundary_facets, facets_except, plane_groups
 from .profile import Profile
@@ -55,6 +56,11 @@ class Cylinder:
 
     def cells_estimate(self) -> int:
         return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """The round side."""
+        return (Round(("side",), self.radius, "xyz".index(self.axis)),)
 
     def build(self) -> MeshData:
         points, cells = meshed(self._draw, 3, Sizing(self.h))
@@ -106,6 +112,11 @@ class Disk:
 
     def cells_estimate(self) -> int:
         return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """The rim."""
+        return (Round(self.groups, self.radius),)
 
     def build(self) -> MeshData:
         draw = self._sectors().draw if self.arc else self._draw

@@ -7,6 +7,7 @@ from math import pi
 from typing import ClassVar
 
 from ..parameters import affordable, not_negative, positive, require
+from ..rounds import Round
 from ..sizing import Sizing
 from .profile import CutRectangle, Profile
 
@@ -56,6 +57,11 @@ class PlateHole(CutRectangle):
     def cells_estimate(self) -> int:
         """The hole is taken for filled with the cells beside it, less its own share of them."""
         return max(1, round(super().cells_estimate() - pi / 4 * self._cells_within(self.radius, self.radius)))
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """The hole."""
+        return (Round(("hole",), self.radius, 1 if self.thickness else None),)
 
     def _profile(self) -> Profile:
         r, length, height = self.radius, self.length, self.height

@@ -136,7 +136,7 @@ def _mesh_of(domain: Domain) -> MeshData:
     exterior = domain._exterior
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
     of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)
-    of_geometry[domain.mesh.geometry.dofmap] = domain.cell_nodes
+    of_geometry[domain.corner_geometry] = domain.cell_nodes
     facets = of_geometry[geometry].reshape(-1, domain.dim)
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 

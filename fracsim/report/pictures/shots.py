@@ -13,6 +13,8 @@ import numpy as np
 from ...errors import InputError
 from ...output.surface.collection import Entry, read_entries
 
+KINDS = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # of cells, by their nodes
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -69,7 +71,7 @@ def load(shot: Shot) -> Any:
     with h5py.File(shot.file) as file:
         frame = file["frames"][sorted(file["frames"])[shot.index]]
         cells = file["cells"][()]
-        kind = pyvista.CellType.TRIANGLE if cells.shape[1] == 3 else pyvista.CellType.TETRA
+        kind = pyvista.CellType[KINDS[cells.shape[1]]]
         grid = pyvista.UnstructuredGrid({kind: cells}, file["points"][()] + frame["displacement"][()])
         for name, data in frame.items():
             (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = data[()]
