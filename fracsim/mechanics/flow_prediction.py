@@ -18,10 +18,11 @@ from dolfinx import fem
 
 from ..forms.plasticity import ImplicitFlow, Plastic
 from ..mesh.domain import Domain
+from .kernels import point_field
 from .spectrum import times
 
 Values = npt.NDArray[np.float64]
-Cells = npt.NDArray[np.int32]
+Points = npt.NDArray[np.int32]
 
 WEIGHTS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # of squares in the norm of xx, yy, zz, xy, xz, yz
 MOST = 0.9  # norm of dt D: with less than 1 no stretch turns over
@@ -38,15 +39,15 @@ class FlowPrediction(Protocol):
     def begin(self, dt: float, fraction: float) -> None:
         """A step of dt is to be solved whose flow makes `fraction` of the return; zeros: it is done."""
 
-    def flowed(self, cells: Cells, power: Values, dt: float) -> None:
-        """`cells` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
+    def flowed(self, points: Points, power: Values, dt: float) -> None:
+        """`points` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
 
 
 class Implicit:
     """beta follows from the unknown displacement."""
 
     def __init__(self, domain: Domain, energy: Plastic, frobenius: bool) -> None:
-        self._resistance, self._softness = fem.Function(domain.cell_scalar), fem.Function(domain.cell_scalar)
+        self._resistance, self._softness = (point_field(domain, (), name) for name in ("resistance", "softness"))
         self._share = fem.Constant(domain.mesh, np.float64(0.0))
         self.form = ImplicitFlow(energy, self._resistance, self._softness, self._share, frobenius)
 
@@ -55,11 +56,11 @@ class Implicit:
         self._share.value = fraction
 
     def refresh(self, resistance: Values, softness: Values) -> None:
-        """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the cells as they are now."""
+        """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the points as they are now."""
         self._resistance.x.array[: len(resistance)] = resistance
         self._softness.x.array[: len(softness)] = softness
 
-    def flowed(self, cells: Cells, power: Values, dt: float) -> None:
+    def flowed(self, points: Points, power: Values, dt: float) -> None:
         """Nothing to remember."""
 
 
@@ -72,35 +73,35 @@ class Extrapolated:
     form = None
 
     def __init__(self, inverse: Values) -> None:
-        """`inverse`: (cells, 9) F_p^-1, which this changes for the time of a solve."""
+        """`inverse`: (points, 9) F_p^-1, which this changes for the time of a solve."""
         self._inverse = inverse
-        self._cells: Cells = np.empty(0, np.int32)
+        self._points: Points = np.empty(0, np.int32)
         self._rate: Values = np.empty((6, 0))
-        self._held: Values | None = None  # (9, n) F_p^-1 of the cells, while another stands in for it
+        self._held: Values | None = None  # (9, n) F_p^-1 of the points, while another stands in for it
 
     def begin(self, dt: float, fraction: float) -> None:
         """Put the stand-in in its place, or F_p^-1 itself back."""
         if self._held is not None and not dt:
-            self._inverse[self._cells], self._held = self._held.T, None
-        if not dt or not len(self._cells):
+            self._inverse[self._points], self._held = self._held.T, None
+        if not dt or not len(self._points):
             return
         if self._held is None:
-            self._held = np.ascontiguousarray(self._inverse[self._cells].T)
+            self._held = np.ascontiguousarray(self._inverse[self._points].T)
         longest = MOST / np.maximum(np.sqrt(WEIGHTS @ self._rate**2), MOST / dt)
-        self._inverse[self._cells] = times(self._held, UNIT + longest * self._rate).T
+        self._inverse[self._points] = times(self._held, UNIT + longest * self._rate).T
 
-    def flowed(self, cells: Cells, power: Values, dt: float) -> None:
+    def flowed(self, points: Points, power: Values, dt: float) -> None:
         """Remember D of the step, by which the next one is predicted to flow."""
-        self._cells, self._rate = cells, (power - UNIT) / dt
+        self._points, self._rate = points, (power - UNIT) / dt
 
     @property
     def memory(self) -> Values:
-        """(cells, 6) D, 1/s."""
+        """(points, 6) D, 1/s."""
         rows = np.zeros((len(self._inverse), 6))
-        rows[self._cells] = self._rate.T
+        rows[self._points] = self._rate.T
         return rows
 
     @memory.setter
     def memory(self, rows: Values) -> None:
-        self._cells = np.flatnonzero(rows.any(axis=1)).astype(np.int32)
-        self._rate = np.ascontiguousarray(rows[self._cells].T)
+        self._points = np.flatnonzero(rows.any(axis=1)).astype(np.int32)
+        self._rate = np.ascontiguousarray(rows[self._points].T)

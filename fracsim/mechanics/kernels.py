@@ -213,6 +213,11 @@ def stress_points(mesh: Mesh) -> npt.NDArray[np.float64]:
 STRESS_DEGREE = 2  # of the quadrature of a stress where displacement is quadratic
 
 
+def points_of_cell(domain: Domain) -> int:
+    """How many points `point_field` has in a cell."""
+    return 1 if domain.order == 1 else domain.dim + 1
+
+
 def point_field(domain: Domain, shape: tuple[int, ...], name: str) -> fem.Function:
     """A field of scalars or tensors with a value at each point where stress is integrated, those of a cell one after
     the other in `x.array`; DG0 with linear displacement."""

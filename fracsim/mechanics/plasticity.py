@@ -1,4 +1,8 @@
-"""What cells remember of plastic flow: F_p with det F_p = 1, and the accumulated plastic strain (M22 section 3.7)."""
+"""What cells remember of plastic flow: F_p with det F_p = 1, and the accumulated plastic strain (M22 section 3.7).
+
+With quadratic displacement each point where stress is integrated remembers its own; those of a cell come one after the
+other.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,11 @@ from dolfinx import fem
 from ..forms.plasticity import Plastic
 from ..mesh.domain import Domain
 from .flow_prediction import Extrapolated, FlowPrediction, Implicit
+from .kernels import point_field, points_of_cell
 from .material import MaterialFields, PerCell
 
 Values = npt.NDArray[np.float64]
-Cells = npt.NDArray[np.int32]
+Points = npt.NDArray[np.int32]
 
 WEAKEST = 0.01  # share of the yield stress that softening leaves
 
@@ -44,9 +49,10 @@ class Plasticity:
     """What the cells remember of their flow.
 
     Attributes:
-        inverse: F_p^-1, DG0, 3 x 3; while a step is solved, what `prediction` puts in its place.
-        rows: (cells, 9) its values.
-        strain: (cells,) accumulated plastic strain alpha.
+        inverse: F_p^-1, 3 x 3, at each point; while a step is solved, what `prediction` puts in its place.
+        points: of a cell.    volumes: (points,) of this rank, m^d.
+        rows: (points, 9) values of `inverse`.
+        strain: (points,) accumulated plastic strain alpha.
         prediction: what flow takes off the stress while a step is solved; None where flow only follows it.
         fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
     """
@@ -55,11 +61,12 @@ class Plasticity:
         """`implicit`: whether u is what a step is solved for; explicit schemes know it beforehand."""
         self.rate, self.hardening, self.frobenius = law.flow_rate, law.hardening, law.frobenius
         self.dt, self.fraction = 0.0, 0.0
-        self._yield = law.yield_stress
-        self._modulus: PerCell = 3 * material.mu
-        self.strain = np.zeros(domain.cell_count)
-        self.inverse = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (3, 3))), name="inverse plastic part")
-        self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: domain.cell_count]
+        self.points = points_of_cell(domain)
+        self._yield, self._modulus = self._of_points(law.yield_stress), self._of_points(3 * material.mu)
+        self.volumes = np.repeat(domain.volumes / self.points, self.points) if self.points > 1 else domain.volumes
+        self.strain = np.zeros(self.points * domain.cell_count)
+        self.inverse = point_field(domain, (3, 3), "inverse plastic part")
+        self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: len(self.strain)]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
         # where u is known before the stress is asked for nothing need be extrapolated
@@ -68,14 +75,21 @@ class Plasticity:
         self.refresh()
         self._memory: Values | None = None
 
+    def _of_points(self, value: PerCell) -> PerCell:
+        return np.repeat(value, self.points) if isinstance(value, np.ndarray) else value
+
+    def of_cells(self, values: Values) -> Values:
+        """(cells,) means of (points,) values."""
+        return values if self.points == 1 else values.reshape(-1, self.points).mean(axis=1)
+
     def _prediction(self, domain: Domain, update: str) -> FlowPrediction | None:
         if update == "implicit":
             return Implicit(domain, self.energy, self.frobenius)
         return Extrapolated(self.rows) if update == "extrapolated" else None
 
-    def resistance(self, strain: Values, cells: Cells | slice = slice(None)) -> Values:
-        """Y = yield_stress + K alpha of cells with the given alpha, Pa; never below a small share of yield_stress."""
-        start = self._yield[cells] if isinstance(self._yield, np.ndarray) else self._yield
+    def resistance(self, strain: Values, points: Points | slice = slice(None)) -> Values:
+        """Y = yield_stress + K alpha of points with the given alpha, Pa; never below a small share of yield_stress."""
+        start = self._yield[points] if isinstance(self._yield, np.ndarray) else self._yield
         return np.maximum(start + self.hardening * strain, WEAKEST * start)
 
     def refresh(self) -> None:
@@ -91,7 +105,7 @@ class Plasticity:
         self._memory = None
 
     def memory(self) -> Values:
-        """(cells, 10) F_p^-1 and alpha; with six of the last flow between them where it matters."""
+        """(points, 10) F_p^-1 and alpha; with six of the last flow between them where it matters."""
         if self._memory is None:
             self.begin(0.0)  # a step that failed may have left another in its place
             last = [self.prediction.memory] if isinstance(self.prediction, Extrapolated) else []

@@ -23,13 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms.plasticity import Trial
-from .kernels import CellExpression
+from .kernels import point_expression
 from .plasticity import Plasticity
 from .spectrum import deviatoric_power, eigenvalues, times
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
-Cells = npt.NDArray[np.int32]
+Points = npt.NDArray[np.int32]
 Chosen = slice | npt.NDArray[np.intp]  # some of an array, or all of it without a copy
 
 CLOSE = 1e-6  # of the stress: how near the root is found
@@ -51,9 +51,8 @@ class ReturnMapping:
         assert plastic is not None
         self.plastic: Plasticity = plastic
         self._stress, self._flowed = stress, True
-        trial, of = Trial(plastic.energy, stress.u, stress.R), (domain.comm, domain.mesh)
-        self._state = CellExpression(*of, trial.state(), domain.cell_count)
-        self._measures = CellExpression(*of, trial.measures(), domain.cell_count)
+        trial = Trial(plastic.energy, stress.u, stress.R)
+        self._state, self._measures = (point_expression(domain, each) for each in (trial.state(), trial.measures()))
 
     def begin(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""
@@ -63,30 +62,30 @@ class ReturnMapping:
         """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
         plastic, dt = self.plastic, self.plastic.dt
         self._put_back()
-        state = self._state()
+        state = self._state.at_points().reshape(-1, self._state.width)
         measure, Y = self.measured(state), plastic.resistance(plastic.strain)
-        cells = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
-        power, lost, psi = np.empty((6, len(cells))), 0.0, state[:, 2]
+        points = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
+        power, lost, psi = np.empty((6, len(points))), 0.0, state[:, 2]
         if plastic.fraction > 0:
-            for part in (slice(k, k + BLOCK) for k in range(0, len(cells), BLOCK)):
-                where = cells[part]
+            for part in (slice(k, k + BLOCK) for k in range(0, len(points), BLOCK)):
+                where = points[part]
                 block = _Return(self, where, state[where], measure[where])
                 power[:, part] = block.find()
                 lost += self._lost(block)
                 psi[where] = block.after[:, 2]
-        self.stored = float(self._stress.domain.volumes @ psi)
+        self.stored = float(plastic.volumes @ psi)
         if plastic.prediction is not None and dt:
-            plastic.prediction.flowed(cells, power, dt)
+            plastic.prediction.flowed(points, power, dt)
         plastic.begin(0.0)
-        if len(cells) and plastic.hardening:
+        if len(points) and plastic.hardening:
             plastic.refresh()
-        if len(cells) or self._flowed:
+        if len(points) or self._flowed:
             plastic.changed()
-        self._flowed = len(cells) > 0
+        self._flowed = len(points) > 0
         return lost
 
     def memory(self) -> Values:
-        """(cells, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
+        """(points, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
         return self.plastic.memory()
 
     def recall(self, memory: object) -> bool:
@@ -102,42 +101,50 @@ class ReturnMapping:
         if self.plastic.prediction.form is None:
             self._stress.displaced()  # its rotation was that of another F_e
 
+    def measures(self, points: Points) -> Values:
+        """(n, 3) measures of some points at their present F_p."""
+        count = self.plastic.points
+        if count == 1:
+            return self._measures(points)
+        cells, place = np.unique(points // count, return_inverse=True)
+        return self._measures.at_points(cells.astype(np.int32)).reshape(-1, count, 3)[place, points % count]
+
     def measured(self, stress: Values) -> Values:
         """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
         vm, p = stress[:, 0], stress[:, 1]
         return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
 
     def _lost(self, block: _Return) -> float:
-        """Energy that a block of cells lost, J; takes up their plastic strain."""
-        plastic, cells = self.plastic, block.cells
+        """Energy that a block of points lost, J; takes up their plastic strain."""
+        plastic, points = self.plastic, block.points
         flowed = block.beta * block.size
-        plastic.strain[cells] = block.alpha + flowed
-        gain = plastic.resistance(plastic.strain[cells], cells) - plastic.resistance(block.alpha, cells)
+        plastic.strain[points] = block.alpha + flowed
+        gain = plastic.resistance(plastic.strain[points], points) - plastic.resistance(block.alpha, points)
         # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
-        chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[cells]
-        return float(np.sum(chi * self._stress.domain.volumes[cells] * (psi_trial - psi - over / 2 * flowed)))
+        chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points]
+        return float(np.sum(chi * plastic.volumes[points] * (psi_trial - psi - over / 2 * flowed)))
 
 
 class _Return:
-    """Cells past yield on their way back to the yield surface.
+    """Points past yield on their way back to the yield surface.
 
     Attributes:
         trial, after: (n, 3) measures before and after.    alpha: (n,) accumulated plastic strain before.
         size: (n,) sqrt(2/3) |e|.    beta: (n,) the root.
     """
 
-    def __init__(self, flow: ReturnMapping, cells: Cells, state: Values, measure: Values) -> None:
-        self._flow, self.cells, self._measure = flow, cells, measure
+    def __init__(self, flow: ReturnMapping, points: Points, state: Values, measure: Values) -> None:
+        self._flow, self.points, self._measure = flow, points, measure
         plastic = flow.plastic
-        self.alpha, self._start = plastic.strain[cells], np.ascontiguousarray(plastic.rows[cells].T)
+        self.alpha, self._start = plastic.strain[points], np.ascontiguousarray(plastic.rows[points].T)
         self.trial, self._C = state[:, :3], np.ascontiguousarray(state[:, 3:].T)
         self._values = eigenvalues(self._C)
         logs = np.log(self._values)
         self._logs = logs - logs.mean(axis=0)
         self.size = np.sqrt(np.sum(self._logs**2, axis=0) / 6)  # e is half the deviator of log C
-        self._excess = measure - plastic.resistance(self.alpha, cells)
+        self._excess = measure - plastic.resistance(self.alpha, points)
         self.after, self._power = self.trial.copy(), np.empty_like(self._C)
 
     @cached_property
@@ -146,7 +153,7 @@ class _Return:
         return np.sqrt(np.prod(self._values, axis=0))
 
     def find(self) -> Values:
-        """Let the cells flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
+        """Let the points flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
 
         Where the last two excesses promise that the next secant step is the root (errors of the secant multiply), it is
         taken and not looked at. A beta of 1 has no deviator left to lose: the Frobenius norm of a large pressure may
@@ -171,31 +178,32 @@ class _Return:
         return self._power
 
     def _left(self, live: Chosen) -> Values:
-        """What the excess of cells is above exp(-nu dt) of the old one, Pa, at their beta."""
-        plastic, cells = self._flow.plastic, self.cells[live]
+        """What the excess of points is above exp(-nu dt) of the old one, Pa, at their beta."""
+        plastic, points = self._flow.plastic, self.points[live]
         self._return(live)
-        self.after[live] = stress = self._flow._measures(cells)
-        Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], cells)
+        self.after[live] = stress = self._flow.measures(points)
+        Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], points)
         return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
 
-    def _settle(self, cells: Chosen, before: Values) -> None:
+    def _settle(self, points: Chosen, before: Values) -> None:
         """A last step from the beta `before`: small, so that the measures go along straight lines."""
-        self._return(cells)
-        step, now = self.beta[cells] - before, self.after[cells]
+        self._return(points)
+        step, now = self.beta[points] - before, self.after[points]
         slope = np.divide(step, before, out=np.zeros_like(step), where=before > 0)
-        now[:, :2] += slope[:, None] * (now - self.trial[cells])[:, :2]
-        now[:, 2] -= self.J[cells] * now[:, 0] * self.size[cells] * step  # s : e of a von Mises stress along e
-        self.after[cells] = now
+        now[:, :2] += slope[:, None] * (now - self.trial[points])[:, :2]
+        now[:, 2] -= self.J[points] * now[:, 0] * self.size[points] * step  # s : e of a von Mises stress along e
+        self.after[points] = now
 
-    def _return(self, cells: Chosen) -> None:
+    def _return(self, points: Chosen) -> None:
         """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
-        power = deviatoric_power(self._C[:, cells], self._values[:, cells], self._logs[:, cells], -self.beta[cells] / 2)
-        self._flow.plastic.rows[self.cells[cells]] = times(self._start[:, cells], power).T
-        self._power[:, cells] = power
+        C, values, logs = (each[:, points] for each in (self._C, self._values, self._logs))
+        power = deviatoric_power(C, values, logs, -self.beta[points] / 2)
+        self._flow.plastic.rows[self.points[points]] = times(self._start[:, points], power).T
+        self._power[:, points] = power
 
 
-def _among(cells: Chosen, mask: npt.NDArray[np.bool_]) -> Chosen:
-    """`cells` narrowed to those of the mask; where that is all of them, without a copy."""
+def _among(points: Chosen, mask: npt.NDArray[np.bool_]) -> Chosen:
+    """`points` narrowed to those of the mask; where that is all of them, without a copy."""
     if mask.all():
-        return cells
-    return np.flatnonzero(mask) if isinstance(cells, slice) else cells[mask]
+        return points
+    return np.flatnonzero(mask) if isinstance(points, slice) else points[mask]

@@ -85,7 +85,7 @@ def write_checkpoint(
     if stress.chi is not None:
         arrays["chi"] = domain.gather_cells(stress.chi.x.array[: domain.cell_count])
     if (plastic := stress.material.plastic) is not None:
-        arrays["plastic"] = domain.gather_cells(plastic.memory())
+        arrays["plastic"] = domain.gather_cells(_by_cells(plastic.memory(), plastic.points))
     if record is not None:
         arrays["weakened"], arrays["integrity"] = record.graph.gather_weakened() or (None, None)
         arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
@@ -95,6 +95,11 @@ def write_checkpoint(
     clock = {name: getattr(state, name) for name in _CLOCK}
     written(domain.comm, path, lambda: write_arrays(path, arrays, clock, domain.source, notes))
     return path
+
+
+def _by_cells(rows: npt.NDArray[np.float64], points: int) -> npt.NDArray[np.float64]:
+    """(cells, n), or (cells, points, n) where cells have several, of (cells points, n)."""
+    return rows if points == 1 else rows.reshape(-1, points, rows.shape[1])
 
 
 def write_arrays(
@@ -153,7 +158,8 @@ def read_checkpoint(
     if stress.chi is not None and "chi" in names:
         stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
-        plastic.recall(scattered(domain.gather_cells, "plastic"))
+        rows = scattered(domain.gather_cells, "plastic")
+        plastic.recall(rows.reshape(-1, rows.shape[-1]))
     read: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
     terms = {name.removeprefix(_TERMS): values for name, values in small.items() if name.startswith(_TERMS)}
     return replace(state, **read, memory={"saved": terms})
@@ -178,7 +184,7 @@ def _read(folder: Path, mesh: MeshData | None, torn_too: bool, bent_too: bool) -
     arrays, clock = read_arrays(folder, mesh, _CLOCK)
     if len(arrays.get("weakened", ())) and not torn_too:
         raise InputError(f"--restart: the body in {path} has broken edges; the study needs its [fracture] table")
-    if "plastic" in arrays and arrays["plastic"][:, -1].any() and not bent_too:
+    if "plastic" in arrays and arrays["plastic"][..., -1].any() and not bent_too:
         raise InputError(f"--restart: the body in {path} has flowed; the study needs its [plasticity] table")
     return arrays | {"clock": clock}
 

@@ -55,7 +55,8 @@ class Frames:
         if name == "region":
             return self._domain.region.astype(np.int32)
         if name == "plastic_strain":
-            strain: Values = self._stress.material.plastic.strain
+            plastic = self._stress.material.plastic
+            strain: Values = plastic.of_cells(plastic.strain)
             return strain
         if name == "damage":
             return self._broken_share()

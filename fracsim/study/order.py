@@ -27,7 +27,6 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
     fracture, contact = study.fracture, study.contact
     return [
         ('time.scheme = "rigid"', study.time.scheme == "rigid", "bodies are solved for with linear displacement"),
-        ("[plasticity]", study.plasticity is not None, "cells have one state of flow each"),
         ("fracture.energy", fracture is not None and fracture.energy is not None, "tips go by linear displacement"),
         (
             'fracture.approach = "edge"',
@@ -48,8 +47,10 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
 
 def bent(study: Study, mesh: MeshData, builder: Any) -> MeshData:
     """The mesh with the middles of edges on the round faces that its builder knows of, where cells are to have nodes
-    there: straight sides would cost what quadratic displacement gains. What breaks stays straight: cells are cut."""
-    if study.mesh.order == 1 or study.fracture is not None or not getattr(builder, "rounds", ()):
+    there: straight sides would cost what quadratic displacement gains. What breaks or flows stays straight: energies of
+    cells are sums over their volume."""
+    cut = study.fracture is not None or study.plasticity is not None
+    if study.mesh.order == 1 or cut or not getattr(builder, "rounds", ()):
         return mesh
     from ..meshes.rounds import middles_on
 
