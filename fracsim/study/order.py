@@ -40,8 +40,17 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
         ),
         ('output.cut = "forces"', study.output.cut == "forces", "corners carry no share of a uniform stress"),
         ("[brittle]", study.brittle is not None, "level sets cut straight cells whose stress is one value"),
-        ("[[obstacle]]", bool(study.obstacle), "points of the surface follow the corners of cells alone"),
-        ("[contact]", contact is not None, "points of the surface follow the corners of cells alone"),
+        (
+            "[[obstacle]] and [fracture]",
+            bool(study.obstacle) and fracture is not None,
+            "walls of cracks follow the corners of cells alone",
+        ),
+        (
+            '[[obstacle]] shape = "mesh"',
+            any(each.shape == "mesh" for each in study.obstacle),
+            "it is felt by the corners of cells alone",
+        ),
+        ("[contact] itself", contact is not None and bool(contact.itself), "it is felt by the corners of cells alone"),
     ]
 
 

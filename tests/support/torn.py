@@ -203,7 +203,8 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
     found[f"{name}-energy"] = np.array([state.work, state.dissipated])
     found[f"{name}-mass"] = domain.gather_nodes(scene.balance.mass.lumped.reshape(-1, domain.dim))
     if scene.balance.stress.material.plastic is not None:
-        found[f"{name}-plastic"] = domain.gather_cells(scene.balance.stress.material.plastic.memory())
+        memory = scene.balance.stress.material.plastic.memory()
+        found[f"{name}-plastic"] = domain.gather_cells(memory.reshape(domain.cell_count, -1, memory.shape[1]))
     if scene.fracture is not None and scene.balance.stress.chi is not None:
         found[f"{name}-chi"] = domain.gather_cells(scene.balance.stress.chi.x.array[: domain.cell_count])
     if scene.fracture is not None:

@@ -43,8 +43,9 @@ class LocalSurface:
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
-        self._skeleton = Skeleton(_mesh_of(domain))
-        self.follow_damage(np.zeros(domain.cell_count, np.uint8))
+        mesh = _mesh_of(domain)
+        self._skeleton = Skeleton(mesh)
+        self.follow_damage(np.zeros(len(mesh.cells), np.uint8))
 
     def follow_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Be the surface of a body with these patterns of broken edges, (cells,) (collective)."""
@@ -133,6 +134,10 @@ class LocalSurface:
 
 def _mesh_of(domain: Domain) -> MeshData:
     """This rank's cells, and which of their facets are on the boundary of the body."""
+    if domain.order == 2:
+        from .refined import refined
+
+        return refined(domain, OUTSIDE)
     exterior = domain._exterior
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
     of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)
