@@ -1,4 +1,4 @@
-"""Quadratic elements on the mesh of a study of linear elasticity: a reference that shares no element with the program.
+"""Quadratic elements on the mesh of a study of linear elasticity: a reference with forms and a solver of its own.
 
     python -m fracsim.studies.evidence.precision.quadratic --case cantilever --h 0.025 -o figures.json
 
@@ -32,8 +32,8 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
     from ....study.check import checked_mesh
     from ....study.file import validate
 
-    checked = validate(study, "quadratic")
-    domain = distribute(MPI.COMM_SELF, checked_mesh(checked))
+    checked = validate(study | {"mesh": study["mesh"] | {"order": 2}}, "quadratic")
+    domain = distribute(MPI.COMM_SELF, checked_mesh(checked), 2)  # for its round sides
     d, material = domain.dim, checked.material
     V = fem.functionspace(domain.mesh, ("Lagrange", 2, (d,)))
     u, v, w = fem.Function(V), ufl.TrialFunction(V), ufl.TestFunction(V)
