@@ -8,13 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from mpi4py import MPI
+from scipy.linalg import eigh
+from scipy.sparse import csr_matrix
 
 import xdmf_reader
 from fracsim.run import run_study
+from fracsim.stepping.frequencies import cell_frequencies
+from fracsim.study.check import check_study
 from support.manufactured import errors, solved
 from support.scenes import make_scene, make_study, march
+
+Values = npt.NDArray[np.float64]
 
 
 def orders(energy: str, order: int, dim: int, cells: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> list[float]:
@@ -200,3 +207,58 @@ def test_middles_touch_too() -> None:
     force, top = pressed(2)
     assert force == pytest.approx(linear, rel=0.02)
     assert np.ptp(top) < 0.01 * 0.5
+
+
+# --- mass ---
+
+
+def spectrum(dim: int, cells: int, order: int, mass: str) -> tuple[Values, float]:
+    """omega^2 of a box on rollers but for one free end, from K and M as they are assembled, and the bound of its
+    fastest cell, 1/s^2."""
+    sides = ("left", "bottom", "top", "front", "back")[: 2 * dim - 1]
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 1.0 / cells, "order": order},
+        material={"energy": "linear", "young": 1.0, "poisson": 0.3, "density": 1.0},
+        boundary=[{"on": side, "fix": "xyyzz"[at] if dim == 2 else "xzzyy"[at]} for at, side in enumerate(sides)],
+        time={"scheme": "newmark", "step": 1.0, "end": 1.0, "mass": mass},
+    )
+    balance = scene.balance
+    balance.look_at(0.0, state.u, state.v, dt=1.0)
+    free = np.flatnonzero(balance.motion.free)
+    K, M = (np.zeros((len(free), len(free))) for _ in range(2))
+    balance.assemble_tangent(balance.tangent)
+    K[:] = dense(balance.tangent)[np.ix_(free, free)]
+    for column, dof in enumerate(free):
+        M[:, column] = balance.mass.times(np.eye(1, balance.owned, dof)[0])[free]
+    K -= balance.c_a * M
+    return eigh(K, M, eigvals_only=True), float(cell_frequencies(balance.stress).max())
+
+
+def dense(matrix: Any) -> Values:
+    return csr_matrix(matrix.getValuesCSR()[::-1], shape=matrix.size).toarray()
+
+
+@pytest.mark.parametrize(("dim", "cells"), [(2, 3), (3, 1)])
+def test_no_body_is_faster_than_its_fastest_cell(dim: int, cells: int) -> None:
+    """The bound from a constant of the reference cell: above the fastest motion, and not by so much that steps are
+    half as long as they could be."""
+    values, bound = spectrum(dim, cells, 2, "lumped")
+    assert values.min() > 0
+    assert values.max() < bound < 4 * values.max()
+
+
+def test_lumped_mass_costs_the_order_of_frequencies() -> None:
+    """The slowest motion along x, (pi/2)^2 (lambda + 2 mu) / rho: an error in omega^2 of h^2 with the lumped mass, of
+    h^4 with the consistent one."""
+    exact = (np.pi / 2) ** 2 * 0.7 / (1.3 * 0.4)
+    for mass, order in (("lumped", 2), ("consistent", 4)):
+        found = [abs(np.abs(spectrum(2, n, 2, mass)[0] - exact).min()) for n in (2, 4)]
+        assert np.log2(found[0] / found[1]) == pytest.approx(order, abs=0.3)
+
+
+def test_check_says_what_is_built() -> None:
+    mesh = {"builder": "disk", "radius": 1.0, "h": 0.5, "order": 2}
+    assert "cells of 6 nodes, round sides" in "\n".join(check_study(make_study(mesh=mesh)))
+    broken = "\n".join(check_study(make_study(mesh=mesh, fracture={"strength": 1.0})))
+    assert "cells of 6 nodes, 4 times" in broken
+    assert "quadratic" not in "\n".join(check_study(make_study()))

@@ -26,7 +26,7 @@ from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
 from .lengths import fits
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
-from .order import bent
+from .order import bent, has_round_sides
 from .resultants import resultants
 from .tearing import tearing
 
@@ -197,7 +197,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}; groups {', '.join(anatomy.groups) or 'none'}"
     if study.mesh.order == 2:
         nodes = 6 if anatomy.dim == 2 else 10
-        yield f"            quadratic displacement: cells of {nodes} nodes, {NODES[anatomy.dim]} as many nodes"
+        sides = ", round sides" if has_round_sides(study, find_builder(study.mesh)) else ""
+        yield f"            quadratic displacement: cells of {nodes} nodes{sides}, {NODES[anatomy.dim]} as many nodes"
     yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
         yield f"            note: {note}"

@@ -54,12 +54,17 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
     ]
 
 
+def has_round_sides(study: Study, builder: Any) -> bool:
+    """Whether cells of the study are bent; `builder`: of its mesh, None of a file."""
+    straight = study.mesh.order == 1 or study.fracture is not None or study.plasticity is not None
+    return not straight and bool(getattr(builder, "rounds", ()))
+
+
 def bent(study: Study, mesh: MeshData, builder: Any) -> MeshData:
     """The mesh with the middles of edges on the round faces that its builder knows of, where cells are to have nodes
     there: straight sides would cost what quadratic displacement gains. What breaks or flows stays straight: energies of
     cells are sums over their volume."""
-    cut = study.fracture is not None or study.plasticity is not None
-    if study.mesh.order == 1 or cut or not getattr(builder, "rounds", ()):
+    if not has_round_sides(study, builder):
         return mesh
     from ..meshes.rounds import middles_on
 

@@ -27,7 +27,7 @@ SIZES = {
     "plate": (0.008, 0.006, 0.004, 0.003, 0.002, 0.0015, 0.001, 0.00075),
 }
 # with quadratic displacement
-SECOND = {"cantilever": (0.1, 0.05, 0.033, 0.025), "plate": (0.012, 0.01, 0.008, 0.006, 0.004, 0.003, 0.002)}
+SECOND = {"cantilever": (0.1, 0.05, 0.033), "plate": (0.012, 0.01, 0.008, 0.006, 0.004, 0.003, 0.002)}
 FULL = {"cantilever": 0.004, "plate": 0.00075}  # this size is for the long report
 
 
