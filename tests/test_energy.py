@@ -19,7 +19,7 @@ from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through
 from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
 from fracsim.fracture.energy.mixed import NORMAL, SHEAR, gain, kink, phase
 from fracsim.fracture.energy.seen import Seen
-from fracsim.fracture.energy.tips import AVERAGE, DISC, NEAR_TIP, CrackTips
+from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
@@ -116,6 +116,9 @@ def test_a_crack_does_not_turn_back() -> None:
     assert leave(corners, entry, point, normal, np.array([[1.0, 0.0]]), whole).edge.tolist() == [0]
     both = np.array([[True, True, False]])
     assert leave(corners, entry, point, normal, up, both).edge.tolist() == [1]
+    steep = np.array([[-0.94, -0.33]])  # out by where it came in: along that edge, by the end that lies ahead
+    turned = leave(corners, entry, point, np.array([[0.33, -0.94]]), steep, whole)
+    assert turned.edge.tolist() == [1] and points_at(corners, np.full((1, 3), turned.share[0]))[0, 1, 0] < 0.02
 
 
 def test_a_cell_is_let_go_in_the_time_of_a_rayleigh_wave() -> None:
@@ -182,8 +185,7 @@ def test_where_a_crack_turns_in_closed_form() -> None:
         best = np.argmax(hoop)
         if each:
             assert kink(np.array([each]))[0] == pytest.approx(t[best], abs=1e-4)
-        expected = hoop[best] ** 2 / np.sqrt(1 + np.sin(2 * each) ** 2)
-        assert gain(np.array([each]))[0] == pytest.approx(expected, rel=1e-6)
+        assert gain(np.array([each]))[0] == pytest.approx(hoop[best] ** 2, rel=1e-6)
     assert np.degrees(kink(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
     assert gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
     c, s = np.cos(t / 2), np.sin(t / 2) * np.sin(1.5 * t)
@@ -197,9 +199,9 @@ def test_where_a_crack_turns_in_closed_form() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
-    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 12 degrees, and what the crack
-    that turns releases to a quarter, as near as a field is that no mesh made; the first principal stress of the mean
-    is 30 degrees off."""
+    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 5 degrees, and what the crack
+    that turns releases to a tenth, as near as a field is that no mesh made; the first principal stress of the mean is
+    30 degrees off."""
     study = make_study(**plate_tables(), crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
     scene = scene_on(distribute(MPI.COMM_SELF, square(kind, 30)), study)
     graph, criterion = scene.fracture.graph, scene.fracture.criterion
@@ -209,16 +211,16 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.displace(u.ravel())
         seen = criterion.sight.look(*scene.fracture.evaluate(), point, point, criterion.cut)
-        radius = AVERAGE * criterion._h[tips]
+        radius = criterion.disc * criterion._h[tips]
         mean, _ = seen.averages(point, radius)
         back, _ = seen.behind(point, radius, 0 * radius)
-        size = np.linalg.norm(seen.forces(point, criterion.disc * criterion._h[tips]), axis=1)
-        released, ahead = criterion._turned(mean, point - back, size)
+        force = seen.forces(point, radius)
+        released, ahead = criterion._turned(mean, point - back, force)
         psi = np.arctan2([second], [first])
         angle = np.arctan2(ahead[0, 1], ahead[0, 0])
-        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=12)
-        expected = (first**2 + second**2) * np.sqrt(1 + np.sin(2 * psi[0]) ** 2) * gain(psi)[0]
-        assert released[0] * STIFF == pytest.approx(expected, rel=0.25)
+        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=5)
+        expected = (first**2 + second**2) * gain(psi)[0]
+        assert released[0] * STIFF == pytest.approx(expected, rel=0.1)
 
 
 # --- a notched plate -------------------------------------------------------------------------------------------------

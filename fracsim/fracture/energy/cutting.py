@@ -54,18 +54,32 @@ def leave(corners: Values, entry: Ints, point: Values, normal: Values, ahead: Va
     """Where cracks that came in at local edges `entry` (n,) and points (n, 2) leave their cells: one edge each.
 
     Along the line of the normal (n, 2), unless that goes back, against `ahead` (n, 2), or into a split cell, `torn`
-    (n, 3), where the other way out does not: then by the other edge, as near to the line as it comes.
+    (n, 3), where the other way out does not: then by the other edge, as near to the line as it comes. A crack that
+    turns so far that it would leave by where it came in goes by the end that lies most ahead.
     """
-    rows = np.arange(len(entry))
+    rows = np.arange(len(entry))[:, None]
     crossed, share = line_cuts(corners, point, normal)
     ways = np.stack([(entry + 1) % 3, (entry + 2) % 3], axis=1)
-    exits = points_at(corners, share)[rows[:, None], ways]
-    back = np.einsum("nwi,ni->nw", exits - point[:, None], ahead) < 0
-    bad = back + 0.5 * torn[rows[:, None], ways]
-    first = np.argmax(crossed[rows[:, None], ways], axis=1)
-    chosen = np.where(bad[rows, 1 - first] < bad[rows, first], 1 - first, first)
-    edge = ways[rows, chosen]
-    return Cuts(rows, edge, share[rows, edge])
+    along = _along(points_at(corners, share)[rows, ways], point, ahead)
+    ends = np.stack([np.full_like(share, each) for each in (CLOSEST, 1 - CLOSEST)])
+    far = np.stack([_along(points_at(corners, each)[rows, ways], point, ahead) for each in ends])
+    turned = (along < 0) & (far.max(axis=0) > along)
+    share[rows, ways] = np.where(turned, np.where(far[1] > far[0], 1 - CLOSEST, CLOSEST), share[rows, ways])
+    along = np.where(turned, far.max(axis=0), along)
+    bad = (along < 0) + turned + 0.5 * torn[rows, ways]
+    first = np.argmax(crossed[rows, ways], axis=1)[:, None]
+    worse = np.take_along_axis(bad, first, 1) - np.take_along_axis(bad, 1 - first, 1)
+    less = np.take_along_axis(along, first, 1) < np.take_along_axis(along, 1 - first, 1)
+    aside = np.take_along_axis(turned, first, 1) & less & (worse == 0)
+    edge = np.take_along_axis(ways, np.where((worse > 0) | aside, 1 - first, first), 1)[:, 0]
+    return Cuts(rows[:, 0], edge, share[rows[:, 0], edge])
+
+
+def _along(exits: Values, point: Values, ahead: Values) -> Values:
+    """(n, ways) cosines, times |ahead|, of `ahead` (n, 2) and the ways from points (n, 2) to (n, ways, 2)."""
+    apart = exits - point[:, None]
+    length = np.linalg.norm(apart, axis=2)
+    return np.divide(np.einsum("nwi,ni->nw", apart, ahead), length, out=np.zeros(length.shape), where=length > 0)
 
 
 def cleave(corners: Values, broken: Flags, point: Values, normal: Values) -> Cuts:

@@ -73,6 +73,12 @@ class Front:
         ends = self._domain.nodes[self._ends[edges]]
         return np.asarray(ends[..., 0, :] + share[..., None] * (ends[..., 1, :] - ends[..., 0, :]))
 
+    def middles(self, cells: Ints, cut: Values) -> Values:
+        """(n, d) mean of the places where cells (n,) are cut, m."""
+        broken = ~self._graph.intact(cells)
+        places = self.places(self._graph.cell_edges[cells], cut)
+        return np.asarray(np.einsum("nk,nki->ni", broken, places) / broken.sum(axis=1, keepdims=True))
+
     def rows(self, cells: Ints, cut: Values) -> Values:
         """(n, WIDTH) polygons of split cells: four corners in m, and 1 for each side inside the body."""
         corners, faces = (table[self._graph.pattern[cells]] for table in polygons())

@@ -4,8 +4,10 @@
     tan(t/2) = - 2 K_II / (K_I + (K_I^2 + 8 K_II^2)^1/2)        the greatest hoop stress (Erdogan and Sih 1963)
     K = cos(t/2) (K_I cos^2(t/2) - 3/2 K_II sin t)              of the crack that turns by t
 
-The force on a tip is |g| = (K_I^2 + K_II^2) (1 + sin^2 2 psi)^1/2 / E', of growing straight on. In pure sliding the
-crack that turns releases a third more. Where K_I < 0 the sides press on each other, and it has no part.
+The force along the crack, (K_I^2 + K_II^2) / E', is of growing straight on. In pure sliding the crack that turns
+releases a third more. Across it the force is - 2 K_I K_II / E' and what the stress along the crack's sides adds: a disc
+has as much of it as of K_II where that stress is large (a blow along a notch), so that it has no part.
+Where K_I < 0 the sides press on each other, and it has no part.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ def kink(psi: Values) -> Values:
 
 
 def gain(psi: Values) -> Values:
-    """(n,) what the crack that turns releases, over |g|."""
+    """(n,) what the crack that turns releases, over that of growing straight on."""
     t = kink(psi)
     turned = np.cos(t / 2) * (np.maximum(np.cos(psi), 0.0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(psi) * np.sin(t))
-    return np.asarray(turned**2 / np.sqrt(1 + np.sin(2 * psi) ** 2))
+    return np.asarray(turned**2)

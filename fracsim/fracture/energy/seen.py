@@ -37,6 +37,7 @@ class Seen:
         sigma: (near, d, d) Eshelby's stress of the body as it is, Pa; 0 far from tips.
         inertia: (near, d) rho (H^T a - (grad v)^T v), N/m^3; 0 far from tips, and where nothing has a mass.
         split, damaged: (near,) come apart; with a broken edge.
+        inside: (near, d) from the centre of a split cell to the middle of the crack in it, m.
         polygons: (near, WIDTH) of split cells (front); None in the plane, where an advance makes its own length.
     """
 
@@ -46,6 +47,7 @@ class Seen:
     inertia: Values
     split: Flags
     damaged: Flags
+    inside: Values
     polygons: Values | None = None
 
     @property
@@ -105,11 +107,11 @@ class Seen:
         return mean, square
 
     def behind(self, point: Values, radius: Values, beyond: Values) -> tuple[Values, Flags]:
-        """(n, d) the mean of the split cells nearer than R, and whether there are any from R to R + `beyond`."""
+        """(n, d) the middle of the crack nearer than R, and whether there is any from R to R + `beyond`."""
         pairs = self.around.pairs(point, radius + beyond)
         split, far = self.split[pairs.cell], pairs.distance >= radius[pairs.place]
         weight = (split & ~far).astype(float)
-        mean = _ratio(pairs, weight[:, None] * pairs.apart, weight)
+        mean = _ratio(pairs, weight[:, None] * (pairs.apart + self.inside[pairs.cell]), weight)
         return point + mean, pairs.any(split & far)
 
 
@@ -133,9 +135,9 @@ class Sight:
         self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))
         self._front = Front(domain, graph)
 
-    def places(self, edges: Cells, cut: Values) -> Values:
-        """(..., d) where local edges are cut, m, by their share `cut` (edges,)."""
-        return self._front.places(edges, cut)
+    def middles(self, cells: Ints, cut: Values) -> Values:
+        """(n, d) mean of the places where cells (n,) are cut, m."""
+        return self._front.middles(cells, cut)
 
     def look(self, stress: Values, psi: Values, points: Values, others: Values, cut: Values) -> Seen:
         """What is around the tips at `points` (n, d), and `others` (m, d) where cracks may begin (collective).
@@ -143,13 +145,15 @@ class Sight:
         `cut`: (edges,) where cracks cut local edges.
         """
         graph, count, d = self._graph, len(stress), self._domain.dim
-        rows = np.zeros((count, 2 * d * d + d + 2))
-        tensor, sigma, inertia = np.split(rows[:, :-2], [d * d, 2 * d * d], axis=1)  # views
+        rows, parts = np.zeros((count, 2 * d * (d + 1) + 2)), [d * d, 2 * d * d, 2 * d * d + d]
+        tensor, sigma, inertia, inside = np.split(rows[:, :-2], parts, axis=1)  # views
         cells = self.around.wanted(np.concatenate([points, others]))
         tensor[cells] = tensors(stress[cells], d).reshape(-1, d * d)
         rows[cells, -2], rows[cells, -1] = graph.split[cells], graph.damaged[cells]
         assert self._stress.chi is not None
         cells = self.around.wanted(points)
+        split = cells[graph.split[cells]]
+        inside[split] = self._front.middles(split, cut) - self.centres[split]
         cells = cells if self._stress.closes else cells[self._stress.chi.x.array[cells] > 0]
         H = self.gradients(cells, self._stress.u.x.array)
         sigma[cells] = self._eshelby(cells, tensors(stress[cells], d), psi[cells], H).reshape(-1, d * d)
@@ -157,10 +161,10 @@ class Sight:
             kinetic, inertia[cells] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
             sigma[cells] += kinetic[:, None] * np.eye(d).ravel()
         seen = self.around.exchange(rows)
-        tensor, sigma, inertia = np.split(seen[:, :-2], [d * d, 2 * d * d], axis=1)
+        tensor, sigma, inertia, inside = np.split(seen[:, :-2], parts, axis=1)
         tensor, sigma = tensor.reshape(-1, d, d), sigma.reshape(-1, d, d)
         polygons = self._polygons(points, cut) if d == 3 else None
-        return Seen(self.around, tensor, sigma, inertia, seen[:, -2] > 0, seen[:, -1] > 0, polygons)
+        return Seen(self.around, tensor, sigma, inertia, seen[:, -2] > 0, seen[:, -1] > 0, inside, polygons)
 
     def _polygons(self, points: Values, cut: Values) -> Values:
         """(near, WIDTH) of the split cells around tips (collective)."""

@@ -144,10 +144,7 @@ class CrackTips:
 
     def _entries(self, tips: Ints) -> tuple[Ints, Values]:
         """(n,) a local edge at which the crack came into each tip cell, and (n, d) where, m: the mean of all."""
-        broken = ~self._graph.intact(tips)
-        places = self.sight.places(self._graph.cell_edges[tips], self.cut)
-        point = np.einsum("nk,nki->ni", broken, places) / broken.sum(axis=1, keepdims=True)
-        return np.argmax(broken, axis=1), point
+        return np.argmax(~self._graph.intact(tips), axis=1), self.sight.middles(tips, self.cut)
 
     def _grown(self, seen: Seen, tips: Ints, entry: Ints, point: Values) -> Proposal:
         """Tips that advance."""
@@ -157,11 +154,11 @@ class CrackTips:
         mean, square = seen.averages(point, AVERAGE * h)
         sigma = largest(mean)
         behind, mature = seen.behind(point, radius, FULL * h)
-        size, ahead = np.linalg.norm(force, axis=1), np.where(mature[:, None], force, point - behind)
-        turns = np.zeros(len(tips), bool)
+        size, turns = np.linalg.norm(force, axis=1), np.zeros(len(tips), bool)
+        ahead = np.where(mature[:, None], force, point - behind)
         if d == 2:
-            back, _ = seen.behind(point, AVERAGE * h, 0 * h)
-            size, turned = self._turned(mean, point - back, size)
+            size, turned = self._turned(seen.averages(point, radius)[0], point - behind, force)
+            mature &= size > 0  # a force back is that of other tips in the disc
             turns = mature & np.any(turned, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
         toughness = np.broadcast_to(self.toughness, len(self._h))[tips]
@@ -172,14 +169,18 @@ class CrackTips:
         return Proposal(rank, tips[active], mean[active], entry[active], ahead[active], turns[active])
 
     @staticmethod
-    def _turned(stress: Values, along: Values, size: Values) -> tuple[Values, Values]:
-        """(n,) what cracks that turn release, J/m^2, and (n, 2) whither; 0 where nothing lies behind."""
+    def _turned(stress: Values, along: Values, force: Values) -> tuple[Values, Values]:
+        """(n,) what cracks that turn release, J/m^2, and (n, 2) whither; 0 where nothing lies behind.
+
+        Of the force that along the crack: the stress along its sides, and the wave in it, push across it besides.
+        """
         length = np.linalg.norm(along, axis=1)
         tangent = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
         psi = phase(stress, tangent)
         c, s = np.cos(kink(psi)), np.sin(kink(psi))
         turned = np.column_stack([c * tangent[:, 0] - s * tangent[:, 1], s * tangent[:, 0] + c * tangent[:, 1]])
-        return np.where(length > 0, size * gain(psi), size), turned
+        straight = np.einsum("ni,ni->n", force, tangent)
+        return np.where(length > 0, straight * gain(psi), np.linalg.norm(force, axis=1)), turned
 
     def _begun(self, seen: Seen, weak: Ints) -> Proposal:
         """Whole cells, farther than R from any crack, whose averaged stress reaches the strength."""
