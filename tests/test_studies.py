@@ -36,6 +36,7 @@ COARSE = {
     "hammered-vase": ["mesh.h=0.015"],
     "izod": ["mesh.h=0.002", "mesh.h_notch=0.0006"],
     "jelly-figure": ["mesh.h=0.015"],
+    "kalthoff": ["mesh.h=0.005"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "platens": ["mesh.h=0.01"],
