@@ -365,6 +365,16 @@ def test_the_second_peak_is_the_top_of_the_longest_rise_after_the_first() -> Non
     assert max(found["curve"][1]) == 10.0 and len(found["curve"][0]) == 10
 
 
+def test_angle_of_kalthoffs_crack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the first row in which the tip is 40 mm or more from the notch."""
+    tips = 0.05 + 0.045 * np.cos(1.1) * np.array([0.0, 0.5, 1.0, 2.0]), 0.025 + 0.045 * np.sin(1.1) * np.arange(4) / 2
+    rows = {"tip_x": tips[0], "tip_y": tips[1], "pieces": np.ones(4)}
+    study = {"crack": [{"segment": [[-0.01, 0.025], [0.05, 0.025]]}]}
+    monkeypatch.setattr(experiments.results, "history", lambda run: rows)
+    monkeypatch.setattr(experiments.results, "study", lambda run: study)
+    assert experiments.measured_kalthoff(tmp_path)["angle"] == pytest.approx(np.degrees(1.1))
+
+
 def test_section_of_experiments() -> None:
     """A disk 5 % off on two meshes and 20 % on the third is no claim that holds; a failed run stays in the table."""
     exact = experiments.BY_CASE["brazilian"].peak
@@ -374,7 +384,7 @@ def test_section_of_experiments() -> None:
         records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
     records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
     (section,) = experiments.sections(records)
-    assert [claim.holds for claim in section.claims] == [False, True, True, None, None]
+    assert [claim.holds for claim in section.claims] == [False, True, True, None, None, None, None]
     every, spreads = section.tables
     assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
     assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))

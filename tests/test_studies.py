@@ -39,6 +39,7 @@ COARSE = {
     "kalthoff": ["mesh.h=0.005"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
+    "notched-shear": ["mesh.h=0.0001"],
     "platens": ["mesh.h=0.01"],
     "punched-slab": ["mesh.h=0.015"],
     "rigid-dropped-vase": ["mesh.h=0.02"],
