@@ -25,7 +25,7 @@ SPARE = 0.02  # of the body's volume: what hulls may have beyond it
 ROUGH = 0.1  # of the mean edge of the mesh: how far off they may be, in the mean
 PARTS = 32  # of a body, at most
 MANY = 1000  # points: what has more is cut across its longest axis, without a comparison
-LONG = 0.4  # of its greatest length (as its second moments go): it is not cut across what is shorter
+LONG = 0.7  # of its greatest length (as its second moments go): it is not cut across what is shorter
 THIN = 0.01  # of its length: no part is flatter, or it would have no hull
 
 
@@ -148,7 +148,7 @@ def outermost(parts: list[Values]) -> Ints:
 
 
 def _halved(part: Solid) -> list[tuple[Solid, Hull]]:
-    """The best way of cutting it through its middle, across one of its longer axes; none where it has no volume to cut."""
+    """The best way of cutting it through its middle, across a longer axis; none where it has no volume to cut."""
     of = part.moments
     if not of.volume[0] > 0:
         return []

@@ -91,7 +91,8 @@ def model_of(
     rules: Rules,
     outer: Sequence[Ints] | None = None,
 ) -> Model:
-    """Of bodies of these convex parts, corners of which may be `outer`. MuJoCo numbers the geoms of what stands still first."""
+    """Of bodies of these convex parts, corners of which may be `outer`. MuJoCo numbers the geoms of what stands still
+    first."""
     mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
     spec, things = _spec(rules), []
     for number, each in enumerate(parts):
@@ -134,8 +135,8 @@ def _planes(
     friction = np.array([stands[k].friction for k in stand])
     if outer is None:
         return Planes(stand, geom, normal, friction, corners, of, part)
-    begin = np.cumsum([0, *(sum(map(len, each)) for each in parts)])
-    kept = np.concatenate([np.empty(0, np.int64), *(each + k for each, k in zip(outer, begin, strict=False))])
+    begin = np.searchsorted(of, np.arange(len(parts)))
+    kept = np.concatenate([np.empty(0, np.int64), *(each + k for each, k in zip(outer, begin, strict=True))])
     return Planes(stand, geom, normal, friction, corners[kept], of[kept], part[kept])
 
 
