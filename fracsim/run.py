@@ -28,7 +28,7 @@ from .output.writing import written
 from .scene import Scene, build_scene
 from .stepping.stepper import StepReport
 from .study import Study
-from .study.file import study_text
+from .study.file import completed, study_text
 
 if TYPE_CHECKING:
     from .output.crack_front import CrackFront
@@ -422,7 +422,7 @@ def _check(
         study.mesh.shell,
         *(each.file for each in study.obstacle),
     )
-    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs)
+    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=completed)
 
 
 def _draw(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import dataclasses
 import importlib
@@ -12,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from fracsim.output.fields import Frames
 from fracsim.output.same_study import differences
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
+from fracsim.study.file import completed, study_text
 from fracsim.study.mesh_source import build_mesh, save_mesh
 
 Data = dict[str, Any]
@@ -284,6 +287,17 @@ def test_tables_that_an_earlier_version_did_not_know_are_empty() -> None:
     assert list(differences(then, then | {"crack": []})) == []
     (found,) = differences(then, then | {"crack": [{"segment": [0.0, 1.0]}]})
     assert found.startswith("crack.0.segment was absent")
+
+
+def test_keys_that_an_earlier_version_did_not_know_have_their_defaults() -> None:
+    """An older study.toml is that of today but for what it says otherwise; what is no study of today stays."""
+    now = tomllib.loads(study_text(study(TEARING)))
+    then = copy.deepcopy(now)
+    assert then["fracture"].pop("crumbs") is True and then["mesh"].pop("order") == 1
+    assert completed(then) == now
+    then["fracture"]["strength"] *= 2
+    assert [each.split()[0] for each in differences(completed(then), now)] == ["fracture.strength"]
+    assert completed({"mesh": {"forgotten": 1}}) == {"mesh": {"forgotten": 1}}
 
 
 @pytest.mark.parametrize("ranks", [0, 2])

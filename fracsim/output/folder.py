@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import platform
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -23,14 +24,23 @@ from .same_study import check_same_study
 from .writing import reason, replace_text
 
 
-def check_folder(folder: Path, study: str, *, restart: bool, overwrite: bool, inputs: Iterable[Path | None]) -> None:
+def check_folder(
+    folder: Path,
+    study: str,
+    *,
+    restart: bool,
+    overwrite: bool,
+    inputs: Iterable[Path | None],
+    completed: Callable[[dict[str, Any]], dict[str, Any]],
+) -> None:
     """InputError where a run of this study may not write there, or cannot go on from there; changes nothing (rank 0).
 
     `study`: as it would stand in study.toml; `overwrite`: a run that may go on may be thrown away; `inputs`: files
-    that the study is read from.
+    that the study is read from; `completed` gives an earlier version's study the defaults of keys that it did not know.
     """
     if restart:
-        check_same_study(checkpoint_path(folder), read_notes(folder).values(), tomllib.loads(study))
+        then = completed(read_notes(folder).values())
+        check_same_study(checkpoint_path(folder), then, tomllib.loads(study))
         inputs = ()  # study.toml of the run itself is what one goes on with
     check_owner(folder, inputs)
     if not restart and not overwrite:

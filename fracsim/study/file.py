@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,15 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
     data["material"] |= data["material"].pop("regions")
     data["mesh"] |= _builder_parameters(study)
     return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
+
+
+def completed(values: dict[str, Any]) -> dict[str, Any]:
+    """What `study_text` of an earlier version wrote, with the defaults of keys that it did not know; as it is, where it
+    is no study of this one."""
+    try:
+        return tomllib.loads(study_text(validate(deepcopy(values), "")))
+    except InputError:
+        return values
 
 
 def _builder_parameters(study: Study) -> dict[str, Any]:

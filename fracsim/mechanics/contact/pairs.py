@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .crossings import NONE, crossings
-from .near import Kind, Near
+from .near import KEPT, Kind, Near, longest
 from .slip import Friction, projection
 
 Values = npt.NDArray[np.float64]
@@ -58,7 +58,7 @@ class Pairs:
         made = [Kind(ipctk.BarrierPotential(share * distance, k, True), name) for k, share, name in kinds]
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
-        self._friction = friction
+        self._friction, self._distance = friction, distance
         self._area = areas(rest, elements)
 
     # --- the barrier ---
@@ -82,7 +82,9 @@ class Pairs:
 
     def least_gap(self, x: Values) -> float:
         """The least distance between elements on which the barrier acts, m; infinite where there is none."""
-        on = self._mesh.vertices(x)
+        return self._gap_at(self._mesh.vertices(x))
+
+    def _gap_at(self, on: Values) -> float:
         squared = [pairs.compute_minimum_distance(self._mesh, on) for _, pairs in self._near.touching(on)]
         return float(np.sqrt(min(squared)))
 
@@ -115,12 +117,22 @@ class Pairs:
         """
         on, way = self._mesh.vertices(x), self._mesh.vertices(to) - self._mesh.vertices(x)
         way -= way.mean(axis=0)  # what all have in common brings nothing together
+        if self._is_short(on, way):
+            return 1.0
         pieces = self._pieces(way)
         for piece in range(min(pieces, MOST)):
             share = self._near.free(on + piece / pieces * way, on + (piece + 1) / pieces * way)
             if share < 1.0:
                 return (piece + share) / pieces
         return min(pieces, MOST) / pieces
+
+    def _is_short(self, on: Values, way: Values) -> bool:
+        """Whether a way (n, d) leaves KEPT of every gap however points go, as half of Newton's corrections do.
+
+        A pair on which no barrier acts is no nearer than that of edges begins.
+        """
+        most = 2.0 * longest(way) / (1.0 - KEPT)
+        return most <= EDGES * self._distance and most <= self._gap_at(on)
 
     def _pieces(self, way: Values) -> int:
         """In how many pieces a way (n, d) is walked: so many that boxes around what moves have on average WIDE times
