@@ -83,8 +83,10 @@ class Around:
         every = np.concatenate(self._comm.allgather(places))
         if len(every) > MANY:
             return np.arange(self._own.n)
-        found = self._own.query_ball_point(every, self._reach) if len(every) else []
-        return np.unique(np.concatenate([np.empty(0, np.int64), *map(np.asarray, found)]).astype(np.int64))
+        near = np.zeros(self._own.n, bool)
+        for found in self._own.query_ball_point(every, self._reach, return_sorted=False) if len(every) else ():
+            near[found] = True
+        return np.flatnonzero(near)
 
     def pairs(self, places: Values, radius: Values) -> Pairs:
         """Cells whose centres lie within `radius` (n,) of places (n, d)."""

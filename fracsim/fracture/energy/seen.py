@@ -163,14 +163,12 @@ class Sight:
         seen = self.around.exchange(rows)
         tensor, sigma, inertia, inside = np.split(seen[:, :-2], parts, axis=1)
         tensor, sigma = tensor.reshape(-1, d, d), sigma.reshape(-1, d, d)
-        polygons = self._polygons(points, cut) if d == 3 else None
+        polygons = self._polygons(split, cut) if d == 3 else None
         return Seen(self.around, tensor, sigma, inertia, seen[:, -2] > 0, seen[:, -1] > 0, inside, polygons)
 
-    def _polygons(self, points: Values, cut: Values) -> Values:
-        """(near, WIDTH) of the split cells around tips (collective)."""
+    def _polygons(self, cells: Ints, cut: Values) -> Values:
+        """(near, WIDTH) of the split cells (n,) around tips (collective)."""
         rows = np.zeros((len(self.centres), WIDTH))
-        cells = self.around.wanted(points)
-        cells = cells[self._graph.split[cells]]
         rows[cells] = self._front.rows(cells, cut)
         return self.around.exchange(rows)
 
