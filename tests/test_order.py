@@ -15,6 +15,7 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 
 import xdmf_reader
+from fracsim.output.breaks import Breaks
 from fracsim.run import run_study
 from fracsim.stepping.frequencies import cell_frequencies
 from fracsim.study.check import check_study
@@ -262,3 +263,17 @@ def test_check_says_what_is_built() -> None:
     broken = "\n".join(check_study(make_study(mesh=mesh, fracture={"strength": 1.0})))
     assert "cells of 6 nodes, 4 times" in broken
     assert "quadratic" not in "\n".join(check_study(make_study()))
+
+
+# --- pieces ---
+
+
+def test_dust_is_what_has_one_corner() -> None:
+    """All edges of a square broken by hand: a piece a corner, though middles go with them, and all of the mass."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 1.0, "order": 2}, fracture={"strength": 1.0})
+    graph = scene.fracture.graph
+    graph.break_edges(np.ones(len(graph.broken), bool))
+    breaks = Breaks(scene.balance.stress, scene.fracture)
+    corners = len(scene.domain.source.points)
+    assert breaks.figures[2] == corners
+    assert breaks.dust(scene.domain.volumes) == (corners, pytest.approx(1.0))

@@ -158,6 +158,13 @@ class Domain:
             result[between] = self.middles.named(result[ends])
         return result
 
+    @property
+    def corners(self) -> slice | npt.NDArray[np.bool_]:
+        """Which nodes are corners of cells and owned."""
+        if self.middles is None:
+            return slice(self.node_count)
+        return (self.node_input < self.middles.points) & (np.arange(len(self.nodes)) < self.node_count)
+
     @cached_property
     def cell_input(self) -> npt.NDArray[np.int64]:
         """Index in the input mesh of every owned cell."""

@@ -86,11 +86,11 @@ class Breaks:
         return find_pieces(graph)
 
     def dust(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:
-        """Pieces of a single node, and their mass, kg; `mass` (cells,) of cells, kg (collective)."""
+        """Pieces of a single corner of cells, and their mass, kg; `mass` (cells,) of cells, kg (collective)."""
         if self.pieces is None:
             return 0, 0.0
         domain, of_node = self._domain, self.pieces.of_node
-        size = total(domain.comm, np.bincount(of_node[: domain.node_count], minlength=self.pieces.count))
+        size = total(domain.comm, np.bincount(of_node[domain.corners], minlength=self.pieces.count))
         alone = (size == 1)[of_node]
         share = np.count_nonzero(alone[domain.cell_nodes], axis=1) / (domain.dim + 1)
         return int(np.count_nonzero(size == 1)), float(total(domain.comm, np.array([share @ mass]))[0])
