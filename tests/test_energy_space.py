@@ -163,3 +163,44 @@ def test_a_round_crack_starts_at_its_load() -> None:
     load = np.sqrt(F**2 * np.pi * (1 - poisson**2) / forces(scene))
     assert load.min() == pytest.approx(1.0, abs=0.08)
     assert np.median(load) == pytest.approx(1.0, abs=0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ("newmark", "explicit"))
+def test_a_front_runs_where_enough_is_stored(scheme: str) -> None:
+    """A clamped strip of ten cells, 1 m high and 0.25 m thick, pulled slowly with its crack, of 1 m, held, then let go:
+    0.9 G_c never runs, 1.5 G_c runs through, as fast as in the plane (0.7 to 0.8 of c_R), and stays flat."""
+    assert run_of_a_strip(0.9, scheme)[0] < 1e-9
+    far, speed, off = run_of_a_strip(1.5, scheme)
+    assert far > 1.2 and 0.55 < speed < 0.9 and off < 0.06
+
+
+def run_of_a_strip(ratio: float, scheme: str) -> tuple[float, float, float]:
+    """How far the middle of the front runs, m, its speed over c_R, and how far the crack is off its plane, m."""
+    young, poisson, n, at = 1e4, 0.3, 10, 0.52
+    constrained = young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))
+    shear = np.sqrt(young / 2 / (1 + poisson))
+    rayleigh, ready = 0.9274 * shear, 6 / shear
+    s, top = np.linspace(0, 1, 30), np.sqrt(2 * ratio / constrained)
+    ramp = {"time": (ready * s).tolist(), "value": [[0, 0, x] for x in top * s**3 * (10 - 15 * s + 6 * s**2)]}
+    scene = cracked(
+        {"polygon": [[-1, -1, at], [1, -1, at], [1, 2, at], [-1, 2, at]]}, [2.5, 0.25, 1.0], 1 / n,
+        material={"energy": "linear", "young": young, "poisson": poisson, "density": 1.0},
+        fracture={"strength": 1e9, "energy": 1.0}, damping={"mass": 4 * shear},
+        boundary=[*({"on": side, "fix": "y"} for side in ("front", "back")), {"on": "bottom", "fix": "xyz"},
+                  {"on": "top", "displacement": ramp}],
+        time={"scheme": scheme, "step": (0.1 if scheme == "explicit" else 0.5) / n / shear,
+              "end": ready + 2 / rayleigh},
+    )  # fmt: skip
+    criterion, graph, state, seen = scene.fracture.criterion, scene.fracture.graph, scene.start(), [(0.0, 1.0)]
+    criterion.toughness = np.inf
+    while not scene.ended(state):
+        state, report = scene.stepper.advance(state)
+        criterion.toughness = 1.0 if state.t > ready else np.inf
+        tips = np.flatnonzero(graph.damaged & ~graph.split)
+        if report.broken and len(tips):
+            seen.append((state.t - ready, float(np.median(criterion._entries(tips)[1][:, 0]))))
+    t, x = np.array(seen).T
+    steady = (x > 1.2) & (x < 2.2)
+    speed = float(np.polyfit(t[steady], x[steady], 1)[0]) if steady.sum() > 3 else 0.0
+    return float(x.max()) - 1, speed / rayleigh, float((criterion.sight.centres[graph.split][:, 2] - at).std())
