@@ -162,7 +162,7 @@ class FreeSolids(Solids):
             self._now[k] = self.free[k].pose
             if self._solids:
                 self._solids[k].put(self.free[k].pose)
-        self._far = None
+        self._far = self._struck = None
 
     def _before(self, k: int, x: Values | None) -> Before:
         """What is around a free one, on rank 0; `x`: as in Before."""
