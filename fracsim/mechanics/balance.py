@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
+# of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
+STILL = 0.01
+
 
 class Balance:
     """The equations of a body, and the displacement that they are asked about.
@@ -81,6 +84,7 @@ class Balance:
         self.low_rank: list[tuple[Values, Values]] = []
         self.springs: list[Stiff] = []
         self.couples = False
+        self._body_at: tuple[float | None, Values] | None = None  # where K was assembled in this attempt
         self._assembled: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
         self.moves = 0
         self.vector = assembler.vector()
@@ -262,11 +266,8 @@ class Balance:
         """
         if self.linear and self._is_assembled(K, small):
             return
-        if self._coupled:
-            K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
-        self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
-        if factor := sum(term.mass_factor for term in self.terms):
-            self.mass.add_to(K, factor)
+        if not self._serves(small):
+            self._assemble_body(K, small)
         self.springs, self.couples = [], False
         for term in self.terms:
             term.add_stiffness(K)
@@ -275,6 +276,31 @@ class Balance:
         self.low_rank = [part for term in self.terms for part in term.low_rank()] if self._touches else []
         for U, _ in self.low_rank:
             U[self.motion.owned] = 0.0
+
+    def _assemble_body(self, K: PETSc.Mat, small: float | None) -> None:
+        """What K has without terms that add to it."""
+        if self._coupled:
+            K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
+        self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
+        if factor := sum(term.mass_factor for term in self.terms):
+            self.mass.add_to(K, factor)
+        self._body_at = (small, self.u.x.array[: self.owned].copy()) if self._alone else None
+
+    def _serves(self, small: float | None) -> bool:
+        """Whether the last K of this attempt is the body's own, and it has hardly moved since (collective).
+
+        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier.
+        """
+        if self._body_at is None or self._coupled or not self.couples or self._body_at[0] != small:
+            return False
+        moved = float(np.abs(self.u.x.array[: self.owned] - self._body_at[1]).max(initial=0.0))
+        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= STILL * self.domain.mean_edge)
+
+    @cached_property
+    def _alone(self) -> bool:
+        """Whether all that terms add to K is beside it, or a coupling, and the body's share follows from u alone."""
+        within = any(type(term).add_stiffness is not Term.add_stiffness for term in self.terms)
+        return self.limits_steps and self.conservative and not within
 
     def _positive_moduli(self, small: float) -> fem.Form:
         """What makes the moduli positive at the current u."""
@@ -343,6 +369,7 @@ class Balance:
 
     def set_out(self) -> None:
         """Newton's method sets out on the step, once more where it has failed before."""
+        self._body_at = None
         for term in self.terms:
             term.set_out()
 
