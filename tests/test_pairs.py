@@ -168,6 +168,26 @@ def test_nothing_passes(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("gap", [0.3 * REACH, 0.7 * REACH])
+def test_ways_too_short_to_meet_ask_no_collision_detection(dim, gap, monkeypatch):
+    """The upper box comes down, whole: on either side of the length from which detection is asked, a tenth of the gap
+    is left."""
+    x, elements, upper = stacked(dim, gap)
+    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
+    asked = []
+    free = pairs._near.free
+    monkeypatch.setattr(pairs._near, "free", lambda *ends: asked.append(1) or free(*ends))
+    for length in np.linspace(0.02, 1.5, 60) * gap:
+        asked.clear()
+        way = -length * upper[:, None] * np.eye(dim)[-1]
+        share = pairs.longest_step(x, x + way)
+        assert gap - share * length >= 0.09 * gap
+        assert share == 1 or asked
+        assert asked or length < 0.91 * min(gap, 0.5 * REACH) / max(upper.mean(), 1 - upper.mean()) / 2
+    assert asked
+
+
+@pytest.mark.parametrize("dim", [2, 3])
 def test_a_fast_body_is_stopped(dim):
     """The upper one thrown through the lower one, from far off: at the end of the way they are apart again."""
     x, elements, upper = stacked(dim, 3.0)
