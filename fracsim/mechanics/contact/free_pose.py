@@ -23,6 +23,7 @@ from .reach import safe_shares
 from .rigid_step import RigidStep
 from .skin import Skin
 from .stops import Stops
+from .taken import Taken
 from .touch import Grip, Touch
 
 Values = npt.NDArray[np.float64]
@@ -52,16 +53,6 @@ class Around:
         )
 
 
-@dataclass(frozen=True)
-class _Way:
-    """A step of Newton's method that is under way: from points at x (n, d) by `moved`, from z by `dz`."""
-
-    x: Values
-    moved: Values
-    z: Values
-    dz: Values
-
-
 class FreePose:
     """A free obstacle, and its pose.
 
@@ -80,7 +71,7 @@ class FreePose:
         self._of: Flight | None = None  # that the step began with
         self._found: Values | None = None  # z of the last solution of this step
         self._settled: Push | None = None  # what contact does to it at z
-        self._way: _Way | None = None
+        self._way: Taken | None = None
 
     # --- a step ---
 
@@ -148,10 +139,7 @@ class FreePose:
         once this step was solved, and where the step began."""
         here = self.z
         if (way := self._way) is not None:
-            along = [float(np.vdot(around.x - way.x, way.moved)), float(np.vdot(way.moved, way.moved))]
-            gone = total(around.skin.comm, along)
-            share = float(np.clip(gone[0] / gone[1], 0.0, 1.0)) if gone[1] > 0 else 0.0
-            yield way.z + share * way.dz
+            yield way.at(way.share(around.x, around.skin.comm))
         yield here
         if self._found is not None:
             yield self._found
@@ -194,7 +182,7 @@ class FreePose:
 
     def goes(self, around: Around, moved: Values, dz: Values) -> Values:
         """(p,) increment of its pose as Newton's method moves it by dz (k,) and the points by `moved` (n, d), m."""
-        self._way = _Way(around.x, moved, self.z, dz)
+        self._way = Taken(around.x, moved, self.z, dz)
         return self.step.onward(self.z, dz)
 
     def forget_way(self) -> None:

@@ -20,6 +20,7 @@ from ..push import Push, of_points, resultant, ways_of_points
 from ..rigid_step import RigidStep
 from ..slip import Friction
 from ..stops import Stops
+from ..taken import Taken
 from .facing import Facing
 
 Values = npt.NDArray[np.float64]
@@ -43,16 +44,6 @@ class Before:
     start: Values | None = None
 
 
-@dataclass(frozen=True)
-class _Way:
-    """A step of Newton's method that is under way: from points at x (n, 3) by `moved` (n, 3), from z by `dz`."""
-
-    x: Values
-    moved: Values
-    z: Values
-    dz: Values
-
-
 class FreeSolid:
     """A free solid, and its pose.
 
@@ -70,7 +61,7 @@ class FreeSolid:
         self.pose = self.flight.pose
         self._of: Flight | None = None  # that the step began with
         self._found: Values | None = None  # z of the last solution of this step
-        self._way: _Way | None = None
+        self._way: Taken | None = None
         self._at: tuple[Values | None, Pose] | None = None  # where it was settled last in the step
 
     # --- a step ---
@@ -118,16 +109,11 @@ class FreeSolid:
 
     def _candidates(self, before: Before) -> Iterator[Values]:
         if (way := self._way) is not None and before.x is not None:
-            yield way.z + self._share(way, before.x) * way.dz
+            yield way.at(way.share(before.x))
         yield self.z
         if self._found is not None:
             yield self._found
         yield np.zeros_like(self.z)
-
-    @staticmethod
-    def _share(way: _Way, x: Values) -> float:
-        length = float(np.vdot(way.moved, way.moved))
-        return float(np.clip(np.vdot(x - way.x, way.moved) / length, 0.0, 1.0)) if length > 0 else 0.0
 
     def _may_be_at(self, before: Before, z: Values) -> bool:
         """Whether it gets there, and the body where that is, with nothing between them on their ways."""
@@ -137,9 +123,9 @@ class FreeSolid:
         if before.facing is None or before.x is None or before.start is None:
             return True
         if (way := self._way) is not None:
-            off = before.x - way.x - (share := self._share(way, before.x)) * way.moved
+            off = before.x - way.x - (share := way.share(before.x)) * way.moved
             on_it = abs(off).max() <= ON_THE_WAY * abs(way.moved).max()
-            if on_it and np.array_equal(z, way.z + share * way.dz):
+            if on_it and np.array_equal(z, way.at(share)):
                 return True  # longest_step has looked
         x, then = before.start, self.step.start.pose
         if self._at is not None and self._at[0] is not None:
@@ -154,15 +140,19 @@ class FreeSolid:
         parts = self._parts(before)
         return found if parts is None else found + of_points(*parts)
 
-    def _parts(self, before: Before) -> tuple[float, Values, csr_matrix, csr_matrix, Values] | None:
-        """Energy, its derivative by the points of the solid, second ones, exact and positive, and arms; None: far."""
+    def _met(self, before: Before) -> tuple[Facing, Values, int] | None:
+        """The body's facets, with the solid where it is, the points (n + m, 3) of both and n; None: far."""
         facing = before.facing
         if facing is None or before.x is None:
             return None
         facing.solid.put(self.pose)
-        if facing.is_far(before.x):
+        return None if facing.is_far(before.x) else (facing, facing.with_solid(before.x), len(before.x))
+
+    def _parts(self, before: Before) -> tuple[float, Values, csr_matrix, csr_matrix, Values] | None:
+        """Energy, its derivative by the points of the solid, second ones, exact and positive, and arms; None: far."""
+        if (met := self._met(before)) is None:
             return None
-        both, n = facing.with_solid(before.x), len(before.x)
+        facing, both, n = met
         energy, g = facing.energy(both), facing.gradient(both)
         exact, stiff = facing.hessian(both, exact=True), facing.hessian(both)
         if before.friction is not None:
@@ -188,13 +178,9 @@ class FreeSolid:
     def given_way(self, before: Before) -> tuple[Values, Values] | None:
         """(3 n, k) Phi_xz by the body's points and (k, k) Phi_zz^-1, its positive definite part; None: nothing of the
         body is near."""
-        facing = before.facing
-        if facing is None or before.x is None:
+        if (met := self._met(before)) is None:
             return None
-        facing.solid.put(self.pose)
-        if facing.is_far(before.x):
-            return None
-        both, n = facing.with_solid(before.x), len(before.x)
+        facing, both, n = met
         H = facing.hessian(both)
         if before.friction is not None:
             H = H + before.friction.hessian(both)
@@ -212,7 +198,7 @@ class FreeSolid:
             mixed, compliance = given
             dz = -compliance @ (mixed.T @ moved.reshape(-1))
         assert before.x is not None
-        self._way = _Way(before.x, moved, self.z, dz)
+        self._way = Taken(before.x, moved, self.z, dz)
         return self.step.pose(self.z + dz)
 
     def pushed(self, before: Before) -> Values:
