@@ -40,6 +40,8 @@ Values = npt.NDArray[np.float64]
 
 # of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
 STILL = 0.01
+# of a correction: where contact leaves less of it, the next one, which is the rest of it, is found with the same share
+CUT_SHORT = 0.5
 
 
 class Balance:
@@ -85,6 +87,7 @@ class Balance:
         self.springs: list[Stiff] = []
         self.couples = False
         self._body_at: tuple[float | None, Values] | None = None  # where K was assembled in this attempt
+        self._went = 1.0  # share of the last correction
         self._assembled: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
         self.moves = 0
         self.vector = assembler.vector()
@@ -289,10 +292,13 @@ class Balance:
     def _serves(self, small: float | None) -> bool:
         """Whether the last K of this attempt is the body's own, and it has hardly moved since (collective).
 
-        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier.
+        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier. And
+        while they come into touch, one after another, a correction is found again and again.
         """
         if self._body_at is None or self._coupled or not self.couples or self._body_at[0] != small:
             return False
+        if self._went < CUT_SHORT:
+            return True
         moved = float(np.abs(self.u.x.array[: self.owned] - self._body_at[1]).max(initial=0.0))
         return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= STILL * self.domain.mean_edge)
 
@@ -369,14 +375,15 @@ class Balance:
 
     def set_out(self) -> None:
         """Newton's method sets out on the step, once more where it has failed before."""
-        self._body_at = None
+        self._body_at, self._went = None, 1.0
         for term in self.terms:
             term.set_out()
 
     def longest_step(self, change: Values) -> float:
         """Largest share of a change of u (owned dofs,) that all terms allow (collective)."""
         share = min(term.longest_step(change) for term in self.terms)
-        return float(self.domain.comm.allreduce(share, op=MPI.MIN))
+        self._went = float(self.domain.comm.allreduce(share, op=MPI.MIN))
+        return self._went
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that Newton's method may start from: the step's start where there is no

@@ -20,7 +20,7 @@ from ...mesh.split.build import split
 from ...mesh.split.identity import found_again, identity
 from ...mesh.split.places import whole
 from ...mesh.split.skeleton import Skeleton
-from ...mesh.split.solid import split_of_pieces
+from ...mesh.split.solid import is_same_solid, split_of_pieces
 from ...meshes.words import format_point
 from ..stiff import stiff_directions
 from .near import longest
@@ -72,6 +72,7 @@ class Surface:
         self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
     ) -> None:
         """`u`: (nodes, d) where the body is, m; `before`: the surface until now."""
+        self._skeleton, self._pattern, self._of_pieces = skeleton, pattern, law.pieces
         self.made = split_of_pieces(skeleton, pattern) if law.pieces else split(skeleton, pattern)
         self._rest = receded(self.made, self.gap * law.distance)
         self.at = whole(self.made, skeleton, pattern, self._rest)
@@ -89,6 +90,10 @@ class Surface:
             share, load = self._known(before, u)
             self.at = self.at.drawn_in(share)
             self._settle(u, load)
+
+    def serves(self, pattern: npt.NDArray[np.uint8]) -> bool:
+        """Whether it is the surface of these patterns (C,) too: most edges break within pieces."""
+        return self._of_pieces and is_same_solid(self._skeleton, pattern, self._pattern)
 
     def _check_apart(self) -> None:
         """InputError where a body at rest cuts or touches itself."""

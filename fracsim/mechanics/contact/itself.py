@@ -65,6 +65,7 @@ class SelfContact(Term):
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
         self._struck: Values | None = None
+        self._stored: float | None = None
         self._start: Values | None = None
         self._tangent_at: Values | None = None
         self._rubbing: Friction | None = None
@@ -73,6 +74,8 @@ class SelfContact(Term):
     def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
         """On rank 0."""
         assert self._skeleton is not None
+        if self._surface is not None and self._surface.serves(pattern):
+            return self._surface
         return Surface(self._skeleton, pattern, self.law, u, self._surface)
 
     def _gathered(self, u: Values) -> Values | None:
@@ -140,7 +143,7 @@ class SelfContact(Term):
         """(n, d) at the end of the step that belongs to the current u, on rank 0 (collective)."""
         if self._moved:
             self._x, self._moved = self._placed(self._level.at_end(self._u.x.array[: self._owned])), False
-            self._struck = None
+            self._struck = self._stored = None
         return self._x
 
     def _placed(self, u: Values) -> Values | None:
@@ -212,7 +215,9 @@ class SelfContact(Term):
     def stored(self) -> float:
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
         x = self._places()
-        return 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
+        if self._stored is None:  # asked for in turn by whether it acts, the line search, and the book of energies
+            self._stored = 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
+        return self._stored
 
     def drag(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""

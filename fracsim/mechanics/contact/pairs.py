@@ -30,7 +30,7 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 EDGES = 0.5  # of the distance of the barrier
-MARGIN = 1.0  # of the distance of the barrier: how far points may move before candidates are looked for again
+MARGIN = 0.5  # of the distance of the barrier: how far points may move before candidates are looked for again
 MOST, WIDE = 128, 3.0  # pieces of a step, and the measure of the boxes in one
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from ..simplices import is_split
 from .build import Split, split
 from .skeleton import Skeleton
 
@@ -21,16 +22,34 @@ Patterns = npt.NDArray[np.integer]
 def split_of_pieces(skeleton: Skeleton, pattern: Patterns) -> Split:
     """The split surface of damage patterns (C,) without the elements of loose nodes, which have no whole cell, and
     without walls between nodes of one piece: edges are open that join other pieces, or lead to loose nodes."""
+    apart, loose = _apart(skeleton, pattern)
+    made = split(skeleton, _patterns(skeleton, apart))
+    kept = ~loose[made.follow.first_parent[made.elements[:, 0]]]  # all corners of an element follow the same side
+    each = {name: getattr(made, name)[kept] for name in ("elements", "cell", "edge", "origin")}
+    return replace(made, **each)
+
+
+def is_same_solid(skeleton: Skeleton, pattern: Patterns, before: Patterns) -> bool:
+    """Whether damage patterns (C,) of now and of before have the same surface of pieces, and the same cells say how it
+    moves with its nodes: cracks within a piece change neither."""
+    (apart, loose), (apart_before, loose_before) = _apart(skeleton, pattern), _apart(skeleton, before)
+    if not (np.array_equal(apart, apart_before) and np.array_equal(loose, loose_before)):
+        return False
+    ends = np.zeros(len(skeleton.points), bool)
+    ends[skeleton.edges[apart]] = True
+    at = ends[skeleton.cells].any(axis=1)
+    gone = is_split(skeleton.dim)
+    return np.array_equal(gone[pattern[at]], gone[before[at]])
+
+
+def _apart(skeleton: Skeleton, pattern: Patterns) -> tuple[Flags, Flags]:
+    """(E,) open edges, and (N,) loose nodes."""
     loose = np.ones(len(skeleton.points), bool)
     loose[skeleton.cells[pattern == 0]] = False
     ends = skeleton.edges
     cut = skeleton.broken_edges(pattern) | loose[ends].any(axis=1)
     _, piece = skeleton.pieces(cut)
-    apart = cut & (piece[ends[:, 0]] != piece[ends[:, 1]])
-    made = split(skeleton, _patterns(skeleton, apart))
-    kept = ~loose[made.follow.first_parent[made.elements[:, 0]]]  # all corners of an element follow the same side
-    each = {name: getattr(made, name)[kept] for name in ("elements", "cell", "edge", "origin")}
-    return replace(made, **each)
+    return cut & (piece[ends[:, 0]] != piece[ends[:, 1]]), loose
 
 
 def _patterns(skeleton: Skeleton, broken: Flags) -> Patterns:
