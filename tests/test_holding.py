@@ -97,8 +97,6 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     assert rows[0][-1] == "dust" and sorted((row[2], row[-1]) for row in rows[1:])[0] == ("1", "1")
 
 
-def test_not_with_surfaces_nor_with_an_energy() -> None:
-    for other in ({"brittle": {"surfaces": 2}}, {"fracture": {"energy": 1.0}}):
-        fracture = {"strength": 1.0, "crumbs": False} | other.pop("fracture", {})
-        with pytest.raises(ValueError, match="crumbs"):
-            make_study(mesh=MESH, fracture=fracture, **other)
+def test_not_with_an_energy() -> None:
+    with pytest.raises(ValueError, match="crumbs"):
+        make_study(mesh=MESH, fracture={"strength": 1.0, "energy": 1.0, "crumbs": False})

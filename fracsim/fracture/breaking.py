@@ -17,6 +17,7 @@ from ..mesh.edges import EdgeGraph
 from .criterion import Criterion
 from .degradation import Degradation, make_degradation
 from .edge_law import Brittle, EdgeLaw
+from .joining import Joining
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -74,12 +75,14 @@ class Breaking:
         opened: Values | None = None,
         degradation: Degradation | None = None,
         pace: float | None = None,
+        joining: Joining | None = None,
     ) -> None:
-        """`pace`: most passes a second, in place of `passes` (collective)."""
+        """`pace`: most passes a second, in place of `passes`; `joining`: which of the failing edges hold nodes that
+        would be crumbs (collective)."""
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
-        self.not_finite, self.opened, self._pace = 0, opened, pace
+        self.not_finite, self.opened, self._pace, self._joining = 0, opened, pace, joining
         if opened is not None:
             self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
@@ -114,7 +117,11 @@ class Breaking:
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
         stress, psi = self.evaluate()
-        broken, weakened = self._weaken(*self.criterion(stress, psi))
+        edges, load = self.criterion(stress, psi)
+        if self._joining is not None:
+            fail = self._joining(edges, stress)
+            edges, load = edges[fail], load[fail]
+        broken, weakened = self._weaken(edges, load)
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
         before = [each.x.array.copy() for each in self.stress.fields] if broken else []

@@ -28,7 +28,10 @@ class EdgeGraph:
         broken: (edges,) bool, integrity is 0.
         pattern: (cells,) uint8, bit k set where local edge k is broken.
         damaged: (cells,) bool, whether any edge is less than whole.
+        kept: (edges,) bool, those that join their ends though all their cells have come apart; None: there are none.
     """
+
+    kept: npt.NDArray[np.bool_] | None = None
 
     def __init__(self, domain: Domain) -> None:
         topology = domain.mesh.topology
@@ -119,9 +122,9 @@ class EdgeGraph:
         """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
 
         Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
-        apart. Mechanics do not change: chi of its cells is 0 and they enter no average.
+        apart. Mechanics do not change: chi of its cells is 0 and they enter no average. What is `kept` is not broken.
         """
-        carried = np.zeros(len(self.broken), bool)
+        carried = np.zeros(len(self.broken), bool) if self.kept is None else self.kept.copy()
         carried[self.cell_edges[~self.split]] = True
         return self.break_edges(~self.on_any_rank(carried))
 

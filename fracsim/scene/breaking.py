@@ -20,7 +20,10 @@ Values = npt.NDArray[np.float64]
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
     from ..fracture.brittle.rules import SurfaceRules
-    from ..fracture.criterion import Average, Criterion
+    from ..fracture.brittle.surfaces import BrittleSurfaces
+    from ..fracture.criterion import Average, OverloadedEdges
+    from ..fracture.holding import Holding
+    from ..fracture.joining import Joining
     from ..fracture.strength import Strength
     from ..mesh.edges import EdgeGraph
 
@@ -50,7 +53,8 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
         breaking = _tearing(study, balance, graph, passes, opened)
     else:
         criterion = _criterion(study, balance.stress, graph)
-        breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened)
+        joining = None if study.fracture.crumbs else _joining(balance, graph, criterion.strength)
+        breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
     if opened is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()
@@ -83,7 +87,7 @@ def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
     return open_cracks(graph, cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
 
 
-def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
+def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | Holding | BrittleSurfaces:
     """Which edges fail."""
     from ..fracture.criterion import OverloadedEdges
 
@@ -99,6 +103,16 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> Criterion:
     from ..fracture.brittle.surfaces import BrittleSurfaces
 
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
+
+
+def _joining(balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining:
+    """What nodes without a whole cell stay joined by."""
+    from ..fracture.joining import Joining
+
+    domain = balance.domain
+    held = np.zeros(len(domain.nodes), bool)
+    held[balance.motion.dofs // domain.dim] = True
+    return Joining(balance.stress, graph, strength, held)
 
 
 def average_of(study: Study, domain: Domain) -> Average | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
@@ -114,6 +115,19 @@ def _contact(parts: Parts) -> Term | None:
     return self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress.material)
 
 
+def _tethers(parts: Parts) -> Term | None:
+    fracture = parts.study.fracture
+    if fracture is None or fracture.crumbs or fracture.approach != "chi" or parts.domain.order > 1:
+        return None
+    from ..mechanics.tethers import Tethers
+
+    domain = parts.domain
+    held = np.zeros(len(domain.nodes), bool)
+    held[parts.motion.dofs // domain.dim] = True
+    young = domain.comm.allreduce(float(np.max(parts.stress.material.young, initial=0.0)), op=MPI.MAX)
+    return Tethers(domain, parts.u, young, parts.mass.lumped, held)
+
+
 def _inertia(parts: Parts) -> Term | None:
     return Inertia(parts.u, parts.mass) if parts.scheme.inertia else None
 
@@ -135,6 +149,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
     "obstacles": _obstacles,
     "solids": _solids,
     "contact": _contact,
+    "tethers": _tethers,
     "inertia": _inertia,
     "drag": _drag,
 }

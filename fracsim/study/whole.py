@@ -132,8 +132,6 @@ class Study(Table):
             raise ValueError(
                 "fracture.cap is a share of edges, [brittle] breaks surfaces: set brittle.per_pass instead"
             )
-        if not self.fracture.crumbs:
-            raise ValueError("fracture.crumbs = false spares edges, [brittle] breaks surfaces: remove crumbs")
         if self.output.cut == "forces":
             raise ValueError(
                 'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'

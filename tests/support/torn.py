@@ -325,6 +325,11 @@ RUNS: dict[str, dict[str, Any]] = {
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.2}, "probe": [{"name": "grip", "on": "left"}],
     },
 }  # fmt: skip
+# a plate, in which nodes that have lost their last whole cell stay joined to others
+RUNS["joined"] = RUNS["plate"] | {
+    "fracture": {"strength": 0.09, "radius": 0.05, "crumbs": False},
+    "time": {"scheme": "newmark", "step": 0.05, "end": 0.6},
+}
 SURFACES = ("plate", "block")  # whose split surface is written
 # the same, each step solved with its own flow
 RUNS["ductile-implicit"] = RUNS["ductile"] | {"plasticity": RUNS["ductile"]["plasticity"] | {"update": "implicit"}}

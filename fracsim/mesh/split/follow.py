@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from ...mesh.small_matrices import polar_rotation
-from ..simplices import is_split
+from ..simplices import is_split, local_edges
 from .skeleton import Skeleton
 
 Ints = npt.NDArray[np.int64]
@@ -82,11 +82,13 @@ class Follow:
 class Rotations:
     """R of some nodes: the polar rotation of the volume average of F over the whole (not split) cells around each.
 
-    Where a node has none, its fragment is smaller than a cell and its rotation unknown: identity.
+    A node that has none turns with those that it is joined to; where these have none either its fragment is smaller
+    than a cell and its rotation unknown: identity.
     """
 
     def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
         d = skeleton.dim
+        nodes, self._of = np.unique(_turning_with(skeleton, pattern)[nodes], return_inverse=True)
         place = np.full(len(skeleton.points), -1)
         place[nodes] = np.arange(len(nodes))
         around = np.any(place[skeleton.cells] >= 0, axis=1) & ~is_split(d)[pattern]
@@ -110,4 +112,26 @@ class Rotations:
         d = len(self._identity)
         mean = (self._sum @ gradient.reshape(-1, d * d)) * self._per_volume[:, None]
         F = mean.reshape(-1, d, d) + self._identity
-        return polar_rotation(F) if len(F) else F
+        return (polar_rotation(F) if len(F) else F)[self._of]
+
+
+def _turning_with(skeleton: Skeleton, pattern: npt.NDArray[np.integer]) -> Ints:
+    """(nodes,) the node whose rotation each node has: its own where it has a whole cell, else that of the nearest one
+    with such a cell over intact edges, of these the first; its own, too, where there is none."""
+    result = np.arange(len(skeleton.points))
+    whole = np.zeros(len(result), bool)
+    whole[skeleton.cells[~is_split(skeleton.dim)[pattern]]] = True
+    if whole.all():
+        return result
+    pairs = local_edges(skeleton.dim)
+    cells = np.flatnonzero(~whole[skeleton.cells].all(axis=1))
+    intact = (np.asarray(pattern)[cells, None] >> np.arange(len(pairs))) & 1 == 0
+    ends = skeleton.cells[cells][:, pairs][intact]
+    ends = np.concatenate([ends, ends[:, ::-1]])
+    known = whole.copy()
+    while len(new := np.flatnonzero(~known[ends[:, 0]] & known[ends[:, 1]])):
+        nearest = np.full(len(result), len(result))
+        np.minimum.at(nearest, ends[new, 0], result[ends[new, 1]])
+        at = np.unique(ends[new, 0])
+        result[at], known[at] = nearest[at], True
+    return result
