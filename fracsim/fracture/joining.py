@@ -37,7 +37,7 @@ class Joining:
     def __init__(self, stress: Stress, graph: EdgeGraph, strength: Strength, held: Flags) -> None:
         """`held`: (nodes,) whose motion is prescribed, ghosts too."""
         self._stress, self._graph, self._strength, self._held = stress, graph, strength, held
-        self._both: Flags = held[graph.edge_nodes].all(axis=1)
+        self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
         self._sum = la.vector(graph.domain.space.dofmap.index_map, 1, np.float64)
 
     def __call__(self, edges: npt.NDArray[np.integer], stress: Values) -> Flags:
@@ -51,8 +51,8 @@ class Joining:
             whole = np.zeros(len(fails), bool)
             whole[graph.cell_edges[~graph.split]] = True
             joined = ~graph.broken & ~graph.on_any_rank(whole)
-            graph.kept = self._both & ~fails | joined | self._found(fails, joined, stress)
-            fails &= ~graph.kept
+            kept = (self._both & ~fails) | joined | self._found(fails, joined, stress)
+            graph.kept, fails = kept, fails & ~kept
         return np.asarray(fails[edges])
 
     def _found(self, fails: Flags, joined: Flags, stress: Values) -> Flags:

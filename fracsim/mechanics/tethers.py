@@ -15,7 +15,7 @@ When the cell comes apart, too, the node is tied anew and what was stored is los
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -74,7 +74,7 @@ class Tethers(Term):
     """Nodes without a whole cell, tied to where they hang."""
 
     name = "tethers"
-    linear: ClassVar[bool] = True  # ties change where cells come apart, and so with chi
+    linear = True  # ties change where cells come apart, and so with chi
 
     def __init__(self, domain: Domain, u: fem.Function, young: float, mass: Values, held: Flags) -> None:
         """`young`: Pa; `mass`: (owned dofs,) lumped, kg; `held`: (nodes,) whose motion is prescribed, ghosts too: they
@@ -91,7 +91,9 @@ class Tethers(Term):
 
     def _be(self, ties: Ties) -> None:
         """Tie these, and no others (not collective)."""
-        self.ties, self._matrix, self._fastest = ties, None, None
+        self.ties = ties
+        self._matrix: PETSc.Mat | None = None
+        self._fastest: float | None = None
         self._numbers, place = np.unique(ties.nodes, return_inverse=True)
         self._place: Ints = place.reshape(ties.nodes.shape)
         self._here, self._local = self._owned(self._numbers)
@@ -206,9 +208,9 @@ class Tethers(Term):
             W = csr_matrix((self.ties.weights.reshape(-1), (rows, self._place.reshape(-1))), shape=(len(rows), n))
             K = csr_matrix(kron(self.stiffness * (W.T @ W), identity(d)))
             first = self._domain.space.dofmap.index_map.local_range[0]
-            numbers = np.zeros(n, np.int64)
-            numbers[self._here] = first + self._local
-            numbers = total(self._domain.comm, numbers)
+            own = np.zeros(n, np.int64)
+            own[self._here] = first + self._local
+            numbers: Ints = total(self._domain.comm, own)
             if self._domain.comm.rank:
                 K, numbers = csr_matrix((0, 0)), np.empty(0, np.int64)
             self._matrix = self._coupling(K, numbers)

@@ -40,7 +40,7 @@ def run_sections(
         parts.append(precision(runs, quantity, exact))
     if references:
         parts.append(against(runs, references))
-    return [*parts, curves(runs), energies(runs), cost(runs), *pictures(runs)]
+    return [*parts, *pictures(runs), curves(runs), energies(runs), cost(runs)]
 
 
 def overview(runs: list[RunData]) -> Section:
@@ -48,13 +48,15 @@ def overview(runs: list[RunData]) -> Section:
     keys = differing(runs)
     peaks = list(dict.fromkeys(key for run in runs for key in run.summary.get("peak_reactions", {})))
     columns = (
-        "run", *keys, "outcome", "cells", "nodes", "ranks", "steps", "failed attempts", "time s", "wall s",
-        *(f"{phase} s" for phase in PHASES), "memory MiB", "broken edges", "split cells", "pieces",
-        "external work J", "dissipated J", *(f"peak {key} N" for key in peaks),
+        "run", *keys, "outcome", "pieces", "broken edges", "split cells", *(f"peak {key} N" for key in peaks),
+        "external work J", "dissipated J", "cells", "nodes", "ranks", "steps", "failed attempts", "time s", "wall s",
+        *(f"{phase} s" for phase in PHASES), "memory MiB",
     )  # fmt: skip
     rows = tuple(_row(run, keys, peaks) for run in runs)
-    text = f"{runs[0].settings.get('title', '')}. Each run again: fracsim run study.toml, in its folder."
-    return Section("Runs", text, tables=(Table("runs", "Settings that differ, and what came out", columns, rows),))
+    titles = dict.fromkeys(str(run.settings.get("title", "")) for run in runs)
+    text = f"{'; '.join(titles)}. Each run again: fracsim run study.toml, in its folder."
+    caption = "Settings that differ, and what came out" if keys else "What came out"
+    return Section("Runs", text, tables=(Table("runs", caption, columns, rows),))
 
 
 def _row(run: RunData, keys: list[str], peaks: list[str]) -> tuple[Cell, ...]:
@@ -63,10 +65,10 @@ def _row(run: RunData, keys: list[str], peaks: list[str]) -> tuple[Cell, ...]:
     last: Any = {key: values[-1] if len(values) else None for key, values in history.items()}
     return (
         run.name, *(_cell(run.settings.get(key)) for key in keys), run.outcome,
-        get("cells"), get("nodes"), get("ranks"), get("steps", len(history["step"])), get("steps_failed"),
-        get("time", last["time"]), run.wall, *(seconds.get(phase) for phase in PHASES), get("peak_memory_MiB"),
-        get("broken_edges"), get("split_cells"), get("pieces"), get("external_work"), get("dissipated"),
-        *(reactions.get(key) for key in peaks),
+        get("pieces"), get("broken_edges"), get("split_cells"), *(reactions.get(key) for key in peaks),
+        get("external_work"), get("dissipated"), get("cells"), get("nodes"), get("ranks"),
+        get("steps", len(history["step"])), get("steps_failed"), get("time", last["time"]), run.wall,
+        *(seconds.get(phase) for phase in PHASES), get("peak_memory_MiB"),
     )  # fmt: skip
 
 

@@ -53,7 +53,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
         breaking = _tearing(study, balance, graph, passes, opened)
     else:
         criterion = _criterion(study, balance.stress, graph)
-        joining = None if study.fracture.crumbs else _joining(balance, graph, criterion.strength)
+        joining = _joining(study, balance, graph, criterion.strength)
         breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
     if opened is not None:
         balance.edges_broke(graph.pattern)
@@ -105,8 +105,13 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
 
 
-def _joining(balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining:
-    """What nodes without a whole cell stay joined by."""
+def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining | None:
+    """What nodes without a whole cell stay joined by. None with crumbs, nor where strain is projected on intact edges:
+    a node that hangs on one edge is held along it alone, and swings, and with a linear energy swells as it does."""
+    table = study.fracture
+    assert table is not None
+    if table.crumbs or table.approach == "edge":
+        return None
     from ..fracture.joining import Joining
 
     domain = balance.domain

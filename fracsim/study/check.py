@@ -29,6 +29,7 @@ from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, ope
 from .order import bent, has_round_sides
 from .resultants import resultants
 from .tearing import tearing
+from .turning import MUCH, turned
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
@@ -212,7 +213,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield from (f"            {line}" for line in others)
     else:
         yield f"fracture    {_fracture(study)}"
-    for line in fits(study, float(np.min(np.subtract(anatomy.upper, anatomy.lower)))):
+    for line in fits(study, _least_side(anatomy)):
         yield f"            {line}"
     yield f"plasticity  {_plasticity(study)}"
     if study.brittle is not None:
@@ -252,7 +253,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield f"            steps in which edges break are {study.time.breaking_step:g} s at most"
     if (until := study.time.until) is not None:
         yield f"            ends where the force on {study.watched} has fallen by {until.drop:.0%} from its peak"
-    if study.fracture is not None and study.material.energy == "linear" and study.time.kind.inertia:
+    if study.material.energy == "linear" and turned(study, anatomy.dim, _least_side(anatomy)) > MUCH:
         yield '            note: with energy = "linear" pieces that come off and turn swell by 1/cos of their angle;'
         yield '            "corotated" costs little more, and turns them as they are'
     if _may_ring(study):
@@ -320,6 +321,11 @@ def _may_ring(study: Study) -> bool:
     if study.time.scheme != "newmark" or material.energy == "linear" or not isinstance(h, int | float):
         return False
     return study.time.longest * float(np.sqrt(material.young / material.density)) > RINGS * h
+
+
+def _least_side(anatomy: Anatomy) -> float:
+    """Of the body's box, m."""
+    return float(np.min(np.subtract(anatomy.upper, anatomy.lower)))
 
 
 def _size(anatomy: Anatomy) -> str:
