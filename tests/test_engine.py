@@ -225,3 +225,17 @@ def test_a_ball_lands_on_every_shape_that_stands() -> None:
         near, far = (cubes([[over[0], over[1], 0.5 + gap]]) for gap in (-0.01, 0.05))
         engine = Engine(near, [[ball]], [Stand(primitive(shape, "it"), at)], Rules(1e-3, DOWN))
         assert engine.depth(near) and not engine.depth(far), shape
+
+
+def test_a_round_body_meets_a_floor_with_few_of_its_corners() -> None:
+    """Of 2,000 near the floor two dozen, and it comes to rest on them, lying neither in it nor above it."""
+    number = np.arange(2000)
+    z = 1 - (2 * number + 1) / 2000
+    angle = np.pi * (3 - np.sqrt(5)) * number
+    ball = 0.5 * np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+    bodies = replace(cubes([[0.0, 0.0, 0.6]]), velocity=np.array([[0.0, 0.0, -20.0]]))
+    engine = Engine(bodies, [[ball]], [floor()], Rules(2e-2, DOWN))
+    after, _ = engine.advance(bodies)
+    assert 6 <= len(engine._data.contact.dist) <= 24
+    low = (ball @ after.turn[0].T + after.place[0])[:, 2].min()
+    assert -5e-4 < low < 5e-3

@@ -19,6 +19,7 @@ Motion:
 bodies       mass, place and motion of pieces, and of what they break into
 geometry     what pieces weigh and which shapes they have, from the split surface
 hulls        unions of convex parts
+clusters     of pieces of shells, all at once
 primitives   shapes of obstacles
 model        the scene as MuJoCo has it; this and the engine alone import it
 engine       MuJoCo: finds contacts, and solves for what they give

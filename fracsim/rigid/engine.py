@@ -47,11 +47,12 @@ class Engine:
         overlaps: Overlaps | None = None,
         names: Ints | None = None,
         outer: Sequence[Ints] | None = None,
+        turn: Values | None = None,
     ) -> None:
-        """`parts`: convex parts of each body, of whose corners those `outer` are outermost (None: any may be);
-        `overlaps`: of bodies by their names (n,), ascending, or numbers."""
+        """`parts`: convex parts of each body, of whose corners those `outer` are outermost (None: any may be), turned
+        by `turn` (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers."""
         self._rules, self._count = rules, len(bodies)
-        self._model = model_of(bodies, parts, stands, rules, outer)
+        self._model = model_of(bodies, parts, stands, rules, outer, turn)
         self._data = mujoco.MjData(self._model.made)
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         planes = self._model.planes
@@ -72,34 +73,38 @@ class Engine:
         """The bodies a step later, and what touched; `ways`: (stands, 3) where the reference points of what stands are
         at the end of the step, m (None: where they were)."""
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
-        reach = ROOM * self._reach(bodies)
+        common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
+        reach = [ROOM * self._reach(bodies, of) for of in (common, 0.0)]
         for _ in range(ROUNDS):
-            moved, touches = self._moved(bodies, rates, reach)
-            farther = self._reach(moved)
-            if not np.any(farther > FARTHER * reach):
+            moved, touches = self._moved(bodies, rates, common, reach)
+            farther = [self._reach(moved, of) for of in (common, 0.0)]
+            if not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
                 break
-            reach = np.maximum(reach, farther)
+            reach = [np.maximum(now, then) for now, then in zip(farther, reach, strict=True)]
         if ways is not None:
             self._way = ways.copy()
         return moved, touches
 
-    def _reach(self, bodies: Bodies) -> Values:
-        """(n,) how far any point of a body comes in a step, m."""
-        speed = np.linalg.norm(bodies.velocity, axis=1) + self._model.extent * np.linalg.norm(bodies.spin, axis=1)
+    def _reach(self, bodies: Bodies, common: Values | float) -> Values:
+        """(n,) how far any point of a body comes in a step beside what moves with a `common` velocity, m/s: two things
+        come together by no more than the sum of theirs."""
+        turning = self._model.extent * np.linalg.norm(bodies.spin, axis=1)
+        speed = np.linalg.norm(bodies.velocity - common, axis=1) + turning
         return np.asarray(self._rules.step * (speed + self._rules.fast))
 
-    def _moved(self, bodies: Bodies, rates: Values, reach: Values) -> tuple[Bodies, Touches]:
-        """The bodies a step later where none of their points comes farther than a reach (n,), m."""
+    def _moved(self, bodies: Bodies, rates: Values, common: Values, reach: list[Values]) -> tuple[Bodies, Touches]:
+        """The bodies a step later where none of their points comes farther than a reach (n,) beside what moves with a
+        common velocity (3,), and than another (n,) beside what stands, m and m/s."""
         dt, n, g = self._rules.step, self._count, self._rules.gravity
         start = bodies
-        contacts = self._find(bodies, rates, reach)
+        contacts = self._find(bodies, rates, common, reach)
         meeting, parting = self._meeting(contacts, bodies, rates)
         share = flown(meeting, contacts.things, n)
         if np.any(share):
             fallen = dt * share[:, None] * g
             flying = replace(bodies, velocity=bodies.velocity + fallen / 2)
             bodies = replace(self._flown(flying, dt * share), velocity=bodies.velocity)
-            contacts = self._find(bodies, rates, reach)
+            contacts = self._find(bodies, rates, common, reach)
             falling = replace(bodies, velocity=bodies.velocity + fallen)
             meeting, parting = self._meeting(contacts, falling, rates)
         self._parting = parting
@@ -138,8 +143,8 @@ class Engine:
 
     # --- MuJoCo ---
 
-    def _find(self, bodies: Bodies, rates: Values, reach: Values) -> Contacts:
-        """Contacts of what comes together within the step."""
+    def _find(self, bodies: Bodies, rates: Values, common: Values, reach: list[Values]) -> Contacts:
+        """Contacts of what comes together within the step; see `_moved`."""
         model, data, n = self._model, self._data, self._count
         q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
         q[:n, :3], q[n:, :3] = bodies.place, self._way[model.driven]
@@ -147,12 +152,14 @@ class Engine:
         q[n:, 3:] = [1.0, 0.0, 0.0, 0.0]
         v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates[model.driven], 0.0
         v[:n, 3:] = np.einsum("nji,nj->ni", bodies.turn, bodies.spin)
-        of_thing = np.concatenate([reach, self._rules.step * np.linalg.norm(rates, axis=1)])
+        of_thing = np.concatenate([reach[0], self._rules.step * np.linalg.norm(rates - common, axis=1)])
         model.made.geom_gap[:] = of_thing[model.thing]
-        model.made.body_margin[1:] = np.concatenate([reach, of_thing[n:][model.driven]])
+        model.made.body_margin[:] = np.concatenate(
+            [[of_thing[n:].max(initial=0.0)], reach[0], of_thing[n:][model.driven]]
+        )
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):
             stage(model.made, data)
-        self._add_planes(bodies, reach, of_thing[n:])
+        self._add_planes(bodies, reach[1], self._rules.step * np.linalg.norm(rates, axis=1))
         found = data.contact
         geoms = found.geom.astype(np.int64).reshape(-1, 2)
         axes, places = found.frame.reshape(-1, 3, 3).copy(), np.concatenate([bodies.place, self._way])
@@ -204,7 +211,7 @@ class Engine:
 
     def depth(self, bodies: Bodies) -> list[tuple[int, int, float]]:
         """(thing, thing, depth in m) of what is in one another, the deepest place of each pair."""
-        contacts = self._find(bodies, np.zeros_like(self._way), np.zeros(self._count))
+        contacts = self._find(bodies, np.zeros_like(self._way), np.zeros(3), 2 * [np.zeros(self._count)])
         count = int(contacts.things.max(initial=0)) + 1
         code, place = np.unique(np.sort(contacts.things, axis=1) @ np.array([count, 1]), return_inverse=True)
         depth: Values = np.zeros(len(code))

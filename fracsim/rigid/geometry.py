@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.split.build import split
+from ..mesh.split.build import Split, split
 from ..mesh.split.moments import Moments, moments
 from ..mesh.split.skeleton import Skeleton
 from ..meshes.data import MeshData
+from .clusters import clustered_parts
 from .hulls import Solid, convex_parts, outermost
 from .placing import Poses
 
@@ -27,13 +28,16 @@ class Shapes:
 
     Attributes:
         names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
-        parts: corners (m, 3) of the convex parts of each, at rest, m.    outer: of all of these, those (k,) outermost.
+        parts: corners (m, 3) of the convex parts of each about its centre, in the axes of the mesh, m; copies that are
+        whole share theirs.    turn: (n, 3, 3) from these axes to those of the body at rest.
+        outer: of all corners of a body, those (k,) outermost.
     """
 
     names: Ints
     moments: Moments
     piece_of_node: Ints
     parts: list[list[Values]]
+    turn: Values
     outer: list[Ints]
 
 
@@ -59,6 +63,7 @@ class Geometry:
     def __init__(self, mesh: MeshData, poses: Poses | None = None) -> None:
         """`poses`: where the copies are at rest; None: one, where the mesh has it."""
         self.skeleton, self.poses = Skeleton(mesh), poses or Poses.at_rest(1)
+        self._shell = mesh.shell
         self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
         # of each copy, by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as
         # these break
@@ -80,7 +85,8 @@ class Geometry:
         piece = [each.piece_of_node + first for each, first in zip(self._placed, pieces, strict=False)]
         parts = [part for each in self._placed for part in each.parts]
         outer = [each for placed in self._placed for each in placed.outer]
-        return Shapes(np.concatenate([each.names for each in self._placed]), of, np.concatenate(piece), parts, outer)
+        names, turn = (np.concatenate([getattr(each, name) for each in self._placed]) for name in ("names", "turn"))
+        return Shapes(names, of, np.concatenate(piece), parts, turn, outer)
 
     def _copy(self, pattern: Patterns, cut: Values | None, number: int) -> _Copy:
         """A copy with patterns (C,)."""
@@ -89,23 +95,31 @@ class Geometry:
         of = moments(made.points, made.elements, piece, made.pieces)
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
         before = self._hulls.get(number, {})
-        after: dict[int, _Kept] = {}
         elements = np.bincount(piece, minlength=made.pieces)
-        for each, name in enumerate(map(int, names)):
-            key = int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")
-            same = before.get(name)
-            if same is None or same[0] != key:
-                made_of = convex_parts(Solid.of(made.points, made.elements[piece == each]).filled, self.mean_edge)
-                same = key, made_of, outermost(made_of)
-            after[name] = same
+        keys = [(int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")) for each in range(made.pieces)]
+        same = [before.get(name) for name in map(int, names)]
+        new = [each for each, key in enumerate(keys) if same[each] is None or same[each][0] != key]
+        for each, parts in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
+            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outermost(parts)
+        after = {int(name): kept for name, kept in zip(names, same, strict=True) if kept is not None}
         self._hulls[number] = after
         _, parts, outer = zip(*(after[int(name)] for name in names), strict=True)
         return _Copy(pattern, names, of, made.piece_of_node, list(parts), list(outer))
+
+    def _parts(self, made: Split, piece: Ints, chosen: Ints) -> list[list[Values]]:
+        """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
+        if self._shell is None or made.pieces == 1:  # whole it may be closed, and is one for all copies
+            solids = (Solid.of(made.points, made.elements[piece == each]).filled for each in chosen)
+            return [convex_parts(each, self.mean_edge) for each in solids]
+        place = np.full(made.pieces, -1)
+        place[chosen] = np.arange(len(chosen))
+        of = place[piece]
+        mine, thickness = np.flatnonzero(of >= 0), self._shell.thickness
+        return clustered_parts(made.points, made.elements[mine], of[mine], len(chosen), thickness, self.mean_edge)
 
     def _at(self, number: int, copy: _Copy) -> Shapes:
         """A copy where it is at rest."""
         turn, place = self.poses.turn[number], self.poses.place[number]
         of = Moments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
-        parts = [[corners @ turn.T + place for corners in each] for each in copy.parts]
-        names = copy.names + number * len(copy.piece_of_node)
-        return Shapes(names, of, copy.piece_of_node, parts, copy.outer)
+        names, turns = copy.names + number * len(copy.piece_of_node), np.tile(turn, (len(copy.names), 1, 1))
+        return Shapes(names, of, copy.piece_of_node, copy.parts, turns, copy.outer)

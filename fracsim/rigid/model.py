@@ -90,14 +90,17 @@ def model_of(
     stands: Sequence[Stand],
     rules: Rules,
     outer: Sequence[Ints] | None = None,
+    turn: Values | None = None,
 ) -> Model:
-    """Of bodies of these convex parts, corners of which may be `outer`. MuJoCo numbers the geoms of what stands still
-    first."""
+    """Of bodies of these convex parts, turned by `turn` (n, 3, 3), corners of which may be `outer`. What several bodies
+    share is made once. MuJoCo numbers the geoms of what stands still first."""
     mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
-    spec, things = _spec(rules), []
+    turn = np.tile(np.eye(3), (len(bodies), 1, 1)) if turn is None else turn
+    quat = Rotation.from_matrix(turn).as_quat(scalar_first=True) if len(turn) else turn
+    spec, things, meshes = _spec(rules), [], _Meshes()
     for number, each in enumerate(parts):
         body = _free(spec, float(mass[number]), inertia[number])
-        things += [number] * _add_parts(spec, body, each, rules.friction)
+        things += [number] * _add_parts(spec, body, each, rules.friction, meshes=meshes, quat=quat[number])
     heavy, count = HELD * max(float(bodies.mass.sum()), 1e-9), len(bodies)
     driven, fixed = ([number for number, each in enumerate(stands) if each.driven == which] for which in (True, False))
     for number in driven:
@@ -112,18 +115,19 @@ def model_of(
         flat = stand.shape.kind == "plane"
         _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat)
     first = len(fixed) + np.searchsorted(things, np.arange(count))
-    thing, extent = [count + number for number in fixed] + things, [_extent(each) for each in parts]
-    planes = _planes(parts, stands, np.array(thing, np.int64), first, outer)
+    thing, extent = [count + number for number in fixed] + things, _extents(parts)
+    planes = _planes(parts, stands, np.array(thing, np.int64), first, outer, turn, extent)
     spec.memory = max(LEAST_MEMORY, MEMORY * len(thing))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia, inverse,
-                 np.array(extent), planes)  # fmt: skip
+                 extent, planes)  # fmt: skip
 
 
 def _planes(
-    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Ints] | None
-) -> Planes:
-    """Planes among what stands, and the corners of all hulls, or the outermost ones."""
+    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Ints] | None,
+    turn: Values, extent: Values,
+) -> Planes:  # fmt: skip
+    """Planes among what stands, and the corners of all hulls, or the outermost ones, in the axes of bodies."""
     stand = np.array([number for number, each in enumerate(stands) if each.shape.kind == "plane"], np.int64)
     normal = np.array([stands[number].shape.turn[:, 2] for number in stand]).reshape(-1, 3)
     hulls = [(number, first[number] + place, each) for number, part in enumerate(parts)
@@ -131,13 +135,14 @@ def _planes(
     corners = np.concatenate([np.empty((0, 3)), *(each for *_, each in hulls)])
     sizes = [len(each) for *_, each in hulls]
     of, part = (np.repeat(np.array([each[k] for each in hulls], np.int64), sizes) for k in (0, 1))
+    corners = np.einsum("kij,kj->ki", turn[of], corners)
     geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
     friction = np.array([stands[k].friction for k in stand])
     if outer is None:
-        return Planes(stand, geom, normal, friction, corners, of, part)
+        return Planes(stand, geom, normal, friction, corners, of, part, extent)
     begin = np.searchsorted(of, np.arange(len(parts)))
     kept = np.concatenate([np.empty(0, np.int64), *(each + k for each, k in zip(outer, begin, strict=True))])
-    return Planes(stand, geom, normal, friction, corners[kept], of[kept], part[kept])
+    return Planes(stand, geom, normal, friction, corners[kept], of[kept], part[kept], extent)
 
 
 def plane_contact(normal: Values, friction: float, rules: Rules) -> Any:
@@ -172,11 +177,15 @@ def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
     return float(np.ptp(bodies.place, axis=0).max() + 2 * max(hulls, default=1.0))
 
 
-def _extent(parts: Sequence[Part]) -> float:
-    """How far a body reaches from its centre, m."""
-    reach = [float(np.linalg.norm(np.atleast_2d(each.size if isinstance(each, Primitive) else each), axis=1).max())
-             for each in parts]  # fmt: skip
-    return max(reach, default=0.0)
+def _extents(parts: Sequence[Sequence[Part]]) -> Values:
+    """(n,) how far bodies reach from their centres, m."""
+    shapes = [(number, np.atleast_2d(each.size if isinstance(each, Primitive) else each))
+              for number, part in enumerate(parts) for each in part]  # fmt: skip
+    reach = np.zeros(len(parts))
+    if shapes:
+        of = np.repeat([number for number, _ in shapes], [len(each) for _, each in shapes])
+        np.maximum.at(reach, of, np.linalg.norm(np.concatenate([each for _, each in shapes]), axis=1))
+    return reach
 
 
 def _movable(shape: Primitive, side: float) -> tuple[Primitive, Values]:
@@ -196,12 +205,32 @@ def _free(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> 
     return body
 
 
+class _Meshes:
+    """Names of the hulls that a model has, by the arrays of their corners."""
+
+    def __init__(self) -> None:
+        self._names: dict[int, str] = {}
+
+    def name(self, spec: Any, corners: Values) -> str:
+        """Of a hull with corners (n, 3), which is added where it is not there."""
+        name = self._names.get(id(corners))
+        if name is None:
+            mesh, name = spec.add_mesh(), f"part{len(self._names)}"
+            mesh.name, mesh.uservert, mesh.inertia = (
+                name,
+                corners.reshape(-1),
+                mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+            )
+            self._names[id(corners)] = name
+        return name
+
+
 def _add_parts(
     spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, at: Values | None = None,
-    *, flat: bool = False,
+    *, flat: bool = False, meshes: _Meshes | None = None, quat: Values | None = None,
 ) -> int:  # fmt: skip
-    """The parts of a body; returns how many. What has a priority says what friction is. What is `flat` meets no hulls
-    as MuJoCo goes: those contacts are found by rigid.planes."""
+    """The parts of a body, hulls turned by `quat`; returns how many. What has a priority says what friction is. What is
+    `flat` meets no hulls as MuJoCo goes: those contacts are found by rigid.planes."""
     for part in parts:
         geom = body.add_geom()
         geom.friction, geom.priority = [friction, 0.0, 0.0], priority
@@ -213,9 +242,9 @@ def _add_parts(
             geom.quat = Rotation.from_matrix(part.turn).as_quat(scalar_first=True)
             geom.contype = geom.conaffinity = FLAT if flat else FLAT | OTHER
         else:
-            mesh = spec.add_mesh()
-            mesh.name = f"part{len(spec.meshes)}"
-            mesh.uservert, mesh.inertia = part.reshape(-1), mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
+            assert meshes is not None
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, part)
             geom.contype = geom.conaffinity = OTHER
+            if quat is not None:
+                geom.quat = quat
     return len(parts)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..mechanics.contact.axes import frame
 from .bodies import Bodies
 
 Ints = npt.NDArray[np.int64]
@@ -18,15 +19,27 @@ Flags = npt.NDArray[np.bool_]
 
 SURELY, SLACK = 1.5, 0.25  # times what a corner comes in a step, and of what its body may: it is looked at
 NEAREST = 6  # corners of a body that are looked at in any case
+SECTORS, LOWEST, WIDEST = 8, 2, 1  # of a body around its centre: corners that may touch in each, lowest and outermost
 
 
-def _nearest(of: Ints, gap: Values) -> Flags:
-    """(k,) whether corners of bodies (k,) are among the nearest of theirs, by distances (k,)."""
-    order = np.lexsort((gap, of))
+def _first(of: Ints, value: Values, many: int) -> Flags:
+    """(k,) whether corners of groups (k,) are among the `many` with the least value (k,) of theirs."""
+    order = np.lexsort((value, of))
     _, start, count = np.unique(of[order], return_index=True, return_counts=True)
     rank = np.empty(len(of), np.int64)
     rank[order] = np.arange(len(of)) - np.repeat(start, count)
-    return np.asarray(rank < NEAREST)
+    return np.asarray(rank < many)
+
+
+def _bearing(of: Ints, arm: Values, normal: Values, later: Values) -> Flags:
+    """(k,) which corners of bodies (k,) at `arm` (k, 3) from their centres bear: those `later` (k,) lowest and those
+    farthest out in every direction along the plane with a normal (3,); all of a body that has few."""
+    across = frame(normal)
+    along = arm @ across[:, 0], arm @ across[:, 1]
+    sector = np.floor((np.arctan2(*along) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64)
+    group = SECTORS * of + np.minimum(sector, SECTORS - 1)
+    few = np.bincount(of) <= SECTORS * (LOWEST + WIDEST)
+    return np.asarray(_first(group, later, LOWEST) | _first(group, -np.hypot(*along), WIDEST) | few[of])
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,7 @@ class Planes:
     Attributes:
         stand, geom: (p,) their numbers among what stands and of the engine.    normal: (p, 3) outwards.
         friction: (p,)    corners: (N, 3) about the centres of the bodies at rest, m.    of, part: (N,) body and geom.
+        extent: (n,) how far each body reaches from its centre, m.
     """
 
     stand: Ints
@@ -45,6 +59,7 @@ class Planes:
     corners: Values
     of: Ints
     part: Ints
+    extent: Values
 
     def near(
         self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float
@@ -54,16 +69,20 @@ class Planes:
         come in a step, m; `reach`: (n,) what bodies do; `step`: s."""
         if not len(self.stand) or not len(self.corners):
             return []
-        x = np.einsum("kij,kj->ki", bodies.turn[self.of], self.corners) + bodies.place[self.of]
         found = []
         for number, (stand, normal) in enumerate(zip(self.stand, self.normal, strict=True)):
+            high = (bodies.place - ways[stand]) @ normal
+            near = np.flatnonzero((high < self.extent + reach + speeds[stand])[self.of])
+            of = self.of[near]
+            x = np.einsum("kij,kj->ki", bodies.turn[of], self.corners[near]) + bodies.place[of]
             gap = (x - ways[stand]) @ normal
-            rows = np.flatnonzero(gap < reach[self.of] + speeds[stand])
+            rows = np.flatnonzero(gap < reach[of] + speeds[stand])
             if len(rows):
-                of = self.of[rows]
-                coming = -np.einsum("ki,i->k", bodies.velocity_at(x[rows], of), normal)
-                soon = SURELY * step * coming + SLACK * reach[of] + speeds[stand]
-                rows = rows[_nearest(of, gap[rows]) | (gap[rows] < soon)]
-                points = x[rows] - gap[rows, None] / 2 * normal
-                found.append((number, self.part[rows], gap[rows], points))
+                near, of, x, gap = near[rows], of[rows], x[rows], gap[rows]
+                way = -step * np.einsum("ki,i->k", bodies.velocity_at(x, of), normal)
+                soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
+                kept = _first(of, gap, NEAREST)
+                kept[soon] |= _bearing(of[soon], x[soon] - bodies.place[of[soon]], normal, (gap - way)[soon])
+                points = x[kept] - gap[kept, None] / 2 * normal
+                found.append((number, self.part[near[kept]], gap[kept], points))
         return found

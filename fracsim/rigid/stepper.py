@@ -18,7 +18,7 @@ from .copies import Copies
 from .engine import Engine
 from .geometry import Geometry, Shapes
 from .hertz import Hertz, reduced
-from .model import Part, Rules, Stand
+from .model import Rules, Stand
 from .primitives import primitive
 from .siblings import Overlaps
 from .touches import Touches
@@ -177,9 +177,8 @@ class RigidStepper:
         at = [self._way(each, t) for each in self._obstacles]
         stands = [Stand(shape, where, each.friction, each.moved is not None)
                   for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
-        centres = zip(self.shapes.parts, bodies.centre, strict=True)
-        parts: list[list[Part]] = [[corners - centre for corners in each] for each, centre in centres]
-        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.shapes.names, self.shapes.outer)
+        of = self.shapes
+        self._engine = Engine(bodies, of.parts, stands, self._rules, self.overlaps, of.names, of.outer, of.turn)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
