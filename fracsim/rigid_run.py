@@ -54,7 +54,7 @@ class RigidRun:
         self.history = History(ALONE, folder / "history.csv", names, step)
         density = float(scene.study.material.density)
         where = folder / "surface.pvd"
-        self.frames = self._writing(where, lambda: RigidFrames(folder, scene.mesh, density, scene.obstacles, t))
+        self.frames = self._writing(where, lambda: RigidFrames(folder, *scene.made_of, density, scene.obstacles, t))
         if arrays is not None:
             self.frames.resume(arrays["broken_at"])
             self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))

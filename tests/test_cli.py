@@ -133,7 +133,8 @@ for scheme in {schemes}:
 parts = ("mesh.edges", "mesh.pieces", "mesh.split", "fracture", "report", "mechanics.plasticity")
 parts += ("mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum", "forms.plasticity")
 parts += ("stepping.edge_frequencies", "forms.closing", "forms.damage", "rigid", "scene.rigid")
-absent = [name for name in sys.modules if "contact" in name or name == "scipy"]
+absent = ("scipy", "mujoco", "fracsim.rigid")
+absent = [name for name in sys.modules if "contact" in name or name in absent]
 print([name for name in parts if "fracsim." + name in sys.modules], absent)
 scene = build_scene(MPI.COMM_WORLD, load_study(folder / "local.toml"))
 Run(scene, folder / "local")()

@@ -239,3 +239,23 @@ def test_a_round_body_meets_a_floor_with_few_of_its_corners() -> None:
     assert 6 <= len(engine._data.contact.dist) <= 24
     low = (ball @ after.turn[0].T + after.place[0])[:, 2].min()
     assert -5e-4 < low < 5e-3
+
+
+def test_a_crumb_does_not_whirl() -> None:
+    """A needle that lands on its end at 20 m/s would turn by 12 rad in the step; it stays on the floor, and gains no
+    energy. What nothing touches turns as it will."""
+    needle = np.array([[0.0, 0, -0.05], [0.002, 0, 0.05], [-0.001, 0.002, 0.05], [-0.001, -0.002, 0.05]])
+    needle = needle @ np.array([[0.9, 0, 0.436], [0, 1, 0], [-0.436, 0, 0.9]])
+    light = replace(
+        cubes([[0.0, 0.0, 0.3], [9.0, 0.0, 9.0]]), mass=np.full(2, 1e-6), inertia=np.tile(5e-10 * np.eye(3), (2, 1, 1))
+    )
+    falling = replace(
+        light, velocity=np.array([[0.0, 0, -20.0], [0.0, 0.0, 0.0]]), spin=np.array([[0.0, 0, 0], [0, 0, 300.0]])
+    )
+    engine, bodies = Engine(falling, [[needle]] * 2, [floor()], Rules(2e-2, DOWN)), falling
+    for _ in range(5):
+        bodies, _ = engine.advance(bodies)
+        low = (needle @ bodies.turn[0].T + bodies.place[0])[:, 2].min()
+        assert np.linalg.norm(bodies.spin[0]) <= 1.0 / 2e-2 * (1 + 1e-9) and low > -2e-3
+    assert bodies.kinetic < falling.kinetic
+    assert bodies.spin[1] == pytest.approx([0.0, 0.0, 300.0])

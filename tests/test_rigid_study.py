@@ -180,6 +180,8 @@ def test_a_study_survives_being_written() -> None:
 FLAT = {"mesh": {"builder": "box", "size": [0.6, 0.2], "h": 0.1}, "obstacle": None, "load": None}
 SOFT = {"energy": "corotated", "young": 1.0, "poisson": 0.2, "density": 1.0}
 BALL = {"name": "ball", "shape": "sphere", "radius": 2.0, "at": [0.0, 0.0, 9.0]}
+ROCK = {"name": "rock", "shape": "mesh", "file": "rock.stl", "at": [0.0, 0.0, -1.0]}
+OPEN = "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\n"  # a tetrahedron without a side
 NEWMARK = {"scheme": "newmark", "step": 1e-3, "end": 0.1}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "two dimensions": (FLAT, "2 dimensions"),
@@ -192,6 +194,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "boundary": ({"boundary": [{"on": "left", "fix": "x"}]}, "by obstacles"),
     "initial": ({"initial": {"velocity": [0.0, 0.0, 1.0]}}, r"in \[\[body\]\]"),
     "free obstacle": ({"obstacle": [BALL | {"mass": 1.0}]}, "has a mass"),
+    "obstacle from a file": ({"obstacle": [ROCK]}, "rock is a mesh, .* build it of other shapes"),
+    "flat obstacle": ({"obstacle": [FLOOR | {"at": [0.0, 0.0], "normal": [0.0, 1.0]}]}, "needs 3 numbers"),
+    "open mesh": ({"mesh": {"surface": "OPEN", "h": 0.1}}, "is open"),
     "hollow": ({"obstacle": [BALL | {"hollow": True}]}, "hollow"),
     "soft contact": ({"contact": {"stiffness": 1e5}}, "contacts are hard"),
     "without itself": ({"contact": {"itself": False}}, "always meet"),
@@ -207,6 +212,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_what_makes_no_sense_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
     """By the study, by `check`, or where the bodies are placed; nothing is written."""
     changed, said = REFUSED[name]
+    if changed.get("mesh", {}).get("surface") == "OPEN":
+        (tmp_path / "open.obj").write_text(OPEN)
+        changed = {"mesh": {"surface": str(tmp_path / "open.obj"), "h": 0.1}}
     with pytest.raises((InputError, ValueError), match=said):
         whole = study(**changed)
         check_study(whole)

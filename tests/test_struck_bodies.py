@@ -144,9 +144,9 @@ def test_a_block_that_rests_carries_its_weight() -> None:
 
 
 def test_the_crack_of_a_blow_does_not_depend_on_the_step() -> None:
-    """A bar that comes down askew, at dt and dt/4: the same edges, some 400 of them."""
+    """A bar that comes down askew, at dt, dt/2 and dt/4: the same edges, some 400 of them."""
     found = []
-    for step in (1e-3, 2.5e-4):
+    for step in (1e-3, 5e-4, 2.5e-4):
         stepper = stepper_of(bar(0.02), 2e5, step, contact_time=TAU)
         state = moving(stepper, np.array([0.0, 0.0, -3.0]), np.array([0.0, 1.0, 0.0]))
         broken = 0
@@ -154,7 +154,7 @@ def test_the_crack_of_a_blow_does_not_depend_on_the_step() -> None:
             state, report = stepper.advance(state)
             broken = report.broken
         found.append(stepper.copies.copy(0).graph.broken.copy())
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
 
 
 def test_momentum_is_kept_through_a_fracture() -> None:

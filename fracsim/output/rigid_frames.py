@@ -13,9 +13,10 @@ from ..mechanics.contact.drawing import Drawings
 from ..mechanics.contact.obstacle import Obstacle
 from ..meshes.data import MeshData
 from ..rigid.bodies import Bodies
+from ..rigid.placing import Poses
+from .surface.copies import SurfaceOfCopies
 from .surface.files import SurfaceFiles
 from .surface.fragments import Fragments
-from .surface.frame import Surface
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -33,16 +34,17 @@ class RigidFrames:
         self,
         folder: Path,
         mesh: MeshData,
+        poses: Poses,
         density: float,
         obstacles: Sequence[Obstacle],
         resume_at: float | None = None,
     ) -> None:
-        """`resume_at`: keep the frames up to this time, s. Raises OSError."""
+        """Of copies of a mesh; `resume_at`: keep the frames up to this time, s. Raises OSError."""
         self.files = SurfaceFiles(folder, 3, resume_at, turning=True)
-        self.surface = Surface(mesh, density)
-        self.broken_at: Values = np.full(len(self.surface.skeleton.edges), NEVER)
-        self._obstacles = obstacles
-        self._drawings = Drawings(obstacles, mesh.points.min(axis=0), mesh.points.max(axis=0))
+        self.surface = SurfaceOfCopies(mesh, poses, density)
+        self.broken_at: Values = np.full(self.surface.edge_count, NEVER)
+        self._obstacles, points = obstacles, self.surface.split.points
+        self._drawings = Drawings(obstacles, points.min(axis=0), points.max(axis=0))
 
     def resume(self, broken_at: Values) -> None:
         """Edges broke at these times (E,), s: pieces have the names that they had."""
@@ -51,7 +53,7 @@ class RigidFrames:
 
     def note(self, pattern: npt.NDArray[np.uint8], t: float) -> None:
         """Edges may have broken in the step that ended at t (s), as the patterns (C,) say."""
-        broken = self.surface.skeleton.broken_edges(pattern)
+        broken = self.surface.broken_edges(pattern)
         self.broken_at[broken & (self.broken_at == NEVER)] = t
 
     def write(self, t: float, bodies: Bodies, pattern: npt.NDArray[np.uint8], cut: Values) -> None:

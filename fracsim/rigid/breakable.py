@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..fracture.brittle.surfaces import BrittleSurfaces
 from ..fracture.criterion import Average
+from ..fracture.edge_stress import frobenius_norm
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from ..mesh.pieces import Pieces, find_pieces
@@ -118,6 +119,7 @@ class Breakable:
         """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's."""
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
         self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
+        self._corners = np.ascontiguousarray(self._domain.cell_nodes.T)
         self._kept: dict[int, Analysis] = {}  # by the lowest node of the piece
         self._node = np.argsort(self._domain.node_input)  # of each node of the input mesh
         self._find_pieces()
@@ -186,9 +188,14 @@ class Breakable:
     def shares(self, piece: int) -> Values:
         """(cells,) what of each cell belongs to a piece: as many parts as it has nodes of it; of a cell in which a
         crack ends, hardly anything."""
-        share = (self.pieces.of_node == piece)[self._domain.cell_nodes].mean(axis=1)
+        share = self._count(self.pieces.of_node == piece) / len(self._corners)
         share[self.graph.split & (share == 1)] = CRACKED
         return share
+
+    def _count(self, nodes: Flags) -> npt.NDArray[np.int8]:
+        """(cells,) how many of their nodes have a flag (nodes,): column by column, a tenth of the time of NumPy's sum."""
+        flags = nodes.view(np.int8)
+        return np.asarray(sum(flags[each] for each in self._corners))
 
     def stress(self, piece: int, loads: PointLoads) -> Values:
         """(cells, 3 or 6) stress of a piece under loads that fall on it, 0 in all other cells, Pa. Raises
@@ -279,13 +286,19 @@ class Breakable:
 
     def _may_break(self, mine: Flags) -> bool:
         """Whether a piece with these nodes (nodes,) has a whole cell left."""
-        return bool(mine[self._domain.cell_nodes[~self.graph.split]].all(axis=1).any())
+        return bool(np.any(self._inside(mine) & ~self.graph.split))
+
+    def _inside(self, mine: Flags) -> Flags:
+        """(cells,) those with no other nodes than these (nodes,)."""
+        return np.asarray(self._count(mine) == len(self._corners))
 
     def _pass(self, piece: int, mine: Flags, loads: PointLoads) -> int:
         """One analysis of a piece, and the edges that break in it."""
         assert self._criterion is not None
         stress = self.stress(piece, loads)
-        self._within.cells = np.asarray(mine[self._domain.cell_nodes].all(axis=1))
+        self._within.cells = self._inside(mine)
+        if self._surely_holds(stress):
+            return 0
         edges, _ = self._criterion(stress)
         flags = np.zeros(len(self.graph.broken), bool)
         flags[edges] = True
@@ -293,6 +306,15 @@ class Breakable:
         # the boundary of a grain may go on in other bodies
         count = self.graph.break_edges(flags & mine[ends[0]] & mine[ends[1]])
         return count + self.graph.break_idle() if count else 0
+
+    def _surely_holds(self, stress: Values) -> bool:
+        """Whether no average over cells of the piece comes near its strength, for none of them does; cells that a crack
+        ends in may carry more than they have."""
+        assert self._criterion is not None
+        cells = np.flatnonzero(self._within.cells & ~self.graph.split)
+        size = frobenius_norm(stress[cells], self._domain.dim)
+        enough = float(size.max(initial=0.0)) < self._criterion.strength.weakest * (1 - 1e-9)
+        return enough and not self.graph.damaged[cells].any()
 
     def _lowest(self, mine: Flags) -> list[int]:
         """The lowest node of each piece that these nodes (nodes,) are in, the last first."""

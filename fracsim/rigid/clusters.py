@@ -21,6 +21,7 @@ Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 COARSE = 0.03  # of the length of a piece
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 AROUND, TILTED = 24, (-0.7, 0.0, 0.7)  # directions along which corners are kept
 
 
@@ -45,15 +46,15 @@ def clusters(corners: Values, piece: Ints, count: int, thickness: float, edge: f
     """(m,) clusters of triangles with corners (m, 3, 3), m, of pieces (m,), and (c,) the piece of each cluster."""
     cluster, owner, going = piece.copy(), np.arange(count), np.ones(count, bool)
     allowed = np.maximum(ROUGH * edge, COARSE * _lengths(corners, piece, count))
-    middle = corners.mean(axis=1)
+    sums = _sums(corners, piece, count)
     while going.any() and 2 * np.bincount(owner).max() <= PARTS:
         rows = np.flatnonzero(going[cluster])
         number, of = np.unique(cluster[rows], return_inverse=True)
-        centre, spread = _spread(corners[rows], of, len(number))
+        centre, spread = _spread(sums[:, rows], of, len(number))
         lengths, axes = np.linalg.eigh(spread)
         off = np.sqrt(np.maximum(lengths[:, 0] - (thickness / 2) ** 2, 0.0))
         bent = off > allowed[owner[number]]
-        far = np.einsum("ni,ni->n", middle[rows] - centre[of], axes[of, :, 2]) > 0
+        far = np.einsum("ni,ni->n", sums[1:4, rows].T / sums[0, rows, None] - centre[of], axes[of, :, 2]) > 0
         far &= bent[of]
         # one of two halves may be empty where a few triangles have one middle: it is none then
         number_of_half = np.full(len(number), -1)
@@ -74,22 +75,26 @@ def _lengths(corners: Values, piece: Ints, count: int) -> Values:
     return np.asarray(np.linalg.norm(high - low, axis=1))
 
 
-def _spread(corners: Values, of: Ints, count: int) -> tuple[Values, Values]:
-    """(count, 3) centres and (count, 3, 3) mean squares about them of triangles (m, 3, 3) by their areas:
+def _sums(corners: Values, piece: Ints, count: int) -> Values:
+    """(10, m) areas, first and second moments of triangles (m, 3, 3) about the middle of their piece (m,):
     int x x^T dA = A (sum_k x_k x_k^T + s s^T) / 12, s the sum of the corners."""
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     area = np.maximum(area, 1e-30)
-    weight = np.bincount(of, area, count)
-    many = np.bincount(of, minlength=count)
-    near = np.stack([np.bincount(of, each, count) for each in corners.mean(axis=1).T], axis=1) / many[:, None]
-    x = corners - near[of, None]
+    many = np.bincount(piece, minlength=count)
+    near = np.stack([np.bincount(piece, each, count) for each in corners.mean(axis=1).T], axis=1) / many[:, None]
+    x = corners - near[piece, None]
     s = x.sum(axis=1)
-    first = np.stack([np.bincount(of, area * each / 3, count) for each in s.T], axis=1) / weight[:, None]
-    both = np.einsum("mki,mkj->mij", x, x) + np.einsum("mi,mj->mij", s, s)
-    square = (area[:, None, None] * both / 12).reshape(-1, 9)
-    second = np.stack([np.bincount(of, each, count) for each in square.T], axis=1).reshape(-1, 3, 3)
-    second = second / weight[:, None, None] - np.einsum("ni,nj->nij", first, first)
-    return near + first, second
+    second = [area * ((x[:, :, i] * x[:, :, j]).sum(axis=1) + s[:, i] * s[:, j]) / 12 for i, j in PAIRS]
+    return np.stack([area, *(area * s.T / 3), *second])
+
+
+def _spread(sums: Values, of: Ints, count: int) -> tuple[Values, Values]:
+    """(count, 3) centres and (count, 3, 3) mean squares about them of groups (m,) of triangles with moments (10, m)."""
+    area, *rest = (np.bincount(of, each, count) for each in sums)
+    centre, second = np.stack(rest[:3], axis=1) / area[:, None], np.empty((count, 3, 3))
+    for (i, j), each in zip(PAIRS, rest[3:], strict=True):
+        second[:, i, j] = second[:, j, i] = each / area - centre[:, i] * centre[:, j]
+    return centre, second
 
 
 def extreme(places: Values, of: Ints) -> Flags:

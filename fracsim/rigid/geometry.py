@@ -100,7 +100,9 @@ class Geometry:
         same = [before.get(name) for name in map(int, names)]
         new = [each for each, key in enumerate(keys) if same[each] is None or same[each][0] != key]
         for each, parts in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
-            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outermost(parts)
+            few = self._in_clusters(made)
+            outer = np.arange(sum(map(len, parts))) if few else outermost(parts)
+            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outer
         after = {int(name): kept for name, kept in zip(names, same, strict=True) if kept is not None}
         self._hulls[number] = after
         _, parts, outer = zip(*(after[int(name)] for name in names), strict=True)
@@ -108,14 +110,19 @@ class Geometry:
 
     def _parts(self, made: Split, piece: Ints, chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
-        if self._shell is None or made.pieces == 1:  # whole it may be closed, and is one for all copies
+        if not self._in_clusters(made):
             solids = (Solid.of(made.points, made.elements[piece == each]).filled for each in chosen)
             return [convex_parts(each, self.mean_edge) for each in solids]
         place = np.full(made.pieces, -1)
         place[chosen] = np.arange(len(chosen))
         of = place[piece]
+        assert self._shell is not None
         mine, thickness = np.flatnonzero(of >= 0), self._shell.thickness
         return clustered_parts(made.points, made.elements[mine], of[mine], len(chosen), thickness, self.mean_edge)
+
+    def _in_clusters(self, made: Split) -> bool:
+        """Whether parts are clusters, of few corners: whole a shell may be closed, and its parts are for all copies."""
+        return self._shell is not None and made.pieces > 1
 
     def _at(self, number: int, copy: _Copy) -> Shapes:
         """A copy where it is at rest."""

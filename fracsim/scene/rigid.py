@@ -55,7 +55,7 @@ class RigidScene:
 
     Attributes:
         mesh: of all bodies, where they are at the start.    obstacles: what stands in their way.
-        first: the state at t = 0.
+        first: the state at t = 0.    made_of: the mesh of a copy, and where copies are at rest.
     """
 
     study: Study
@@ -63,6 +63,7 @@ class RigidScene:
     stepper: RigidStepper
     obstacles: list[Obstacle]
     first: RigidState
+    made_of: tuple[MeshData, Poses]
 
     def ended(self, state: RigidState) -> bool:
         """Whether the state is at the end of the study."""
@@ -89,7 +90,7 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     velocity, spin = motion(stepper.shapes.names, len(single.points), at_rest.centre, at_rest.mass, places)
     first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin))
     _check_room(stepper, first, obstacles, geometry.mean_edge)
-    return RigidScene(study, placed(single, places), stepper, obstacles, first)
+    return RigidScene(study, placed(single, places), stepper, obstacles, first, (single, poses))
 
 
 def help_rigid(comm: MPI.Comm) -> None:
