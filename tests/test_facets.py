@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.linalg import block_diag
 
 from fracsim.mechanics.contact.barrier import Barrier
 from fracsim.mechanics.contact.deepest import deepest, most_above
 from fracsim.mechanics.contact.facets import Between, Facets, between
+from fracsim.mechanics.contact.friction import Friction
+from fracsim.mechanics.contact.gripped import gripped_between
 from fracsim.mechanics.contact.joined import joined
 from fracsim.mechanics.contact.obstacles import Obstacles
 from fracsim.mechanics.contact.placed import Placed
@@ -19,7 +22,7 @@ from fracsim.mechanics.contact.push import by_point_and_pose, on_obstacle, push
 from fracsim.mechanics.contact.reach import safe_shares
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
 from fracsim.mechanics.contact.shares import least_over_shares
-from fracsim.mechanics.contact.touch import Touch, nothing
+from fracsim.mechanics.contact.touch import Touch, grip, nothing, touch
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -218,8 +221,46 @@ def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
         assert twice == pytest.approx(way @ on.hessian @ way, abs=1e-3 * abs(on.hessian).max())
     arm = x[found.points] - placed.pose.centre
     J = np.concatenate([np.broadcast_to(-np.eye(d), (len(arm), d, d)), turning(arm)], axis=2)
-    both = np.einsum("nip,niq->pq", J, by_point_and_pose(found, x, placed.pose))
+    both = np.einsum("nip,niq->pq", J, by_point_and_pose(found, x, placed.pose, None, placed.pose))
     np.testing.assert_allclose(both, on.stiffness, atol=1e-9 * abs(on.stiffness).max())
+
+
+@pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])
+def test_forces_before_an_obstacle_that_spins_and_rubs(name: str) -> None:
+    """How forces on points change with the pose, friction holding places that have turned by half a radian since the
+    step began, against differences."""
+    placed, corners = facets_near(name, 6)
+    d, x = placed.shape.dim, corners.reshape(-1, placed.shape.dim)
+    facets = Facets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
+    p, h = 3 * d - 3, 1e-6
+    then = placed.pose.moved(np.concatenate([0.02 * np.ones(d), 0.5 * np.ones(p - d)]))
+    inner, _ = between(facets, placed, x, LAW)
+    held = gripped_between(grip(x, placed.distance(x), np.ones(len(x)), placed, LAW), inner, x)
+    rub = Friction(0.3, 0.05)
+    assert len(held.points) > 4
+
+    def felt(q: Values) -> Touch:
+        there = Placed(placed.shape, placed.pose.moved(q))
+        way = there.pose.points_to_space(then.to_body(held.under)) - held.under
+        return joined(touch(x, np.ones(len(x)), there, LAW, held, rub, way), *between(facets, there, x, LAW))
+
+    steps, found = h * np.eye(p), felt(np.zeros(p))
+    mixed = by_point_and_pose(found, x, placed.pose, held, then, exact=True)
+    for k, q in enumerate(steps):
+        up, down = felt(q), felt(-q)
+        forces = (down.normal + down.friction - up.normal - up.friction) / (2 * h)
+        np.testing.assert_allclose(mixed[:, :, k], forces, atol=1e-5 * abs(mixed).max())
+    on = push(found, x, placed.pose, held, then)
+    by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
+    np.testing.assert_allclose(on.gradient, by_energy, atol=1e-5 * abs(on.gradient).max())
+    # what is left of the points once the pose has given way is a potential that goes up: CG may solve with it
+    rough, C = by_point_and_pose(found, x, placed.pose, held, then), np.linalg.inv(on.stiffness + 1e-6 * np.eye(p))
+    K = block_diag(*found.stiffness)
+    for of, block in zip(np.searchsorted(found.points, inner.corners), inner.stiffness, strict=True):
+        at = (d * of[:, None] + np.arange(d)).reshape(-1)
+        K[np.ix_(at, at)] += block
+    U = rough.reshape(-1, p)
+    assert np.linalg.eigvalsh(K - U @ C @ U.T).min() > -1e-9 * abs(K).max()
 
 
 # --- in a run ---

@@ -298,7 +298,7 @@ def test_a_striker_faster_than_its_step_does_not_tunnel(radius: float) -> None:
         centre = np.array([0.5, 0.2 + radius - 100 * state.t])
         x = places(scene, state)
         assert np.linalg.norm(x - centre, axis=1).min() > radius
-        assert x[:, 1].mean() < centre[1]
+        assert (x[abs(x[:, 0] - 0.5) < 0.1, 1] < centre[1]).all()  # what is in its way, though a bar may slide round it
     assert state.v.reshape(-1, 2)[:, 1].mean() < -50
     assert struck > 0
 

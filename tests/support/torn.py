@@ -284,9 +284,9 @@ RUNS: dict[str, dict[str, Any]] = {
         "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"}, "boundary": [{"on": "left", "fix": "xy"}],
         "fracture": {"strength": 0.006, "radius": 0.1}, "load": {"gravity": [0.0, -0.1]},
         "obstacle": [{"name": "stone", "shape": "sphere", "radius": 0.15, "at": [0.8, 0.77], "velocity": [0.05, -1.2],
-                      "spin": [1.0], "mass": 0.02, "friction": 0.03},
+                      "spin": [1.0], "mass": 0.02, "friction": 0.3},
                       {"name": "second", "shape": "box", "size": [0.2, 0.1], "at": [0.85, 1.0], "velocity": [0.0, -2.0],
-                       "mass": 0.005}],
+                       "mass": 0.01}],
         "time": {"scheme": "generalized-alpha", "step": 0.05, "end": 0.1},
     },
     # torn, then pushed together until its pieces touch one another

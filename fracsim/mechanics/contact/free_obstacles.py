@@ -34,6 +34,7 @@ from .obstacle import Obstacle
 from .placed import Placed
 from .rigid_step import RigidStep
 from .stops import Stops
+from .together import is_positive
 from .touch import Touch
 
 Values = npt.NDArray[np.float64]
@@ -156,19 +157,28 @@ class FreeObstacles(Flights):
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
         if self._mutual is not None and touched:
             U = np.concatenate([self._mixed(number, touches[number]) for number in self.free], axis=1)
-            return [(U, self._mutual.compliance(self._arounds()))]
+            return [(U, self._mutual.compliance(self._arounds(), exact=self._exact))]
         return [(self._mixed(number, touches[number]), self._compliance(number)) for number in touched]
 
     def _mixed(self, number: int, found: Touch) -> Values:
         """(owned dofs, k) Phi_xz (collective)."""
-        by_z = self.free[number].by_z(found, self.x)
+        by_z = self.free[number].by_z(found, self.x, exact=self._exact)
         forces = np.zeros((len(self.x), *by_z.shape[1:]))
         forces[found.points] = by_z
         return np.stack([self.skin.follow.handed_down(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
 
     def _compliance(self, number: int) -> Values:
         """(k, k) Phi_zz^-1 (collective)."""
-        return np.asarray(np.linalg.inv(self.free[number].resistance(self._around(number))), np.float64)
+        resistance = self.free[number].resistance(self._around(number), exact=self._exact)
+        return np.asarray(np.linalg.inv(resistance), np.float64)
+
+    def _may_be_exact(self, moved: float) -> bool:
+        """And all free obstacles stand where the potential is least (collective)."""
+        if not super()._may_be_exact(moved):
+            return False
+        if self._mutual is not None:
+            return is_positive(self._mutual.resistance(self._arounds(), exact=True))
+        return all(is_positive(each.resistance(self._around(k), exact=True)) for k, each in self.free.items())
 
     def _pressed(self, number: int) -> float:
         if number not in self.free:
@@ -191,11 +201,12 @@ class FreeObstacles(Flights):
         """As Newton's method moves them together with the points (collective)."""
         ways, found = super()._taken_along(moved), self.touching()
         if self._mutual is not None:
-            for number, q in self._mutual.taken_along(dict(enumerate(found)), self._arounds(), moved).items():
+            every = self._mutual.taken_along(dict(enumerate(found)), self._arounds(), moved, exact=self._exact)
+            for number, q in every.items():
                 ways[number] = q
             return ways
         for number, each in self.free.items():
-            ways[number] = each.taken_along(found[number], self._around(number), moved)
+            ways[number] = each.taken_along(found[number], self._around(number), moved, exact=self._exact)
         return ways
 
     def reachable(self, u: Values) -> Values:

@@ -161,23 +161,25 @@ class FreePose:
 
     # --- how it gives way ---
 
-    def by_z(self, found: Touch, x: Values) -> Values:
+    def by_z(self, found: Touch, x: Values, *, exact: bool) -> Values:
         """(k, d, ways) derivative of minus the forces on points in touch by z, as it enters the tangent."""
-        return self.step.factor * by_point_and_pose(found, x, self.placed.pose) @ self.step.by_way(self.z)
+        pose, then = self.placed.pose, self.step.start.pose
+        by_pose = by_point_and_pose(found, x, pose, self._held, then, exact=exact)
+        return self.step.factor * by_pose @ self.step.by_way(self.z)
 
-    def resistance(self, around: Around) -> Values:
-        """(k, k) second derivative of Phi by z, its positive definite part (collective)."""
-        return self.step.system(self.z, self._settled or self.push(around, self.z))[2]
+    def resistance(self, around: Around, *, exact: bool) -> Values:
+        """(k, k) second derivative of Phi by z, its positive definite part or `exact` (collective)."""
+        return self.step.system(self.z, self._settled or self.push(around, self.z))[1 if exact else 2]
 
-    def taken_along(self, found: Touch, around: Around, moved: Values) -> Values:
+    def taken_along(self, found: Touch, around: Around, moved: Values, *, exact: bool) -> Values:
         """(p,) increment of its pose as Newton's method moves it together with the points, by `moved` (n, d), m
         (collective)."""
-        dz = np.asarray(-np.linalg.solve(self.resistance(around), self.pulled(found, around, moved)))
-        return self.goes(around, moved, dz)
+        pulled = self.pulled(found, around, moved, exact=exact)
+        return self.goes(around, moved, np.asarray(-np.linalg.solve(self.resistance(around, exact=exact), pulled)))
 
-    def pulled(self, found: Touch, around: Around, moved: Values) -> Values:
+    def pulled(self, found: Touch, around: Around, moved: Values, *, exact: bool) -> Values:
         """(k,) change of the gradient of Phi by z with the points, which go by `moved` (n, d), m (collective)."""
-        mixed = self.by_z(found, around.x)
+        mixed = self.by_z(found, around.x, exact=exact)
         return total(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
 
     def goes(self, around: Around, moved: Values, dz: Values) -> Values:

@@ -126,18 +126,21 @@ class Mutual:
             total[j] -= push(own, x, at[j], None, at[j]).gradient + carried(its, y, at[j]).gradient
         return dict(zip(self._free, total, strict=True))
 
-    def compliance(self, arounds: Mapping[int, Around]) -> Values:
-        """(K, K) Phi_zz^-1 of all, its positive definite part (collective)."""
+    def resistance(self, arounds: Mapping[int, Around], *, exact: bool) -> Values:
+        """(K, K) Phi_zz of all, its positive definite part or `exact` (collective)."""
         z, around = [each.z for each in self._each], [arounds[number] for number in self._free]
-        found = self._settled or self._pushes(around, z)
-        return np.asarray(np.linalg.inv(self.together.system(z, found)[2]))
+        return self.together.system(z, self._settled or self._pushes(around, z))[1 if exact else 2]
+
+    def compliance(self, arounds: Mapping[int, Around], *, exact: bool) -> Values:
+        """(K, K) its inverse (collective)."""
+        return np.asarray(np.linalg.inv(self.resistance(arounds, exact=exact)))
 
     def taken_along(
-        self, found: Mapping[int, Touch], arounds: Mapping[int, Around], moved: Values
+        self, found: Mapping[int, Touch], arounds: Mapping[int, Around], moved: Values, *, exact: bool
     ) -> dict[int, Values]:
         """(p,) increments of their poses as Newton's method moves them together with the points, by `moved` (n, d), m
         (collective)."""
         every = self._free.items()
-        pushed = [each.pulled(found[number], arounds[number], moved) for number, each in every]
-        dz = self.together.split(-self.compliance(arounds) @ np.concatenate(pushed))
+        pushed = [each.pulled(found[number], arounds[number], moved, exact=exact) for number, each in every]
+        dz = self.together.split(-self.compliance(arounds, exact=exact) @ np.concatenate(pushed))
         return {number: each.goes(arounds[number], moved, way) for (number, each), way in zip(every, dz, strict=True)}

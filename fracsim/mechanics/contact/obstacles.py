@@ -14,10 +14,10 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ...mesh.domain import Domain
-from ...mesh.ranks import total
 from ...mesh.split.places import Places
 from ...meshes.words import AXES
 from ..coupling import Coupling
@@ -36,6 +36,11 @@ from .touching import Touching
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+# of the width of the barrier: changes of points in touch below which tangents are exact, in a first attempt and in
+# others. Without their negative eigenvalues Newton's method gains less than a digit an iteration to the end; further
+# away CG may find none with them
+NEAR_END = 0.01, 0.001
+
 
 class Obstacles(Touching, Term):
     """Obstacles that the body cannot pass through."""
@@ -51,6 +56,7 @@ class Obstacles(Touching, Term):
         # of the last step: work of each obstacle, J, what friction took, J, and forces on each, N
         self._worked, self._lost = [0.0] * len(self.obstacles), 0.0
         self._read: list[Values] | None = None  # None: not yet
+        self._exact = False  # the last tangent
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
@@ -69,14 +75,33 @@ class Obstacles(Touching, Term):
     def coupling(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces, where anything is in touch (collective)."""
         touches = self.touching()
-        count = int(total(self.comm, sum(len(each.points) for each in touches))[0])
+        points = np.concatenate([each.points for each in touches])
+        moved, self._tangent_at = self._changed(points), self.x
+        both = np.array([len(points), moved])
+        self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
+        count, most = both
         if not count:
             return None
-        points = np.concatenate([each.points for each in touches])
-        part = self.skin.stiffness(points, np.concatenate([each.stiffness for each in touches]))
+        self._exact = self._may_be_exact(most)
+        part = self.skin.stiffness(points, np.concatenate([each.tangent(exact=self._exact) for each in touches]))
         for between in (each.between for each in touches if each.between is not None):
-            part = part + self.skin.stiffness_between(between.corners, between.stiffness)
+            inner = between.exact if self._exact else between.stiffness
+            part = part + self.skin.stiffness_between(between.corners, inner)
         return self._coupling((self._level.blow.factor * part).tocsr(), self.skin.columns)
+
+    def _changed(self, points: Ints) -> float:
+        """m, by which points (k,) have moved at most since the last tangent; infinite where there was none."""
+        if self._tangent_at is None:
+            return np.inf
+        return float(np.linalg.norm((self.x - self._tangent_at)[points], axis=1).max(initial=0.0))
+
+    def _may_be_exact(self, moved: float) -> bool:
+        """Whether Newton's method is at its end, points in touch having moved by so much, m, at most (collective)."""
+        return moved < NEAR_END[self._attempts > 1] * self.width
+
+    def set_out(self) -> None:
+        """Newton's method sets out on the step: after it has failed it is exact later."""
+        self._tangent_at, self._exact, self._attempts = None, False, self._attempts + 1
 
     def stored(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""

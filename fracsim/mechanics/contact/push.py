@@ -44,20 +44,18 @@ def push(found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose) ->
     the `start` of the step, not those that are there now."""
     arm = x[found.points] - pose.centre
     J, gradient = _by_pose(arm), -found.normal
-    stiffness, hessian = (_summed(J, blocks) for blocks in (found.stiffness, found.exact))
+    stiffness, hessian = (_summed(J, blocks) for blocks in (found.pressed, found.exact))
     if (inner := found.between) is not None:
         facing = _of_facets(inner, x, pose)
         stiffness, hessian = stiffness + _summed(facing, inner.stiffness), hessian + _summed(facing, inner.exact)
     hessian = hessian + _turning_with(gradient, arm)
     total = np.einsum("ndp,nd->p", J, gradient)
     if held is not None and len(held.points):
-        arm = arm.copy()
-        arm[np.searchsorted(found.points, held.points)] = (held.under - start.centre) @ (
-            pose.rotation @ start.rotation.T
-        ).T
+        arm = _under(found, arm, pose, held, start)
         J = _by_pose(arm)
+        stick = _summed(J, found.stick)
         total = total - np.einsum("ndp,nd->p", J, found.friction)
-        hessian = hessian + _summed(J, found.stick)
+        stiffness, hessian = stiffness + stick, hessian + stick
         d = pose.dim
         hessian[d:, d:] += second_order_turn(found.friction, arm).sum(axis=0)
     return Push(found.potential, total, hessian, stiffness)
@@ -113,14 +111,29 @@ def resultant(force: Values, arm: Values) -> Values:
     return np.concatenate([force.sum(axis=0), moment])
 
 
-def by_point_and_pose(found: Touch, x: Values, pose: Pose) -> Values:
-    """(k, d, p) derivative of minus the forces on the points by an increment of the pose, as `stiffness` has it."""
-    result = np.asarray(found.stiffness @ _by_pose(x[found.points] - pose.centre))
+def by_point_and_pose(
+    found: Touch, x: Values, pose: Pose, held: Grip | None, start: Pose, *, exact: bool = False
+) -> Values:
+    """(k, d, p) derivative of minus the forces on the points by an increment of the pose, as `stiffness` has it, or
+    `exact`; friction as in `push`: with an arm other than that of the stiffness Newton's method would creep."""
+    arm = x[found.points] - pose.centre
+    result = np.asarray((found.exact if exact else found.pressed) @ _by_pose(arm))
+    if held is not None and len(held.points):
+        result = result + found.stick @ _by_pose(_under(found, arm, pose, held, start))
+    if exact:
+        result[:, :, pose.dim :] += turning(found.normal)
     if (inner := found.between) is not None:
-        blocks = inner.stiffness @ _of_facets(inner, x, pose)
+        blocks = (inner.exact if exact else inner.stiffness) @ _of_facets(inner, x, pose)
         at = np.searchsorted(found.points, inner.corners)
         np.add.at(result, at, blocks.reshape(*at.shape, x.shape[1], -1))
     return result
+
+
+def _under(found: Touch, arm: Values, pose: Pose, held: Grip, start: Pose) -> Values:
+    """(k, d) arms of what friction holds: places of the obstacle that were under points as the step began."""
+    arm, turned = arm.copy(), pose.rotation @ start.rotation.T
+    arm[np.searchsorted(found.points, held.points)] = (held.under - start.centre) @ turned.T
+    return arm
 
 
 def _by_pose(arm: Values) -> Values:

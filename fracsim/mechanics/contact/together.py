@@ -113,8 +113,13 @@ class Together:
 def _solved(hessian: Values, stiffness: Values, gradient: Values) -> Values:
     """H^-1 g with H the Hessian where that is positive definite, else the stiffness."""
     with np.errstate(all="ignore"):
-        try:
-            np.linalg.cholesky(hessian)
-        except np.linalg.LinAlgError:
-            hessian = stiffness
-        return np.asarray(np.linalg.solve(hessian, gradient), np.float64)
+        return np.asarray(np.linalg.solve(hessian if is_positive(hessian) else stiffness, gradient), np.float64)
+
+
+def is_positive(matrix: Values) -> bool:
+    """Whether a symmetric matrix (k, k) is positive definite."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -89,9 +89,18 @@ class Touch:
         return self._parts[1]
 
     @cached_property
+    def pressed(self) -> Values:
+        """(k, d, d) the part of `exact` that is positive semi-definite, N/m."""
+        return positive(self.exact)
+
+    @property
     def stiffness(self) -> Values:
         """(k, d, d) minus the derivative of the forces, positive semi-definite, N/m."""
-        return positive(self.exact) + self.stick
+        return self.tangent(exact=False)
+
+    def tangent(self, *, exact: bool) -> Values:
+        """(k, d, d) the same, or `exact`, N/m."""
+        return (self.exact if exact else self.pressed) + self.stick
 
 
 def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Repulsion) -> Grip:

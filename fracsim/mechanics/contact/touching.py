@@ -48,6 +48,8 @@ class Touching:
         self.comm = domain.comm
         self._touches: list[Touch] | None = None
         self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
+        self._attempts = 0  # of Newton's method in it
+        self._tangent_at: Values | None = None  # places of the points at the last tangent of this attempt
         check_apart(self.comm, self.skin.rest, self.obstacles)
         if any(each.free for each in self.obstacles):
             from .overlap import check_free_apart
@@ -110,7 +112,7 @@ class Touching:
 
     def begin(self, level: Level) -> None:
         """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
-        self._level, self._touches = level, None
+        self._level, self._touches, self._attempts = level, None, 0
         end = level.t + (1 - level.share) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: grips and ways are still those of the step
@@ -146,7 +148,7 @@ class Touching:
     def _forget_start(self) -> None:
         """The points are others than those that the step began with."""
         none = [None] * len(self.obstacles)
-        self._grips, self._begun, self._touches = [*none], [*none], None
+        self._grips, self._begun, self._touches, self._tangent_at = [*none], [*none], None, None
 
     def _at_end(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
