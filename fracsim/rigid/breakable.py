@@ -193,7 +193,7 @@ class Breakable:
         return share
 
     def _count(self, nodes: Flags) -> npt.NDArray[np.int8]:
-        """(cells,) how many of their nodes have a flag (nodes,): column by column, a tenth of the time of NumPy's sum."""
+        """(cells,) how many of their nodes have a flag (nodes,): a tenth of the time of NumPy's sum."""
         flags = nodes.view(np.int8)
         return np.asarray(sum(flags[each] for each in self._corners))
 
