@@ -1,0 +1,134 @@
+"""Three experiments beside the rigid scheme, after Bao et al. 2007: what it would do otherwise.
+
+    python3 -m fracsim.studies.rigid_trials [PICTURE.png]
+
+1. (Figs. 9, 10) A bar comes down askew on a floor. Its crack under the force of a penalty spring as it is at the end of
+   the first step in touch, for several steps, and under the blow J / tau of the scheme.
+2. (Sec. 5) The same bar pushed at one end: stress with three points pinned, and with inertia relief.
+3. (Fig. 7) What linear strain makes of a rotation, and by how much a linearised rotation swells a body.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..fracture.brittle.principal import tensors
+from ..rigid.breakable import Breakable
+from ..rigid.pinned import pinned
+from ..scene.rigid import build_rigid_scene
+from ..study import Study
+
+Values = npt.NDArray[np.float64]
+STEPS = (4e-4, 2e-4, 1e-4, 5e-5)  # s
+SPEED, MASS, RATE = 4.0, 48.0, 2e8  # m/s, kg; N/m of the penalty
+SIZE = (0.6, 0.2, 0.2)  # m
+PUSH = 1e4  # N
+ANGLES = np.radians([1, 3, 10, 30, 60])
+CORNER = np.array([[0.0, 0.1, 0.0]])  # where the bar comes down, its middle a quarter of its length off
+TABLES = {
+    "title": "A bar that comes down askew",
+    "mesh": {"builder": "box", "size": list(SIZE), "h": 0.05},
+    "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
+    "fracture": {"strength": 2.5e6, "kernel": "neighbours"},
+    "brittle": {"surfaces": 12},
+    "time": {"scheme": "rigid", "step": 1e-3, "end": 1.0},
+}
+
+
+def bar() -> Breakable:
+    """Whole, as the scheme has it."""
+    scene = build_rigid_scene(Study.model_validate(TABLES), MPI.COMM_SELF)
+    return scene.stepper.copies.copy(0)
+
+
+def crack(force: float) -> npt.NDArray[np.bool_]:
+    """(edges,) which break under a push (N) upwards at the corner."""
+    body = bar()
+    body.strike(0, body.loads(0, CORNER, np.array([[0.0, 0.0, force]])))
+    return body.graph.broken.copy()
+
+
+def snapshot(step: float, gap: float = 3e-5) -> float:
+    """Force of the penalty at the end of the first step in which the bar, a gap above the floor, is in touch, N."""
+    depth = -gap
+    while depth <= 0:
+        depth += SPEED * step
+    return RATE * depth
+
+
+def blow() -> float:
+    """J / tau of the same spring: it gives m v twice over pi sqrt(m / k)."""
+    return float(2 * MASS * SPEED / (np.pi * np.sqrt(MASS / RATE)))
+
+
+def stresses() -> tuple[Values, Values, Values]:
+    """Places x (cells,) along the bar, m, and the largest principal stress (cells,) with inertia relief and with
+    pins, Pa."""
+    body = bar()
+    loads = body.loads(0, np.array([[0.0, 0.1, 0.1]]), np.array([[PUSH, 0.0, 0.0]]))
+    domain, free = body.graph.domain, body._stiffness.whole()
+    force = loads.nodal(len(domain.nodes))
+    share = np.ones(domain.cell_count)
+    relieved = body._stiffness.tensor(free(force), share)
+    held = body._stiffness.tensor(pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
+    x = domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
+    return x, *(np.asarray(np.abs(np.linalg.eigvalsh(tensors(each, 3))).max(axis=1)) for each in (relieved, held))
+
+
+def turned() -> tuple[Values, Values]:
+    """1 - cos a, the linear strain of a true rotation; sqrt(1 + a^2) - 1, by which a linearised one stretches."""
+    return np.asarray(1 - np.cos(ANGLES)), np.asarray(np.hypot(1, ANGLES) - 1)
+
+
+def main() -> None:
+    """The figures, and the picture where one is asked for."""
+    true = crack(blow())
+    pushes = [snapshot(step) for step in STEPS]
+    cracks = [crack(push) for push in pushes]
+    print(f"blow: {blow():.3g} N, {true.sum()} edges broken, at any step")
+    for step, push, each in zip(STEPS, pushes, cracks, strict=True):
+        alike = (each & true).sum() / max((each | true).sum(), 1)
+        print(f"snapshot at {step:g} s: {push:.3g} N, {each.sum()} edges broken, {alike:.0%} of both alike")
+    x, relieved, held = stresses()
+    far = x > SIZE[0] / 2
+    print(f"far from the push: at most {relieved[far].max():.3g} Pa with relief, {held[far].max():.3g} Pa with pins")
+    for angle, strain, swell in zip(ANGLES, *turned(), strict=True):
+        print(f"turned by {np.degrees(angle):.0f} degrees: strain {strain:.2g}; linearised: {swell:.2g} longer")
+    if len(sys.argv) > 1:
+        draw(Path(sys.argv[1]), [int(each.sum()) for each in cracks], int(true.sum()), (x, relieved, held))
+
+
+def draw(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Values, Values]) -> None:
+    """Three panels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    first, second, third = figure.subplots(1, 3)
+    first.bar([f"{1e3 * step:g}" for step in STEPS], snapshots, color="#b0835c")
+    first.axhline(true, color="#222222", label="blow, any step")
+    first.set(
+        ylim=(0, 1.3 * max(*snapshots, true)),
+        xlabel="step / ms",
+        ylabel="broken edges",
+        title="Penalty force, looked at once",
+    )
+    x, relieved, held = stress
+    second.semilogy(x, held, ".", ms=3, color="#b0835c", label="three points pinned")
+    second.semilogy(x, relieved, ".", ms=3, color="#222222", label="inertia relief")
+    second.set(xlabel="x / m", ylabel="largest principal stress, size, Pa", title="Pushed at x = 0", ylim=(1e2, None))
+    strain, swell = turned()
+    third.loglog(np.degrees(ANGLES), strain, "o-", color="#b0835c", label="linear strain of a rotation")
+    third.loglog(np.degrees(ANGLES), swell, "s--", color="#222222", label="stretch of a linearised one")
+    third.set(xlabel="angle / degrees", title="Rotations and linear strain")
+    for each in (first, second, third):
+        each.legend(frameon=False)
+    figure.savefig(path, dpi=90)
+
+
+if __name__ == "__main__":
+    main()

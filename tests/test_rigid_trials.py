@@ -1,0 +1,32 @@
+"""The experiments beside the rigid scheme say what METHOD 10 and Bao et al. say of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.studies.rigid_trials import ANGLES, PUSH, SIZE, STEPS, crack, snapshot, stresses, turned
+
+
+def test_a_snapshot_of_a_penalty_force_cracks_otherwise_at_another_step() -> None:
+    """Their figs. 9 and 10: the force is that of a depth which the step decides."""
+    pushes = [snapshot(step) for step in STEPS]
+    assert max(pushes) > 4 * min(pushes)
+    first, last = crack(pushes[0]), crack(pushes[-1])
+    assert first.any() and not np.array_equal(first, last)
+
+
+def test_pins_strain_a_body_where_nothing_pushes_it() -> None:
+    """A bar pushed at one end carries F (1 - x / L) / A; with pins several times that where they are."""
+    x, relieved, held = stresses()
+    far = x > SIZE[0] / 2
+    assert relieved[far].max() < PUSH / (SIZE[1] * SIZE[2])
+    assert held[far].max() > 10 * relieved[far].max()
+
+
+def test_linear_strain_of_rotations() -> None:
+    """Both grow with a^2 / 2."""
+    for each in turned():
+        assert each[:3] == pytest.approx(ANGLES[:3] ** 2 / 2, rel=0.02)
