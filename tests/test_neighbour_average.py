@@ -39,6 +39,12 @@ def test_each_neighbour_counts_with_its_volume_for_every_node_it_shares(numbers:
     cells, found = average.reaching(values, frobenius_norm(values, 2), bound, active)
     assert np.allclose(found, expected[cells], atol=1e-13)
     assert set(np.flatnonzero(frobenius_norm(expected, 2) >= bound)) <= set(cells.tolist())
+    some = np.flatnonzero(rng.random(domain.cell_count) < 0.6)
+    active &= np.isin(np.arange(domain.cell_count), some)
+    cells, found = average.reaching_among(some, values, frobenius_norm(values, 2), bound, active)
+    whole = average.reaching(values, frobenius_norm(values, 2), bound, active)
+    assert np.array_equal(cells, np.intersect1d(whole[0], some)) and len(cells)
+    assert np.allclose(found, average(values, active)[cells], atol=1e-13)
 
 
 def test_bodies_side_by_side_do_not_know_of_one_another() -> None:

@@ -16,6 +16,7 @@ from ..mesh.domain import Domain
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
 
 
 class NeighbourAverage:
@@ -38,6 +39,25 @@ class NeighbourAverage:
         brings in (collective)."""
         cells = np.flatnonzero(self(size[:, None], active)[:, 0] >= bound * (1 - 1e-12))
         return cells, self(values, active)[cells]
+
+    def reaching_among(
+        self, cells: Ints, values: Values, size: Values, bound: float, active: Flags
+    ) -> tuple[Ints, Values]:
+        """`reaching` of some cells (k,), of which those `active` (cells,) alone enter, at their cost (one rank)."""
+        corners = np.unique(self._domain.cell_nodes[cells], return_inverse=True)[1].reshape(len(cells), -1)
+        volume = np.where(active[cells], self._domain.volumes[cells], 0.0)
+
+        def around(each: Values) -> Values:
+            at_nodes = np.bincount(corners.ravel(), np.repeat(volume * each, corners.shape[1]))
+            return np.asarray(sum(at_nodes[column] for column in corners.T))
+
+        whole = around(np.ones(len(cells)))
+        whole[whole <= 0] = 1.0
+        near = np.flatnonzero(around(size[cells]) / whole >= bound * (1 - 1e-12)) if len(cells) else cells
+        if not len(near):
+            return cells[near], values[cells[near]]
+        means = np.stack([around(column)[near] for column in values[cells].T], axis=1)
+        return cells[near], means / whole[near, None]
 
     def _around(self, values: Values) -> Values:
         """(cells, n) sums over the nodes of each cell of the sums over the cells around these."""

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from ..fracture.brittle.surfaces import BrittleSurfaces
 from ..fracture.criterion import Average
 from ..fracture.edge_stress import frobenius_norm
+from ..fracture.neighbour_average import NeighbourAverage
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from ..mesh.pieces import Pieces, find_pieces
@@ -51,6 +52,9 @@ class Within:
         if self._average is None:
             cells = np.flatnonzero((size >= bound) & self.cells)
             return cells, values[cells]
+        if isinstance(self._average, NeighbourAverage):
+            cells = np.flatnonzero(self.cells)
+            return self._average.reaching_among(cells, values, size, bound, self._both(active))
         cells, found = self._average.reaching(values, size, bound, self._both(active))
         mine = self.cells[cells]
         return cells[mine], found[mine]

@@ -97,7 +97,7 @@ class Engine:
         speed = np.linalg.norm(bodies.velocity - common, axis=1) + turning
         return np.asarray(self._rules.step * (speed + self._rules.fast))
 
-    def _moved(self, bodies: Bodies, rates: Values, common: Values, reach: list[Values]) -> tuple[Bodies, Touches]:
+    def _moved(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> tuple[Bodies, Touches]:
         """The bodies a step later where none of their points comes farther than a reach (n,) beside what moves with a
         common velocity (3,), and than another (n,) beside what stands, m and m/s."""
         dt, n, g = self._rules.step, self._count, self._rules.gravity
@@ -152,7 +152,7 @@ class Engine:
 
     # --- MuJoCo ---
 
-    def _find(self, bodies: Bodies, rates: Values, common: Values, reach: list[Values]) -> Contacts:
+    def _find(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> Contacts:
         """Contacts of what comes together within the step; see `_moved`."""
         model, data, n = self._model, self._data, self._count
         q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)

@@ -70,7 +70,7 @@ class Planes:
         if not len(self.stand) or not len(self.corners):
             return []
         found = []
-        for number, (stand, normal) in enumerate(zip(self.stand, self.normal, strict=True)):
+        for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
             high = (bodies.place - ways[stand]) @ normal
             near = np.flatnonzero((high < self.extent + reach + speeds[stand])[self.of])
             of = self.of[near]

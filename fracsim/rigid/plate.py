@@ -123,8 +123,22 @@ class Plates:
     def stress(self, u: Values, young: float, poisson: float, thickness: float) -> Values:
         """(n, 2, 3) stress (xx, yy, xy) in the axes of the triangles on both faces, below and above, in their middles,
         Pa, of unknowns (n, 3, 6) in the axes of space."""
-        C, own = plane_stress(young, poisson), self.to_plane(u)
-        strain = np.einsum("naj,nj->na", self.membrane(), own)
-        bent = np.einsum("naj,nj->na", self.bending(self.turning(), np.full(3, 1 / 3)), own)
-        faces = np.stack([strain - thickness / 2 * bent, strain + thickness / 2 * bent], axis=1)
-        return np.asarray(faces @ C)
+        return self.stressing(young, poisson, thickness).of(u)
+
+    def stressing(self, young: float, poisson: float, thickness: float) -> Stressing:
+        """What makes `stress` of unknowns."""
+        C, bent = plane_stress(young, poisson), self.bending(self.turning(), np.full(3, 1 / 3))
+        both = np.stack([self.membrane() - thickness / 2 * bent, self.membrane() + thickness / 2 * bent], axis=1)
+        both = (C @ both).reshape(-1, 6, 6, 3)
+        return Stressing(np.einsum("nckb,nbj->nckj", both, self.axes).reshape(-1, 6, 18))
+
+
+@dataclass(frozen=True)
+class Stressing:
+    """(n, 6, 18) from unknowns (n, 18) in the axes of space to stress on both faces."""
+
+    matrix: Values
+
+    def of(self, u: Values, chosen: Ints | slice = slice(None)) -> Values:
+        """(k, 2, 3) of chosen triangles, of their unknowns (k, 3, 6)."""
+        return np.asarray((self.matrix[chosen] @ u.reshape(-1, 18, 1)).reshape(-1, 2, 3))

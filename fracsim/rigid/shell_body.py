@@ -35,10 +35,11 @@ class ShellStiffness:
 
     def __init__(self, stress: Stress, shell: Shell, young: float, poisson: float, density: float) -> None:
         """Of one material; `density`: kg/m^3."""
-        self.stress, self.shell, self._young, self._poisson = stress, shell, young, poisson
+        self.stress, self.shell = stress, shell
         self.nodes = shell.middle[: len(shell.middle) // 2]
         self.plates = Plates.of(self.nodes[shell.triangles])
         self._each = self.plates.stiffness(young, poisson, shell.thickness)
+        self._stressing = self.plates.stressing(young, poisson, shell.thickness)
         self.weight = density * shell.thickness * self.plates.area
         domain = stress.domain
         assert domain.source is not None
@@ -87,13 +88,12 @@ class ShellStiffness:
     def tensor(self, u: Values, share: Values) -> Values:
         """(cells, 6) stress of displacements and rotations u (n, 6) in the cells with a share, 0 in all others, Pa."""
         mine = np.flatnonzero(self.of_triangles(share))
-        plates = Plates(*(each[mine] for each in vars(self.plates).values()))
-        faces = plates.stress(u[self.shell.triangles[mine]], self._young, self._poisson, self.shell.thickness)
+        faces = self._stressing.of(u[self.shell.triangles[mine]], mine)
         mean, apart = (faces[:, :, 0] + faces[:, :, 1]) / 2, (faces[:, :, 0] - faces[:, :, 1]) / 2
         tension = mean + np.hypot(apart, faces[:, :, 2])
         flat = np.take_along_axis(faces, tension.argmax(axis=1)[:, None, None], axis=1)[:, 0]
         in_plane = flat[:, [0, 2, 2, 1]].reshape(-1, 2, 2)
-        axes = plates.axes[:, :2]
+        axes = self.plates.axes[mine, :2]
         sigma = np.einsum("nai,nab,nbj->nij", axes, in_plane, axes)
         result = np.zeros((len(self.plates.area), 6))
         result[mine] = np.stack([sigma[:, i, j] for i, j in SYMMETRIC_COMPONENTS[3]], axis=1)
