@@ -51,11 +51,11 @@ class Engine:
         rules: Rules,
         overlaps: Overlaps | None = None,
         names: Ints | None = None,
-        outer: Sequence[Ints] | None = None,
+        outer: Sequence[Values] | None = None,
         turn: Values | None = None,
     ) -> None:
-        """`parts`: convex parts of each body, of whose corners those `outer` are outermost (None: any may be), turned
-        by `turn` (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers."""
+        """`parts`: convex parts of each body, `outer`: its outermost points (None: all corners), both turned by `turn`
+        (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers."""
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
         self._data = mujoco.MjData(self._model.made)

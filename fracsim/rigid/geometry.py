@@ -19,7 +19,7 @@ from .placing import Poses
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-_Kept = tuple[tuple[int, int, float], list[Values], Ints]
+_Kept = tuple[tuple[int, int, float], list[Values], Values]
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Shapes:
         names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
         parts: corners (m, 3) of the convex parts of each about its centre, in the axes of the mesh, m; copies that are
         whole share theirs.    turn: (n, 3, 3) from these axes to those of the body at rest.
-        outer: of all corners of a body, those (k,) outermost.
+        outer: (k, 3) the outermost points of each, likewise.
     """
 
     names: Ints
@@ -38,7 +38,7 @@ class Shapes:
     piece_of_node: Ints
     parts: list[list[Values]]
     turn: Values
-    outer: list[Ints]
+    outer: list[Values]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class _Copy:
     of: Moments
     piece_of_node: Ints
     parts: list[list[Values]]
-    outer: list[Ints]
+    outer: list[Values]
 
 
 class Geometry:
@@ -100,9 +100,9 @@ class Geometry:
         same = [before.get(name) for name in map(int, names)]
         new = [each for each, key in enumerate(keys) if same[each] is None or same[each][0] != key]
         for each, parts in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
-            few = self._in_clusters(made)
-            outer = np.arange(sum(map(len, parts))) if few else outermost(parts)
-            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outer
+            points = made.points[np.unique(made.elements[piece == each])] if self._in_clusters(made) else None
+            outer = outermost(np.concatenate(parts) if points is None else points)
+            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outer - of.centre[each]
         after = {int(name): kept for name, kept in zip(names, same, strict=True) if kept is not None}
         self._hulls[number] = after
         _, parts, outer = zip(*(after[int(name)] for name in names), strict=True)

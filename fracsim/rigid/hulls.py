@@ -137,14 +137,12 @@ def convex_parts(body: Solid, edge: float = 0.0, most: int = PARTS) -> list[Valu
     return [thickened(hull.corners) for *_, hull in heap]
 
 
-def outermost(parts: list[Values]) -> Ints:
-    """Which of the corners of all parts of a body, one after the other, are corners of their common hull: no other is
-    the first to touch a plane."""
-    corners = np.concatenate(parts)
+def outermost(points: Values) -> Values:
+    """(k, 3) those of points (n, 3) that are corners of their hull: no other is the first to touch a plane."""
     try:
-        return np.sort(ConvexHull(corners).vertices).astype(np.int64)
+        return np.asarray(points[np.sort(ConvexHull(points).vertices)])
     except (QhullError, ValueError):
-        return np.arange(len(corners))
+        return points
 
 
 def _halved(part: Solid) -> list[tuple[Solid, Hull]]:

@@ -89,10 +89,10 @@ def model_of(
     parts: Sequence[Sequence[Part]],
     stands: Sequence[Stand],
     rules: Rules,
-    outer: Sequence[Ints] | None = None,
+    outer: Sequence[Values] | None = None,
     turn: Values | None = None,
 ) -> Model:
-    """Of bodies of these convex parts, turned by `turn` (n, 3, 3), corners of which may be `outer`. What several bodies
+    """Of bodies of these convex parts and `outer` points, turned by `turn` (n, 3, 3). What several bodies
     share is made once. MuJoCo numbers the geoms of what stands still first."""
     mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
     turn = np.tile(np.eye(3), (len(bodies), 1, 1)) if turn is None else turn
@@ -115,7 +115,8 @@ def model_of(
         flat = stand.shape.kind == "plane"
         _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat)
     first = len(fixed) + np.searchsorted(things, np.arange(count))
-    thing, extent = [count + number for number in fixed] + things, _extents(parts)
+    thing = [count + number for number in fixed] + things
+    extent = _extents(parts if outer is None else [[*each, more] for each, more in zip(parts, outer, strict=True)])
     planes = _planes(parts, stands, np.array(thing, np.int64), first, outer, turn, extent)
     spec.memory = max(LEAST_MEMORY, MEMORY * len(thing))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
@@ -124,25 +125,23 @@ def model_of(
 
 
 def _planes(
-    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Ints] | None,
+    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Values] | None,
     turn: Values, extent: Values,
 ) -> Planes:  # fmt: skip
-    """Planes among what stands, and the corners of all hulls, or the outermost ones, in the axes of bodies."""
+    """Planes among what stands, and the outermost points of bodies, of the first of their parts, or all corners."""
     stand = np.array([number for number, each in enumerate(stands) if each.shape.kind == "plane"], np.int64)
     normal = np.array([stands[number].shape.turn[:, 2] for number in stand]).reshape(-1, 3)
     hulls = [(number, first[number] + place, each) for number, part in enumerate(parts)
              for place, each in enumerate(part) if not isinstance(each, Primitive)]  # fmt: skip
+    if outer is not None:
+        hulls = [(number, first[number], each) for number, each in enumerate(outer)]
     corners = np.concatenate([np.empty((0, 3)), *(each for *_, each in hulls)])
     sizes = [len(each) for *_, each in hulls]
     of, part = (np.repeat(np.array([each[k] for each in hulls], np.int64), sizes) for k in (0, 1))
     corners = np.einsum("kij,kj->ki", turn[of], corners)
     geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
     friction = np.array([stands[k].friction for k in stand])
-    if outer is None:
-        return Planes(stand, geom, normal, friction, corners, of, part, extent)
-    begin = np.searchsorted(of, np.arange(len(parts)))
-    kept = np.concatenate([np.empty(0, np.int64), *(each + k for each, k in zip(outer, begin, strict=True))])
-    return Planes(stand, geom, normal, friction, corners[kept], of[kept], part[kept], extent)
+    return Planes(stand, geom, normal, friction, corners, of, part, extent)
 
 
 def plane_contact(normal: Values, friction: float, rules: Rules) -> Any:
