@@ -27,6 +27,7 @@ from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, make_study
 from support.squares import KINDS, square
 from support.tearing import RUNS
+from support.tips import criterion_of, run_when_ready, seen, tips
 
 Values = npt.NDArray[np.float64]
 
@@ -158,19 +159,11 @@ def test_the_force_of_a_known_field(kind: str) -> None:
     the tip is somewhere in its cell, the crack as wide as those it cuts, and the field that of no mesh, at any h."""
     study = make_study(**plate_tables(), crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
     scene = scene_on(distribute(MPI.COMM_SELF, square(kind, 30)), study)
-    graph, criterion = scene.fracture.graph, scene.fracture.criterion
-    tips = np.flatnonzero(graph.damaged & ~graph.split)
-    _, point = criterion._entries(tips)
+    point = tips(scene)
     for first, second in ((1.0, 0.0), (0.0, 1.0), (1.0, 0.4)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.displace(u.ravel())
-        stress, psi = scene.fracture.evaluate()
-        force = (
-            criterion.sight.look(stress, psi, point, point, criterion.cut).forces(
-                point, criterion.disc * criterion._h[tips]
-            )[0]
-            * STIFF
-        )
+        force = seen(scene).forces()[0] * STIFF
         expected = np.array([first**2 + second**2, -2 * first * second])
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
 
@@ -204,18 +197,13 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
     30 degrees off."""
     study = make_study(**plate_tables(), crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
     scene = scene_on(distribute(MPI.COMM_SELF, square(kind, 30)), study)
-    graph, criterion = scene.fracture.graph, scene.fracture.criterion
-    tips = np.flatnonzero(graph.damaged & ~graph.split)
-    _, point = criterion._entries(tips)
+    criterion, point = criterion_of(scene), tips(scene)
     for first, second in ((1.0, 0.5), (1.0, 1.0), (0.0, 1.0)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.displace(u.ravel())
-        seen = criterion.sight.look(*scene.fracture.evaluate(), point, point, criterion.cut)
-        radius = criterion.disc * criterion._h[tips]
-        mean, _ = seen.averages(point, radius)
-        back, _ = seen.behind(point, radius, 0 * radius)
-        force = seen.forces(point, radius)
-        released, ahead = criterion._turned(mean, point - back, force)
+        now = seen(scene)
+        along = point - now.tips.behind
+        released, ahead = criterion._turned(now.means(np.array([0]), whole=True), along, now.forces())
         psi = np.arctan2([second], [first])
         angle = np.arctan2(ahead[0, 1], ahead[0, 0])
         assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=5)
@@ -228,11 +216,11 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
 
 def torn(scene: Scene) -> Iterator[tuple[float, float, Any]]:
     """(reaction in N/m, tip's x in m, state) of each step."""
-    state, criterion, graph = scene.start(), scene.fracture.criterion, scene.fracture.graph
+    state = scene.start()
     while not scene.ended(state):
         state, _ = scene.stepper.advance(state)
-        tips = np.flatnonzero(graph.damaged & ~graph.split)
-        yield scene.probes()[1], float(criterion._entries(tips)[1][0, 0]) if len(tips) else np.nan, state
+        found = tips(scene)
+        yield scene.probes()[1], float(found[0, 0]) if len(found) else np.nan, state
 
 
 def notched(kind: str, n: int, end: float = 31.0) -> Scene:
@@ -278,9 +266,9 @@ def test_event_by_event_the_crack_takes_its_energy(kind: str, n: int, monkeypatc
     criterion, state, rows = scene.fracture.criterion, scene.start(), []
     criterion.toughness, scene.fracture.passes, forces = 1e-30, 1, Seen.forces
 
-    def watched(seen: Seen, points: Values, radius: Values) -> Values:
-        found = forces(seen, points, radius)
-        rows.append([scene.balance.stress.stored(), *points[0], np.linalg.norm(found[0])])
+    def watched(seen: Seen) -> Values:
+        found = forces(seen)
+        rows.append([scene.balance.stress.stored(), *seen.tips.point[0], np.linalg.norm(found[0])])
         return np.asarray(found)
 
     monkeypatch.setattr(Seen, "forces", watched)
@@ -383,15 +371,8 @@ def run_of_a_strip(ratio: float, scheme: str, kind: str, n: int) -> tuple[float,
         time={"scheme": scheme, "step": (0.1 if scheme == "explicit" else 0.5) / n / shear, "end": end},
     )  # fmt: skip
     scene = build_scene(MPI.COMM_SELF, study)
-    criterion, graph, state, seen = scene.fracture.criterion, scene.fracture.graph, scene.start(), [(0.0, 1.0)]
-    criterion.toughness = np.inf
-    while not scene.ended(state):
-        state, report = scene.stepper.advance(state)
-        criterion.toughness = 1.0 if state.t > ready else np.inf
-        tips = np.flatnonzero(graph.damaged & ~graph.split)
-        if report.broken and len(tips):
-            seen.append((state.t - ready, float(criterion._entries(tips)[1][:, 0].max())))
-    t, x = np.array(seen).T
+    t, places = run_when_ready(scene, ready)
+    t, x = np.append(0.0, t), np.array([1.0, *(each[:, 0].max() for each in places)])
     steady = (x > 1.3) & (x < 2.5)
     return float(x[-1]) - 1, float(np.polyfit(t[steady], x[steady], 1)[0]) / rayleigh if steady.sum() > 5 else 0.0
 

@@ -15,6 +15,7 @@ from fracsim.fracture.energy.tips import NEAR_TIP
 from fracsim.mesh.simplices import is_split
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
+from support.tips import criterion_of, run_when_ready, seen
 
 Values = npt.NDArray[np.float64]
 
@@ -92,11 +93,7 @@ def test_the_mean_square_in_a_ball() -> None:
 def forces(scene: Scene) -> Values:
     """(tips,) G in J/m^2 after one step."""
     scene.stepper.advance(scene.start())
-    criterion, graph = scene.fracture.criterion, scene.fracture.graph
-    tips = np.flatnonzero(graph.damaged & ~graph.split)
-    _, point = criterion._entries(tips)
-    seen = criterion.sight.look(*scene.fracture.evaluate(), point, point, criterion.cut)
-    return np.asarray(np.linalg.norm(seen.forces(point, criterion.disc * criterion._h[tips]), axis=1))
+    return np.asarray(np.linalg.norm(seen(scene).forces(), axis=1))
 
 
 def plate(n: int, motion: dict[str, Any], end: float) -> Scene:
@@ -192,15 +189,9 @@ def run_of_a_strip(ratio: float, scheme: str) -> tuple[float, float, float]:
         time={"scheme": scheme, "step": (0.1 if scheme == "explicit" else 0.5) / n / shear,
               "end": ready + 2 / rayleigh},
     )  # fmt: skip
-    criterion, graph, state, seen = scene.fracture.criterion, scene.fracture.graph, scene.start(), [(0.0, 1.0)]
-    criterion.toughness = np.inf
-    while not scene.ended(state):
-        state, report = scene.stepper.advance(state)
-        criterion.toughness = 1.0 if state.t > ready else np.inf
-        tips = np.flatnonzero(graph.damaged & ~graph.split)
-        if report.broken and len(tips):
-            seen.append((state.t - ready, float(np.median(criterion._entries(tips)[1][:, 0]))))
-    t, x = np.array(seen).T
+    t, places = run_when_ready(scene, ready)
+    t, x = np.append(0.0, t), np.array([1.0, *(np.median(each[:, 0]) for each in places)])
     steady = (x > 1.2) & (x < 2.2)
     speed = float(np.polyfit(t[steady], x[steady], 1)[0]) if steady.sum() > 3 else 0.0
-    return float(x.max()) - 1, speed / rayleigh, float((criterion.sight.centres[graph.split][:, 2] - at).std())
+    crack = criterion_of(scene).sight.crack
+    return float(x.max()) - 1, speed / rayleigh, float((crack.centre[crack.split, 2] - at).std())

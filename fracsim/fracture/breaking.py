@@ -77,12 +77,13 @@ class Breaking:
         pace: float | None = None,
         joining: Joining | None = None,
     ) -> None:
-        """`pace`: most passes a second, in place of `passes`; `joining`: which of the failing edges hold nodes that
-        would be crumbs (collective)."""
+        """`pace`: passes a second, in place of `passes`: in short steps not one in each; `joining`: which of the failing
+        edges hold nodes that would be crumbs (collective)."""
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.not_finite, self.opened, self._pace, self._joining = 0, opened, pace, joining
+        self._due = True
         if opened is not None:
             self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
@@ -109,6 +110,7 @@ class Breaking:
         self.degradation.begin(t, dt)
         if self._pace is not None:
             self.passes = max(1, math.ceil(self._pace * dt))
+            self._due = math.floor(self._pace * (t + dt)) > math.floor(self._pace * t)
 
     def moving(self, v: Values, a: Values) -> None:
         """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
@@ -117,11 +119,7 @@ class Breaking:
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
         stress, psi = self.evaluate()
-        edges, load = self.criterion(stress, psi)
-        if self._joining is not None:
-            fail = self._joining(edges, stress)
-            edges, load = edges[fail], load[fail]
-        broken, weakened = self._weaken(edges, load)
+        broken, weakened = self._broken(stress, psi) if self._due else (0, 0)
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
         before = [each.x.array.copy() for each in self.stress.fields] if broken else []
@@ -129,6 +127,14 @@ class Breaking:
         if weakened or lost.loss:
             self.changed()
         return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died, before)
+
+    def _broken(self, stress: Values, psi: Values) -> tuple[int, int]:
+        """Weaken what fails: how many edges broke, and how many lost anything (collective)."""
+        edges, load = self.criterion(stress, psi)
+        if self._joining is not None:
+            fail = self._joining(edges, stress)
+            edges, load = edges[fail], load[fail]
+        return self._weaken(edges, load)
 
     def _weaken(self, edges: npt.NDArray[np.integer], load: Values) -> tuple[int, int]:
         """Give edges (n,) under a load (n,), in units of their strength, what the law leaves them.

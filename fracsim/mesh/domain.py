@@ -179,7 +179,10 @@ class Domain:
         return with_middles(self.source, self.middles, written=True)
 
     def with_ghosts(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(owned and ghost dofs,) values from those of the owned dofs of the displacement space (collective)."""
+        """(owned and ghost dofs,) values from those of the owned dofs of the displacement space, not to be written to
+        (collective)."""
+        if self.comm.size == 1:
+            return owned
         result = fem.Function(self.space)
         result.x.array[: len(owned)] = owned
         result.x.scatter_forward()

@@ -124,9 +124,12 @@ class EdgeGraph:
         Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
         apart. Mechanics do not change: chi of its cells is 0 and they enter no average. What is `kept` is not broken.
         """
+        apart = np.zeros(len(self.broken), bool)
+        apart[self.cell_edges[self.split]] = True
+        may = self.on_any_rank(apart & ~self.broken)
         carried = np.zeros(len(self.broken), bool) if self.kept is None else self.kept.copy()
-        carried[self.cell_edges[~self.split]] = True
-        return self.break_edges(~self.on_any_rank(carried))
+        carried[self.cell_edges[may[self.cell_edges].any(axis=1) & ~self.split]] = True
+        return self.break_edges(may & ~self.on_any_rank(carried))
 
     @property
     def broken_count(self) -> int:
@@ -190,16 +193,28 @@ class EdgeGraph:
 
     def find_keys(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Local edges whose keys are among the (n, 2) sorted ones, and the row of each of them there."""
-        own = self.edge_keys(np.arange(len(self.broken)))
-        factor = np.array([int(max(keys.max(initial=0), own.max(initial=0))) + 1, 1])
-        known, wanted = keys @ factor, own @ factor
-        place = np.searchsorted(known, wanted)
-        local = np.flatnonzero(place < len(known))
-        local = local[known[place[local]] == wanted[local]]
-        return local, place[local]
+        known, order = self._by_key
+        wanted = _one_number(keys)
+        at = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+        place = np.flatnonzero(known[at] == wanted) if len(known) else np.empty(0, np.int64)
+        local = order[at[place]]
+        rising = np.argsort(local)
+        return local[rising], place[rising]
+
+    @cached_property
+    def _by_key(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """(edges,) keys of owned and ghost edges as one number each, rising, and the local edges."""
+        keys = _one_number(self.edge_keys(np.arange(len(self.broken))))
+        order = np.argsort(keys)
+        return keys[order], order
 
     def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """(edges,) flags of the local edges whose keys are among those given, in any order."""
         flags = np.zeros(len(self.broken), bool)
         flags[self.find_keys(keys[np.lexsort(keys.T[::-1])])[0]] = True
         return flags
+
+
+def _one_number(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(n,) keys (n, 2) as one number each, in the same order."""
+    return np.asarray((keys[:, 0] << 32) + keys[:, 1], np.int64)

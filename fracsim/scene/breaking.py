@@ -72,7 +72,7 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     tips = CrackTips(stress, graph, strength, toughness, opened)
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
-    pace = tips.pace() if moves and balance.scheme.implicit and not given else None
+    pace = tips.pace() if moves and not given else None
     kind = ClosingSplitting if stress.closes else Splitting
     splitting = kind(stress, graph, tips.release_rate() if moves else None)
     return Breaking(stress, graph, tips, passes=passes, opened=opened, degradation=splitting, pace=pace)

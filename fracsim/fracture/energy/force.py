@@ -13,7 +13,7 @@ def eshelby(psi: Values, H: Values, P: Values) -> Values:
 
     Eshelby (1951); psi and P as the cell has them, chi included.
     """
-    return np.asarray(psi[:, None, None] * np.eye(H.shape[1]) - np.einsum("nik,nil->nkl", H, P))
+    return np.asarray(psi[:, None, None] * np.eye(H.shape[1]) - H.transpose(0, 2, 1) @ P)  # einsum: four times the time
 
 
 def plateau(distance: Values, radius: Values) -> Values:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.spatial import cKDTree
 
 from ...mechanics.material import PerCell
 from ...mechanics.stress import Stress
@@ -26,6 +25,7 @@ from ..strength import Strength, hashed
 from .around import local_size
 from .cutting import Cuts, cleave, leave, through_centre
 from .mixed import gain, kink, phase
+from .neighbourhoods import Reach, Tips
 from .seen import Seen, Sight
 
 Flags = npt.NDArray[np.bool_]
@@ -92,7 +92,7 @@ class CrackTips:
         self.cut: Values = np.full(len(graph.broken), np.nan) if opened is None else opened.copy()
         self._h = local_size(domain)
         self.disc = DISC[domain.dim]
-        self.sight = Sight(stress, graph, self.disc * self._h, FULL * self._h)
+        self.sight = Sight(stress, graph, Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h))
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
@@ -100,18 +100,19 @@ class CrackTips:
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
-        graph = self._graph
-        tips = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        weak = np.flatnonzero(
-            ~graph.damaged & (frobenius_norm(stress, self._domain.dim) >= self.strength.weakest)
-        ).astype(np.int64)
-        weak = weak[upper_bound(tensors(stress[weak], self._domain.dim)) >= self.strength.weakest]
-        if not total(self._domain.comm, len(tips) + len(weak))[0]:
+        tips = self.tips()
+        weak = self._weak(stress)
+        found, begun = total(self._domain.comm, np.array([len(tips), len(weak)]))
+        proposals = [self._grown(self.sight.look(stress, psi)) if found else self._none(0)]
+        proposals.append(self._begun(weak, stress) if begun else self._none(1))
+        if not found + begun:
             return np.empty(0, np.int64), np.empty(0)
-        entry, point = self._entries(tips)
-        seen = self.sight.look(stress, psi, point, self.sight.centres[weak], self.cut)
-        edges = self._cut(*self._chosen(self._grown(seen, tips, entry, point), self._begun(seen, weak)))
+        edges = self._cut(*self._chosen(*proposals))
         return edges, np.ones(len(edges))
+
+    def tips(self) -> Tips:
+        """Those of this rank (collective)."""
+        return self.sight.follow(self.cut)
 
     def moving(self, v: Values, a: Values) -> None:
         """The body moves so: (owned dofs,) in m/s and m/s^2."""
@@ -142,31 +143,29 @@ class CrackTips:
 
     # --- what is active ---
 
-    def _entries(self, tips: Ints) -> tuple[Ints, Values]:
-        """(n,) a local edge at which the crack came into each tip cell, and (n, d) where, m: the mean of all."""
-        return np.argmax(~self._graph.intact(tips), axis=1), self.sight.middles(tips, self.cut)
-
-    def _grown(self, seen: Seen, tips: Ints, entry: Ints, point: Values) -> Proposal:
+    def _grown(self, seen: Seen) -> Proposal:
         """Tips that advance."""
-        h, d = self._h[tips], self._domain.dim
-        radius = self.disc * h
-        force = seen.forces(point, radius)
-        mean, square = seen.averages(point, AVERAGE * h)
-        sigma = largest(mean)
-        behind, mature = seen.behind(point, radius, FULL * h)
+        tips, d = seen.tips, self._domain.dim
+        h, toughness = self._h[tips.cell], np.broadcast_to(self.toughness, len(self._h))[tips.cell]
+        force, mature = seen.forces(), tips.mature.copy()
         size, turns = np.linalg.norm(force, axis=1), np.zeros(len(tips), bool)
-        ahead = np.where(mature[:, None], force, point - behind)
+        ahead = np.where(mature[:, None], force, tips.point - tips.behind)
         if d == 2:
-            size, turned = self._turned(seen.averages(point, radius)[0], point - behind, force)
+            size, turned = self._turned(seen.means(np.arange(len(tips)), whole=True), tips.point - tips.behind, force)
             mature &= size > 0  # a force back is that of other tips in the disc
             turns = mature & np.any(turned, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
-        toughness = np.broadcast_to(self.toughness, len(self._h))[tips]
-        strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips] * toughness / (AVERAGE * h))
-        young = (sigma >= self._strength_of(tips)) | (np.sqrt(square) >= strained)
-        active = np.flatnonzero(np.where(mature, size >= toughness, young) & (sigma > 0))
-        rank = self._ranked(0, sigma[active], point[active], APART[d] * h[active])
-        return Proposal(rank, tips[active], mean[active], entry[active], ahead[active], turns[active])
+        may = np.flatnonzero(~mature | (size >= toughness))
+        mean = seen.means(may)
+        sigma = largest(mean)
+        active = (sigma > 0) & (mature[may] | (sigma >= self._strength_of(tips.cell[may])))
+        weak = np.flatnonzero(~active & (sigma > 0))
+        strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips.cell] * toughness / (AVERAGE * h))[may[weak]]
+        active[weak] = np.sqrt(seen.squares(may[weak])) >= strained
+        rows = may[active]
+        rank = self._ranked(0, sigma[active], tips.point[rows], APART[d] * h[rows])
+        entry = np.argmax(~self._graph.intact(tips.cell[rows]), axis=1)
+        return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows])
 
     @staticmethod
     def _turned(stress: Values, along: Values, force: Values) -> tuple[Values, Values]:
@@ -182,20 +181,29 @@ class CrackTips:
         straight = np.einsum("ni,ni->n", force, tangent)
         return np.where(length > 0, straight * gain(psi), np.linalg.norm(force, axis=1)), turned
 
-    def _begun(self, seen: Seen, weak: Ints) -> Proposal:
-        """Whole cells, farther than R from any crack, whose averaged stress reaches the strength."""
-        radius, d = self.disc * self._h[weak], self._domain.dim
-        if not len(weak):
-            return Proposal(np.empty((0, d + 4)), weak, np.empty((0, d, d)))
-        cracked = seen.cracked
-        if len(cracked):
-            far = cKDTree(cracked).query(self.sight.centres[weak])[0] > radius
-            weak, radius = weak[far], radius[far]
-        mean, _ = seen.averages(self.sight.centres[weak], AVERAGE * self._h[weak])
+    def _weak(self, stress: Values) -> Ints:
+        """Whole cells, farther than R from any crack, whose stress reaches the strength."""
+        graph, d, least = self._graph, self._domain.dim, self.strength.weakest
+        cells = np.flatnonzero(~graph.damaged & (frobenius_norm(stress, d) >= least)).astype(np.int64)
+        cells = cells[upper_bound(tensors(stress[cells], d)) >= least]
+        if len(cells) and len(self.sight.crack.number):
+            far = self.sight.crack.tree.query(self.sight.centres[cells])[0]
+            cells = cells[far > self.disc * self._h[cells]]
+        return cells
+
+    def _begun(self, weak: Ints, stress: Values) -> Proposal:
+        """Those of them whose averaged stress does (collective)."""
+        mean = self.sight.means_at(weak, stress)
         sigma = largest(mean)
         over = sigma >= self._strength_of(weak)
-        cells, sigma = weak[over], sigma[over]
-        return Proposal(self._ranked(1, sigma, self.sight.centres[cells], radius[over]), cells, mean[over])
+        cells = weak[over]
+        radius = self.disc * self._h[cells]
+        return Proposal(self._ranked(1, sigma[over], self.sight.centres[cells], radius), cells, mean[over])
+
+    def _none(self, kind: int) -> Proposal:
+        """Nothing of a kind."""
+        d, none = self._domain.dim, np.empty(0, np.int64)
+        return Proposal(np.empty((0, d + 4)), none, np.empty((0, d, d)), none, np.empty((0, d)), none > 0)
 
     def _strength_of(self, cells: Ints) -> Values:
         """(n,) Pa: the mean over the edges of each cell."""

@@ -1,0 +1,229 @@
+"""What lies around the tips: looked for only where cracks have changed, and kept until they do.
+
+A tip is a cell that is cut and has not come apart, at the mean of the places where its edges are cut. The cells around
+it, and their weights in its sums, are kept as long as it stays; the crack behind it as long as none of it changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from ...mesh.edges import EdgeGraph
+from ..brittle.principal import largest
+from .around import Around, pairs_within
+from .crack import Crack
+from .force import plateau, plateau_gradient
+from .front import Front, advance
+
+Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+LEAST_DISC = 3.0  # R over h is more: polygons reach as far as a cell beyond their cell's centre
+FACED = 0.1  # of R^2: area of the body's surface within a disc from which on it is there
+
+
+@dataclass(frozen=True)
+class Reach:
+    """(cells,) how far a tip in a cell looks, m: the `disc` of its force, where stress is averaged (`average`, no more
+    than that), and how far `beyond` the disc there is a crack once it is mature."""
+
+    disc: Values
+    average: Values
+    beyond: Values
+
+
+@dataclass(frozen=True)
+class Tips:
+    """Tips of this rank.
+
+    Attributes:
+        cell: (n,) local, rising.    pattern: (n,) of its cut edges.    point: (n, d) m.
+        behind: (n, d) the middle of the crack nearer than R, m.    mature: (n,) whether there is any beyond R.
+        ahead: (n, d) in space the crack that an advance makes, m; in the plane 0.
+        surface: (n, d) int q n dA of the body's own surface in the disc, m^2.
+    """
+
+    cell: Ints
+    pattern: npt.NDArray[np.uint8]
+    point: Values
+    behind: Values
+    mature: Flags
+    ahead: Values
+    surface: Values
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+
+class _Sum(IntEnum):
+    """Weights of a cell in the sums around a tip, behind its V grad q; all but the first are 0 of split cells."""
+
+    INSIDE = 0  # V q
+    MEAN = 1  # V (1 - r / radius of the average)
+    ALIKE = 2  # V
+    WHOLE = 3  # V (1 - r / R)
+
+
+class Neighbourhoods:
+    """The tips of this rank, and sums over the cells around them.
+
+    Attributes:
+        tips: as they were when `update` was called last.    asked: the cells around them.
+    """
+
+    def __init__(self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach) -> None:
+        self._around, self._crack, self._graph, self._front, self._reach = around, crack, graph, front, reach
+        none, nowhere = np.empty(0, np.int64), np.empty((0, graph.domain.dim))
+        self.tips = Tips(none, none.astype(np.uint8), nowhere, nowhere, none > 0, nowhere, nowhere)
+        self._split = np.zeros(len(around.number), bool)
+        # the tip and the cell (among those near) of each pair, and the cell's weights in the sums of `_Sum`
+        self._place: Ints = none
+        self._cell: Ints = none
+        self._weights: Values = np.empty((0, graph.domain.dim + len(_Sum)))
+        self._matrices: dict[int, csr_matrix] = {}
+
+    def update(self, cut: Values) -> None:
+        """Cracks have changed: look anew where they have (collective)."""
+        number, centre = self._crack.update(cut)
+        for cells, split in ((number, False), (self._crack.number[self._crack.split], True)):
+            place, near = self._around.those_of(cells)
+            self._split[place[near]] = split
+        fresh = self._look(cut)
+        self._look_back(np.flatnonzero(fresh | self._near(centre)))
+        needed = np.zeros(len(self._split), bool)
+        needed[self._cell] = True
+        cells = np.flatnonzero(needed)
+        self.asked = self._around.asked(cells)
+        index = np.cumsum(needed) - 1
+        ends = np.concatenate([[0], np.cumsum(np.bincount(self._place, minlength=len(self.tips)))])
+        self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._cell], ends
+        self._matrices.clear()
+
+    # --- sums ---
+
+    def forces(self, sigma: Values, push: Values) -> Values:
+        """(n, d) - sum V Sigma grad q + sum V q f over the discs of tips: Sigma (asked, d, d) in Pa and f (asked, d) in
+        N/m^3."""
+        d = sigma.shape[1]
+        force = self._matrix(d + _Sum.INSIDE) @ push
+        for axis in range(d):
+            force -= self._matrix(axis) @ sigma[:, :, axis]
+        return np.asarray(force)
+
+    def means(self, rows: Ints, stress: Values, *, whole: bool = False) -> Values:
+        """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, d, d) which have not come apart,
+        weighted by 1 - r over the radius of the average, or over that of the `whole` disc."""
+        d = stress.shape[1]
+        weights = self._matrix(d + (_Sum.WHOLE if whole else _Sum.MEAN))[rows]
+        sums = np.asarray(weights @ stress.reshape(-1, d * d)).reshape(-1, d, d)
+        return over(sums, np.asarray(weights.sum(axis=1)).reshape(-1, 1, 1))
+
+    def squares(self, rows: Ints, stress: Values) -> Values:
+        """(m,) mean square of the positive first principal stress around tips, all cells alike, Pa^2."""
+        weights = self._matrix(stress.shape[1] + _Sum.ALIKE)[rows]
+        cells = np.unique(weights.indices)
+        squares = np.zeros(len(stress))
+        squares[cells] = np.maximum(largest(stress[cells]), 0.0) ** 2
+        return over(weights @ squares, np.asarray(weights.sum(axis=1)).ravel())
+
+    def _matrix(self, column: int) -> csr_matrix:
+        """(tips, asked) weights, kept until cracks change."""
+        if column not in self._matrices:
+            data = self._weights[:, column]
+            if column > self._graph.domain.dim:
+                data = np.where(self._split[self._cell], 0.0, data)
+            matrix = csr_matrix((data, self._index, self._ends), shape=self._shape)
+            if column > self._graph.domain.dim:
+                matrix.eliminate_zeros()
+            self._matrices[column] = matrix
+        return self._matrices[column]
+
+    # --- what lies around ---
+
+    def _look(self, cut: Values) -> Flags:
+        """Find the tips, and the cells around those that are new: (n,) flags of these."""
+        graph, old = self._graph, self.tips
+        cell = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
+        before = np.full(graph.domain.cell_count, -1)
+        before[old.cell] = np.arange(len(old))
+        row = before[cell]
+        kept = row >= 0
+        kept[kept] = old.pattern[row[kept]] == graph.pattern[cell[kept]]
+        new = np.flatnonzero(~kept)
+        point = self._front.middles(cell, cut)
+        place, cells, weights, surface = self._surroundings(cell[new], point[new])
+        after = np.full(len(old), -1)
+        after[row[kept]] = np.flatnonzero(kept)
+        stays = np.flatnonzero(after[self._place] >= 0)
+        every = np.concatenate([after[self._place[stays]], new[place]])
+        order = np.argsort(every, kind="stable")
+        self._place, self._cell = every[order], np.concatenate([self._cell[stays], cells])[order]
+        self._weights = np.concatenate([self._weights[stays], weights])[order]
+        behind, ahead, surfaces = np.zeros((3, *point.shape))
+        mature = np.zeros(len(cell), bool)
+        surfaces[new] = surface
+        self.tips = Tips(cell, graph.pattern[cell], point, behind, mature, ahead, surfaces)
+        for now, then in ((behind, old.behind), (mature, old.mature), (ahead, old.ahead), (surfaces, old.surface)):
+            now[kept] = then[row[kept]]
+        return ~kept
+
+    def _surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
+        """Of tips: the tip and the cell of each pair, (pairs, d + 4) weights and (n, d) the surface in the discs."""
+        disc, average = self._reach.disc[cell], self._reach.average[cell]
+        pairs = self._around.pairs(point, disc)
+        volume, r, R = self._around.volumes[pairs.other], pairs.distance, disc[pairs.place]
+        slope = volume[:, None] * plateau_gradient(pairs.apart, R)
+        share = 1 - r / average[pairs.place]
+        columns = [plateau(r, R), np.maximum(share, 0.0), share > 0, 1 - r / R]
+        weights = np.column_stack([slope, *(volume * each for each in columns)])
+        return pairs.place, pairs.other, weights, pairs.sum(slope)
+
+    def _near(self, changed: Values) -> Flags:
+        """(n,) whether a tip sees any of the cells with these centres (m, d)."""
+        if not len(changed):
+            return np.zeros(len(self.tips), bool)
+        disc, beyond = self._reach.disc[self.tips.cell], self._reach.beyond[self.tips.cell]
+        apart = cKDTree(changed).query(self.tips.point)[0]
+        return np.asarray(apart <= np.maximum(disc + beyond, disc * (1 + 1 / LEAST_DISC)))
+
+    def _look_back(self, rows: Ints) -> None:
+        """Find the crack behind tips."""
+        tips, crack = self.tips, self._crack
+        point, disc = tips.point[rows], self._reach.disc[tips.cell[rows]]
+        full, split = disc + self._reach.beyond[tips.cell[rows]], np.flatnonzero(crack.split)
+        pairs = pairs_within(cKDTree(crack.centre[split]), point, np.maximum(full, disc * (1 + 1 / LEAST_DISC)))
+        cells, r = split[pairs.other], disc[pairs.place]
+        within = (pairs.distance < r).astype(float)
+        back = within[:, None] * (crack.middle[cells] - point[pairs.place])
+        tips.behind[rows] = point + over(pairs.sum(back), pairs.sum(within)[:, None])
+        tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < full[pairs.place]))
+        if point.shape[1] == 3:
+            sides = np.zeros((len(r), 3))
+            near = np.flatnonzero(pairs.distance < r * (1 + 1 / LEAST_DISC))
+            sides[near] = advance(crack.polygon[cells[near]], point[pairs.place[near]], r[near])
+            tips.ahead[rows] = along_the_surface(pairs.sum(sides), tips.surface[rows], disc)
+
+
+def along_the_surface(ahead: Values, surface: Values, radius: Values) -> Values:
+    """(n, 3) the crack that an advance of tips makes, m; along the body's `surface` where it ends there.
+
+    `surface`: (n, 3) int q n dA of the body, m^2: an advance across it would move the body's own surface. A front that
+    has the surface ahead goes for it.
+    """
+    size = np.linalg.norm(surface, axis=1)[:, None]
+    normal = np.divide(surface, size, out=np.zeros_like(surface), where=size > FACED * radius[:, None] ** 2)
+    along = ahead - np.einsum("nk,nk->n", ahead, normal)[:, None] * normal
+    turned = np.einsum("nk,nk->n", along, along) >= np.einsum("nk,nk->n", ahead, ahead) / 2
+    return np.where(turned[:, None], along, ahead)
+
+
+def over(sums: Values, weight: Values) -> Values:
+    """Sums over their weights; 0 where there is none."""
+    return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)
