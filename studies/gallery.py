@@ -58,7 +58,14 @@ ENTRIES = (
         tuple((f"cut-{each}", f"loaf {CUTS}{each}") for each in ("middle", "forces", "smooth")),
         "--view 1.1,-1.0,0.5 --zoom 1.4 --size 1400x1100",
     ),
+    one("bread", "Bread that flows before it tears (M22 fig. 15).", "--sheet 0,30,40,-1 --floor"),
     one("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
+    Entry(
+        "bar-2d-stress", "Shear stress as it tears: fading energy, and strain projected on intact edges (M22 fig. 9).",
+        (("bar-chi", "bar-2d --set time.end=0.11"),
+         ("bar-edge", "bar-2d --set time.end=0.11 --set material.energy=corotated --set fracture.approach=edge")),
+        "--field stress:xy --size 1100x600 --zoom 0.9",
+    ),
     one("notched-bar", "A bar bent over its notch, displacements ten times as large.", "--magnify 10"),
     one("cylinder", "Granite snapped beside its grips, cracks as lines that hardly open.", "--view 0.6,-1.6,0.5"),
     Entry(
@@ -76,7 +83,7 @@ ENTRIES = (
     one("wall", "A wall of adobe, struck and broken along its grains.", "--view 0.5,-1.6,0.5 --floor"),
     Entry(
         "hammered-vase", "The vase on a table, struck by a ball.",
-        (("hammered-vase", "hammered-vase --set mesh.h=0.008 --set time.end=2.6e-4"),),
+        (("hammered-vase", "hammered-vase --set mesh.h=0.008"),),
         "--view 0.55,-1.2,0.35 --floor --zoom 1.5",
     ),
     one("dropped-vase", "A vase dropped on a table that stands aslant.", "--view 0.4,-1.5,0.3 --zoom 1.2"),

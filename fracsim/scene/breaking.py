@@ -106,11 +106,11 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
 
 
 def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining | None:
-    """What nodes without a whole cell stay joined by. None with crumbs, nor where strain is projected on intact edges:
-    a node that hangs on one edge is held along it alone, and swings, and with a linear energy swells as it does."""
+    """What nodes without a whole cell stay joined by. None with crumbs, nor where cells are turned back before their
+    strain is projected: what hangs on one edge is held along it alone, has no rotation, and steps fail."""
     table = study.fracture
     assert table is not None
-    if table.crumbs or table.approach == "edge":
+    if table.crumbs or (table.approach == "edge" and study.material.energy == "corotated"):
         return None
     from ..fracture.joining import Joining
 
