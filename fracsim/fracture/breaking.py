@@ -77,8 +77,8 @@ class Breaking:
         pace: float | None = None,
         joining: Joining | None = None,
     ) -> None:
-        """`pace`: passes a second, in place of `passes`: in short steps not one in each; `joining`: which of the failing
-        edges hold nodes that would be crumbs (collective)."""
+        """`pace`: passes a second, in place of `passes`: in short steps not one in each; `joining`: which of the edges
+        that fail hold nodes that would be crumbs (collective)."""
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)

@@ -98,15 +98,15 @@ class Geometry:
         elements = np.bincount(piece, minlength=made.pieces)
         keys = [(int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")) for each in range(made.pieces)]
         same = [before.get(name) for name in map(int, names)]
-        new = [each for each, key in enumerate(keys) if same[each] is None or same[each][0] != key]
-        for each, parts in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
+        new = [at for at, (kept, key) in enumerate(zip(same, keys, strict=True)) if kept is None or kept[0] != key]
+        for each, hulls in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
             points = made.points[np.unique(made.elements[piece == each])] if self._in_clusters(made) else None
-            outer = outermost(np.concatenate(parts) if points is None else points)
-            same[each] = keys[each], [corners - of.centre[each] for corners in parts], outer - of.centre[each]
-        after = {int(name): kept for name, kept in zip(names, same, strict=True) if kept is not None}
-        self._hulls[number] = after
-        _, parts, outer = zip(*(after[int(name)] for name in names), strict=True)
-        return _Copy(pattern, names, of, made.piece_of_node, list(parts), list(outer))
+            far = outermost(np.concatenate(hulls) if points is None else points)
+            same[each] = keys[each], [corners - of.centre[each] for corners in hulls], far - of.centre[each]
+        found = [kept for kept in same if kept is not None]
+        self._hulls[number] = dict(zip(map(int, names), found, strict=True))
+        parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
+        return _Copy(pattern, names, of, made.piece_of_node, parts, outer)
 
     def _parts(self, made: Split, piece: Ints, chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
