@@ -176,6 +176,25 @@ def test_a_free_striker_faster_than_its_step_does_not_tunnel(mass: float) -> Non
     assert -105 < state.v.reshape(-1, 2)[:, 1].mean() < -mass / (mass + 0.1) * 95
 
 
+def test_a_ball_much_heavier_than_the_body_needs_no_shorter_steps() -> None:
+    """10,000 times the mass of a bar, by a barrier's distance a step: before a bar that has not given way yet it would
+    stop a hair's breadth away, and Newton's method would creep. It comes on as the bar lets it."""
+    mass = 1e4 * 1100 * 0.25
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.25], "h": 0.125}, solver={},
+        contact={"itself": False, "distance": 1e-3},
+        material={"energy": "neo-hookean", "young": 1e7, "poisson": 0.3, "density": 1100.0},
+        obstacle=[ball(radius=0.25, at=[0.47, 0.5015], velocity=[0.0, -10.0], mass=mass)],
+        time={"scheme": "backward-euler", "step": 1e-4, "end": 5e-4},
+    )  # fmt: skip
+    for report in each_step(scene, state):
+        assert report.dt == pytest.approx(1e-4)
+        assert report.solve.newton <= 20
+        assert told(scene)["gap_it"] > 0
+        np.testing.assert_allclose(momenta(scene, state)[0], [0.0, -10 * mass], atol=1e-9 * mass)
+    assert -20 < state.v.reshape(-1, 2)[:, 1].min() < -9  # what is below goes with it, or bounces off, at 2 v at most
+
+
 def test_a_weight_dropped_on_a_block_comes_to_rest() -> None:
     """Guided, on a damped block that is held: contact has given it m v + m g t in all, and carries m g in the end; what
     gravity did is stored, or gone."""

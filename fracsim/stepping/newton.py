@@ -250,6 +250,7 @@ class Solver:
         extended = self._extend() if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
         if self.balance.limits_steps:
             self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
+            self.balance.displace_to(self._x)  # terms look there for what is held back
         return extended
 
     def _solve_in_legs(self) -> tuple[int, int, bool]:

@@ -39,6 +39,8 @@ from .touch import Touch
 
 Values = npt.NDArray[np.float64]
 
+WALKS = 4  # until what is held back is let go, whatever it presses on
+
 
 class FreeObstacles(Flights):
     """Obstacles, at least one of them free.
@@ -62,6 +64,9 @@ class FreeObstacles(Flights):
         }
         self._scheme, self._mutual = scheme, Mutual(self.free, law.barrier) if len(self.free) > 1 else None
         self._settled_at: Values | None = None  # places of the points that poses belong to
+        self._begins = False  # whether Newton's method begins: nothing has given way to anything yet
+        self._waits = 0.0  # share of their way to where they belong that free obstacles are held back from
+        self._walks = 0  # on which they have been held back
         super().__init__(domain, u, obstacles, law)
 
     # --- a step ---
@@ -91,9 +96,33 @@ class FreeObstacles(Flights):
             self.x = self.skin.places(self._at_end())
             if not self.comm.allreduce(_same(self.x, self._settled_at), op=MPI.LAND):
                 self._settled_at = self.x
-                self._settle()
+                if self._begins:
+                    self._walk()
+                elif not self._waits:
+                    self._settle()
                 self._place()
         return super().touching()
+
+    def _walk(self) -> None:
+        """To where all belong, or as far as closes no gap by more than is safe: before a body that has not given way
+        yet what is heavy would come to rest a hair's breadth away, with a force that tells nothing (collective)."""
+        self._begins = False
+        began = {number: each.z for number, each in self.free.items()}
+        self._settle()
+        ways = {number: each.z - began[number] for number, each in self.free.items()}
+        arounds = self._arounds()
+        if self._mutual is not None:
+            share = self._mutual.free(arounds, began, ways)
+        else:
+            share = min(each.free(arounds[k], began[k], ways[k]) for k, each in self.free.items())
+        self._walks += 1
+        if self._walks == WALKS:
+            share = 1.0
+        self._waits = 1 - share
+        for number, each in self.free.items():
+            each.put(began[number] + share * ways[number])
+            if share < 1:
+                each.forget_push()
 
     def _settle(self) -> None:
         """All are where they belong with the points where they are now (collective)."""
@@ -150,9 +179,8 @@ class FreeObstacles(Flights):
 
     def low_rank(self) -> list[tuple[Values, Values]]:
         """Phi_xz and Phi_zz^-1 of each obstacle that is touched and under way (collective)."""
-        if not self._is_under_way():
+        if not self._is_under_way() or not (touches := self.touching()) or self._waits:
             return []
-        touches = self.touching()
         counts = total(self.comm, np.array([len(touches[number].points) for number in self.free]))
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
         if self._mutual is not None and touched:
@@ -200,6 +228,8 @@ class FreeObstacles(Flights):
     def _taken_along(self, moved: Values) -> list[Values]:
         """As Newton's method moves them together with the points (collective)."""
         ways, found = super()._taken_along(moved), self.touching()
+        if self._waits:
+            return ways
         if self._mutual is not None:
             every = self._mutual.taken_along(dict(enumerate(found)), self._arounds(), moved, exact=self._exact)
             for number, q in every.items():
@@ -213,7 +243,7 @@ class FreeObstacles(Flights):
         """(owned dofs,) a first guess that has passed through nothing on its way from the start: free obstacles stop,
         or the body with them, before they meet (collective)."""
         u, level = super().reachable(u), self._level
-        self._settled_at = None
+        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
         for each in self.free.values():
             each.forget_way()
         if not level.dt:
@@ -251,6 +281,21 @@ class FreeObstacles(Flights):
         apart = all(each.stops.are_open(each.placed.pose, placed) for each in self.free.values())
         return super().clear(u) and apart and (self._mutual is None or self._mutual.are_open())
 
+    def left(self) -> float:
+        """And that of free ones which are held back (collective)."""
+        if self._begins:
+            self.touching()
+        return max(super().left(), self._waits)
+
+    def go_on(self) -> None:
+        """Free obstacles as well (collective)."""
+        super().go_on()
+        if self._waits:
+            self.touching()
+            self._walk()
+            self._place()
+            self._touches = None
+
     def _go_on(self, x: Values) -> None:
         """As far as free obstacles let others."""
         rest, still = self._course.rest(), np.zeros_like(self._course.ways[0])
@@ -263,7 +308,7 @@ class FreeObstacles(Flights):
         for each in self.free.values():
             each.stay()
         self._place()
-        self._settled_at = None
+        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
         super().hold_back()
 
 

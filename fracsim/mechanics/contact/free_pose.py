@@ -130,6 +130,10 @@ class FreePose:
         z, self._settled = self.step.settle(z, partial(self.push, around), partial(self.free, around))
         self.put(z)
 
+    def forget_push(self) -> None:
+        """It was put elsewhere than it was settled."""
+        self._settled = None
+
     def is_open(self, around: Around) -> bool:
         """Whether it lies in nothing (collective)."""
         return around.is_open(self.placed) and self.stops.are_open(self.placed.pose, around.placed)

@@ -78,6 +78,10 @@ class Mutual:
         found, self._settled = self.together.settle(z, partial(self._pushes, around), partial(self._safe, around))
         self._put(found)
 
+    def free(self, arounds: Mapping[int, Around], z: Mapping[int, Values], dz: Mapping[int, Values]) -> float:
+        """Share of the ways from z by dz, by numbers, that closes no gap, with the body where it is (collective)."""
+        return self._safe(*([each[number] for number in self._free] for each in (arounds, z, dz)))
+
     def _put(self, z: Sequence[Values]) -> None:
         for each, way in zip(self._each, z, strict=True):
             each.put(way)

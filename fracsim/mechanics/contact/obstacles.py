@@ -170,7 +170,8 @@ class Obstacles(Touching, Term):
 
     def go_on(self) -> None:
         """The rest of the way, or as far as the body where it is now lets them (collective)."""
-        if self.left():
+        self._tangent_at = None
+        if self._course.left:
             self.touching()
             self._go_on(self.x)
 
