@@ -214,6 +214,28 @@ def test_ties_come_back_with_a_state_and_from_a_checkpoint() -> None:
     np.testing.assert_array_equal(other.ties.weights, was.weights)
 
 
+def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the places that no cell couples, and the same where the body's share of the tangent is kept."""
+    scene, state, tethers = tied(2)
+    balance = scene.balance
+    balance.begin(0.1, 0.1, state.u, state.v, state.a)
+    K = balance.tangent
+    balance.assemble_tangent(K)
+    once = K.convert("dense").getDenseArray().copy() if K.comm.size == 1 else None
+    assert once is not None and not balance.couples
+    added = tethers.coupling()
+    assert added is not None
+    # a node and a corner of its cell that share no cell: nothing but the tie is there
+    node, *corners = (int(np.flatnonzero(scene.domain.node_input == n)[0]) for n in tethers.ties.nodes[0])
+    apart = [c for c in corners if not (scene.domain.cell_nodes[:, :, None] == [node, c]).any(axis=1).all(axis=1).any()]
+    assert apart
+    for corner in apart:
+        assert once[2 * node, 2 * corner] == added.getValue(2 * node, 2 * corner) != 0.0
+    monkeypatch.setattr(type(balance), "_serves", lambda self, small: True)
+    balance.assemble_tangent(K)
+    np.testing.assert_array_equal(K.convert("dense").getDenseArray(), once)
+
+
 def test_what_a_tie_stored_is_booked_as_lost_when_its_cell_comes_apart() -> None:
     scene, state, tethers = tied(2)
     scene.balance.displace(state.u + 0.05 * np.random.default_rng(4).standard_normal(len(state.u)))

@@ -56,7 +56,7 @@ class Balance:
         pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
         springs: the rest of what it lacks.
-        couples: whether terms coupled dofs of different cells in the last tangent.
+        couples: whether terms coupled dofs of different cells in the last tangent otherwise than by constants.
         moves: how often u has been put elsewhere.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
@@ -81,6 +81,7 @@ class Balance:
         self.motion, self.mass, self.scheme, self.blow = motion, mass, scheme, Blow.of(scheme)
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
+        self._mixed = False  # whether what is no constant has been added to the tangent's own entries
         self._touches = True  # whether the tangent has contact in it
         self._positive: Positive | None = None
         self.low_rank: list[tuple[Values, Values]] = []
@@ -269,13 +270,14 @@ class Balance:
         """
         if self.linear and self._is_assembled(K, small):
             return
-        if not self._serves(small):
+        served = self._serves(small)
+        if not served:
             self._assemble_body(K, small)
         self.springs, self.couples = [], False
         for term in self.terms:
             term.add_stiffness(K)
-            if self._touches and (coupling := term.coupling()) is not None:
-                self._couple(K, coupling)
+            if self._touches and (coupling := term.coupling()) is not None and not (served and term.linear):
+                self._couple(K, coupling, constant=term.linear)
         self.low_rank = [part for term in self.terms for part in term.low_rank()] if self._touches else []
         for U, _ in self.low_rank:
             U[self.motion.owned] = 0.0
@@ -284,6 +286,7 @@ class Balance:
         """What K has without terms that add to it."""
         if self._coupled:
             K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
+        self._mixed = False
         self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
@@ -295,7 +298,7 @@ class Balance:
         While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier. And
         while they come into touch, one after another, a correction is found again and again.
         """
-        if self._body_at is None or self._coupled or not self.couples or self._body_at[0] != small:
+        if self._body_at is None or self._mixed or not self.couples or self._body_at[0] != small:
             return False
         if self._went < CUT_SHORT:
             return True
@@ -336,9 +339,10 @@ class Balance:
         yield
         self._touches = True
 
-    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat | Stiff) -> None:
-        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it (collective)."""
-        self.couples = True
+    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat | Stiff, *, constant: bool) -> None:
+        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it. What is
+        `constant` stays in K while the body's share does (collective)."""
+        self.couples |= not constant
         if isinstance(coupling, Stiff):
             coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
             coupling.directions[self.motion.owned] = 0.0
@@ -349,7 +353,7 @@ class Balance:
         part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
         K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         part.destroy()
-        self._coupled = True
+        self._coupled, self._mixed = True, self._mixed or not constant
         self.pattern_changed |= bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
 
     @cached_property
