@@ -80,7 +80,8 @@ class Mutual:
 
     def free(self, arounds: Mapping[int, Around], z: Mapping[int, Values], dz: Mapping[int, Values]) -> float:
         """Share of the ways from z by dz, by numbers, that closes no gap, with the body where it is (collective)."""
-        return self._safe(*([each[number] for number in self._free] for each in (arounds, z, dz)))
+        numbers = list(self._free)
+        return self._safe([arounds[k] for k in numbers], [z[k] for k in numbers], [dz[k] for k in numbers])
 
     def _put(self, z: Sequence[Values]) -> None:
         for each, way in zip(self._each, z, strict=True):
