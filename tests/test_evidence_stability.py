@@ -337,7 +337,22 @@ def test_section_of_dependence() -> None:
     spread, every = section.tables
     assert spread.rows == (("bar-local", 3, 1.0, 1.0, 1.0, 1.0),)
     assert len(every.rows) == 4 and every.rows[3][3] == "out of time"
-    assert section.plots[0].series[0].y == (1.0, 2.0, 3.0)
+    assert section.plots[0].series[0].y == (1.0, 2.0, 3.0) and len(section.plots) == 2
+
+
+def test_plates_before_and_with_an_energy() -> None:
+    """One figure of what they carry, one of their cracks, from side to side, without that of the average."""
+    line = dependence.path(np.array([0.3, 0.1, 0.2]), np.array([3.0, 1.0, 2.0]))
+    assert line == [[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]]
+    assert len(dependence.path(np.arange(1001.0), np.zeros(1001))) <= dependence.PLACES
+    settings, records = {"h": 1e-3, "pattern": "unstructured", "radius": 0.0}, []
+    for number, case in enumerate(("plate-local", "plate-averaged", "plate-energy")):
+        figures = dict.fromkeys(dependence.FIGURES, 1.0 + number) | {"path": line}
+        records.append(record(case, "1-mm", 1, figures=figures, settings=settings))
+    *_, peaks, paths = dependence.sections(records)[0].plots
+    assert [each.y for each in peaks.series] == [(1.0,), (2.0,), (3.0,)]
+    assert [each.label for each in paths.series] == ["plate-local, 1 mm", "plate-energy, 1 mm"]
+    assert paths.series[0].y == (1.0, 2.0, 3.0)
 
 
 # --- experiments ----------------------------------------------------------------------------------------------------

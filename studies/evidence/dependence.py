@@ -22,6 +22,7 @@ MESHES = (
     ("unstructured", 3.5e-4),
     ("structured", 2.5e-4),
 )
+PLACES = 200  # of a crack's path
 Record = dict[str, Any]
 
 
@@ -59,17 +60,17 @@ def _trial(name: str, pattern: str, h: float, radius: float) -> Trial:
 # --- what is measured -----------------------------------------------------------------------------------------------
 
 
-def broken_bar(run: Path) -> dict[str, float]:
+def broken_bar(run: Path) -> Record:
     """Figures of the bar."""
     return broken(run, slit.BAR)
 
 
-def broken_plate(run: Path) -> dict[str, float]:
+def broken_plate(run: Path) -> Record:
     """Figures of the plate."""
     return broken(run, slit.PLATE)
 
 
-def broken(run: Path, specimen: slit.Specimen) -> dict[str, float]:
+def broken(run: Path, specimen: slit.Specimen) -> Record:
     """Peak load, new surface, energy and path of the crack, all for a thickness of 1 m."""
     rows = results.history(run)
     area, centres = crack_faces(run)
@@ -83,7 +84,14 @@ def broken(run: Path, specimen: slit.Specimen) -> dict[str, float]:
         "stray": float(stray @ area / area.sum()) if area.sum() else 0.0,
         "left": float(load[-1] / load.max()),
         "broken_edges": float(rows["broken_edges"][-1]),
+        "path": path(centres[:, 1 - specimen.axis], centres[:, specimen.axis] - specimen.plane),
     }
+
+
+def path(along: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> list[list[float]]:
+    """At most PLACES places of new surface, from one side to the other: how far along the slit, how far off it, m."""
+    order = np.argsort(along, kind="stable")[:: max(1, -(-len(along) // PLACES))]
+    return [[float(each) for each in row] for row in np.column_stack([along, off])[order]]
 
 
 def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -139,7 +147,7 @@ def sections(records: list[Record]) -> list[Section]:
         ),
         Table("dependence", "All runs", COLUMNS, rows),
     )
-    plots = tuple(_plot(records, key) for key in ("peak_load", "dissipated"))
+    plots = (*(_plot(records, key) for key in ("peak_load", "dissipated")), *_plates(records))
     pictures = tuple(
         Picture(f"{r['case']}, {r['name']}", f"{folder_of(r)}/run/last.png") for r in records if r["outcome"] == "done"
     )
@@ -164,6 +172,30 @@ def _spreads(records: list[Record]) -> list[tuple[Cell, ...]]:
         if done:
             found.append((case, len(done), *(spread([figures[key] for figures in done]) for key in FIGURES)))
     return found
+
+
+def _plates(records: list[Record]) -> list[Plot]:
+    """The plate by edges, averaged and with a fracture energy beside one another: what it carries, and its crack."""
+    done = [r for r in records if r["case"].startswith("plate") and r["outcome"] == "done" and "path" in r["figures"]]
+    if not done:
+        return []
+    cases = {case: [r for r in done if r["case"] == case] for case in dict.fromkeys(r["case"] for r in done)}
+    peaks = tuple(
+        Series(case, tuple(r["settings"]["h"] for r in each), tuple(r["figures"]["peak_load"] for r in each))
+        for case, each in cases.items()
+    )
+    paths = tuple(_crack(r) for r in done if r["case"] != "plate-averaged" and r["figures"]["path"])
+    return [
+        Plot("Peak load of the plate, before and with a fracture energy", "h, m", "peak load, N", peaks, kind="loglog"),
+        Plot("Crack of the plate, before and with a fracture energy", "along the slit, m", "off it, m", paths),
+    ]
+
+
+def _crack(record: Record) -> Series:
+    """Its path."""
+    x, y = np.array(record["figures"]["path"]).T
+    label = f"{record['case']}, {record['settings']['h'] * 1e3:g} mm"
+    return Series(label, tuple(x.tolist()), tuple(y.tolist()), "line")
 
 
 def _plot(records: list[Record], key: str) -> Plot:
