@@ -145,11 +145,13 @@ def test_friction_between_bodies_is_in_the_books(tmp_path: Path) -> None:
 def test_a_hammer_goes_on_through_crumbs() -> None:
     """A driven disk breaks a plate whose pieces touch it and one another: what is jammed between them makes it wait
     within a step, and it goes on; nothing is passed."""
+    at, velocity = np.array([0.8, 0.78]), np.array([0.05, -0.5])
     study = RUNS["struck"] | {"contact": {"friction": 0.2}, "fracture": {"strength": 0.15, "radius": 0.1}}
+    study["obstacle"] = [study["obstacle"][0] | {"at": at.tolist(), "velocity": velocity.tolist()}]
     scene, state = make_scene(**study | {"time": study["time"] | {"end": 0.5}, "solver": {}})
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     for _ in each_step(scene, state):
-        hammer = np.array([0.8, 0.78]) + state.t * np.array([0.05, -0.5])
+        hammer = at + state.t * velocity
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
     assert contact._surface is not None
     assert len(contact._surface.pairs.overlaps(contact._places())) == 0
