@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 
 from ..mechanics.stress import Stress
+from ..mesh.around import CellsAround
 from ..mesh.edges import EdgeGraph
 from ..mesh.simplices import is_split, local_edges
 from .criterion import OverloadedEdges
@@ -42,7 +42,7 @@ class Holding:
         self.strength = failing.strength
         domain = graph.domain
         self._map = domain.space.dofmap.index_map
-        self._sum = la.vector(self._map, 1, np.float64)
+        self._around = CellsAround(domain)
         pairs = local_edges(domain.dim)
         self._of_node = np.array([(pairs == node).any(axis=1) for node in range(domain.dim + 1)])  # (d + 1, edges)
 
@@ -100,17 +100,8 @@ class Holding:
         first = np.where(at, self._graph.domain.cell_input[cells][:, None].astype(float), np.inf)  # of equals one
         return np.asarray(cells[(at & (first == self._least(nodes, first)[nodes])).any(axis=1)])
 
-    def _around(self, flags: Flags) -> Values:
-        """(nodes,) how many of the flagged cells (cells,) of all ranks a node has."""
-        self._sum.array[:] = 0.0
-        np.add.at(self._sum.array, self._graph.cell_nodes[flags], 1.0)
-        if self._graph.domain.comm.size > 1:
-            self._sum.scatter_reverse(la.InsertMode.add)
-            self._sum.scatter_forward()
-        return self._sum.array.copy()
-
     def _least(self, nodes: Ints, values: Values) -> Values:
         """(nodes,) the least of `values` (n, d + 1) at `nodes` on all ranks."""
-        result = np.full(len(self._sum.array), np.inf)
+        result = np.full(self._map.size_local + self._map.num_ghosts, np.inf)
         np.minimum.at(result, nodes, values)
         return self._graph.least(result, self._map)

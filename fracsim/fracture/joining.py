@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 
 from ..mechanics.stress import Stress
+from ..mesh.around import CellsAround
 from ..mesh.edges import EdgeGraph
 from ..mesh.ranks import total
 from ..mesh.simplices import is_split
@@ -38,7 +38,7 @@ class Joining:
         """`held`: (nodes,) whose motion is prescribed, ghosts too."""
         self._stress, self._graph, self._strength, self._held = stress, graph, strength, held
         self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
-        self._sum = la.vector(graph.domain.space.dofmap.index_map, 1, np.float64)
+        self._around = CellsAround(graph.domain)
 
     def __call__(self, edges: npt.NDArray[np.integer], stress: Values) -> Flags:
         """(n,) which of the edges (n,) that fail do so, and which idle ones the graph keeps, under the stress (cells,
@@ -81,15 +81,6 @@ class Joining:
         result = np.full(len(graph.broken), -np.finfo(float).max)
         np.maximum.at(result, graph.cell_edges[cells], along / self._strength(cells, graph.cell_edges[cells]))
         return np.asarray(result[edges])
-
-    def _around(self, flags: Flags) -> Values:
-        """(nodes,) how many of the flagged cells (cells,) of all ranks a node has (collective)."""
-        self._sum.array[:] = 0.0
-        np.add.at(self._sum.array, self._graph.cell_nodes[flags], 1.0)
-        if self._graph.domain.comm.size > 1:
-            self._sum.scatter_reverse(la.InsertMode.add)
-            self._sum.scatter_forward()
-        return self._sum.array.copy()
 
 
 def _forest(keys: Ints, load: Values, without: Flags, held: Flags) -> Ints:

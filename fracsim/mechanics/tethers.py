@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem, la
+from dolfinx import fem
 from mpi4py import MPI
 
+from ..mesh.around import CellsAround
 from ..mesh.domain import Domain
 from ..mesh.ranks import total
 from ..mesh.simplices import is_split, local_edges
@@ -82,7 +83,7 @@ class Tethers(Term):
         self._domain, self._u, self._mass, self._held = domain, u, mass, held
         self.stiffness = HOLD * young * domain.mean_edge ** (domain.dim - 2)
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
-        self._coupling = Coupling(domain)
+        self._coupling, self._around = Coupling(domain), CellsAround(domain)
         self._lost = 0.0
         input_of = domain.node_input[: domain.node_count]
         self._order = np.argsort(input_of)
@@ -161,14 +162,6 @@ class Tethers(Term):
         """(n,) whether cells of the input mesh are (collective)."""
         whole = self._domain.cell_input[~is_split(self._domain.dim)[self._pattern]] if len(cells) else cells
         return total(self._domain.comm, np.isin(cells, whole).astype(np.int64)) > 0 if len(cells) else cells > 0
-
-    def _around(self, flags: Flags) -> Values:
-        """(nodes,) how many of the flagged cells (cells,) of all ranks a node has (collective)."""
-        count = la.vector(self._domain.space.dofmap.index_map, 1, np.float64)
-        np.add.at(count.array, self._domain.cell_nodes[flags], 1.0)
-        count.scatter_reverse(la.InsertMode.add)
-        count.scatter_forward()
-        return np.asarray(count.array)
 
     # --- what it adds to the balance ---
 
