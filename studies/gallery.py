@@ -99,6 +99,9 @@ ENTRIES = (
     one("rigid-wall", "A wall of adobe as rigid bodies.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor --zoom 1.3"),
     one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor --zoom 1.3"),
     one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor --zoom 1.6"),
+    one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor --zoom 1.2"),
+    one("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.3"),
+    one("rigid-boats", "Rowing boats dropped in a heap.", "--sheet 0,6,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.2"),
     one("brazilian", "A disk of granite split between platens.", "--field stress:xx --zoom 0.85"),
 )  # fmt: skip
 
