@@ -17,6 +17,7 @@ from fracsim.studies.evidence import (
     experiments,
     extremes,
     failed,
+    published,
     results,
     slit,
     stability,
@@ -388,6 +389,13 @@ def test_angle_of_kalthoffs_crack(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(experiments.results, "history", lambda run: rows)
     monkeypatch.setattr(experiments.results, "study", lambda run: study)
     assert experiments.measured_kalthoff(tmp_path)["angle"] == pytest.approx(np.degrees(1.1))
+
+
+def test_a_curve_that_begins_late_is_read_from_where_its_line_does() -> None:
+    """2 N/m from - 1 m on, to 20 N, then a drop; and no table of a plate that was not run."""
+    way = [*np.linspace(0, 9, 10), 9.5]
+    assert published.read(way, [*(2 * (np.array(way[:-1]) + 1)), 1.0]) == pytest.approx((20.0, 10.0, 2.0))
+    assert published.table([]) == ()
 
 
 def test_section_of_experiments() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import folder as packaged
-from . import results
+from . import published, results
 from .dependence import crack_faces, spread
 from .section import Cell, Claim, Picture, Plot, Section, Series, Table, folder_of
 from .trial import Trial
@@ -231,6 +231,7 @@ def sections(records: list[Record]) -> list[Section]:
         Table("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
         Table("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", SPREADS,
               tuple(_spreads(records))),
+        *published.table(records),
     )  # fmt: skip
     plots = tuple(_plot(records, case) for case in BY_CASE if any(_drawn(record, case) for record in records))
     pictures = tuple(
