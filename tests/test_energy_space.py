@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from mpi4py import MPI
+from scipy.spatial import cKDTree
 
+from fracsim.fracture.energy.around import pairs_within
 from fracsim.fracture.energy.cutting import cleave, line_cuts
 from fracsim.fracture.energy.front import advance
-from fracsim.fracture.energy.tips import NEAR_TIP
+from fracsim.fracture.energy.tips import NEAR_TIP, CrackTips
 from fracsim.mesh.simplices import is_split
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
@@ -115,6 +117,45 @@ def test_a_straight_front_starts_at_griffiths_load() -> None:
     load = scene.probes()[2] / 0.25e-3 * np.sqrt(2.7e3 / found)
     assert load.min() == pytest.approx(645e3, rel=0.05)
     assert load.max() / load.min() < 1.05
+
+
+def test_what_lies_near_is_found() -> None:
+    """As by all distances, with radii of very different sizes; and nothing where there is nothing."""
+    rng = np.random.default_rng(6)
+    points, places, radius = rng.uniform(0, 1, (400, 3)), rng.uniform(0, 1, (30, 3)), rng.choice([0.03, 0.1, 0.4], 30)
+    pairs = pairs_within(cKDTree(points), places, radius)
+    distance = np.linalg.norm(points[None] - places[:, None], axis=2)
+    place, other = np.nonzero(distance < radius[:, None])
+    np.testing.assert_array_equal(np.column_stack([pairs.place, pairs.other]), np.column_stack([place, other]))
+    np.testing.assert_allclose(pairs.distance, distance[place, other])
+    np.testing.assert_allclose(pairs.sum(pairs.apart)[3], (points[other] - places[place])[place == 3].sum(axis=0))
+    assert pairs_within(cKDTree(points), places[:0], radius[:0]).sum(np.empty((0, 3))).shape == (0, 3)
+
+
+def test_what_is_kept_of_the_tips_is_what_is_found_anew() -> None:
+    """While a front gets on, and once it is taken back: the tips and forces of a criterion that begins there."""
+    scene = plate(8, {"time": [0, 1, 5], "value": [[0, 0, 0], [0, 0, 4.2e-6], [0, 0, 5.4e-6]]}, 5.0)
+    criterion, breaking, state = criterion_of(scene), scene.fracture, scene.start()
+    before = breaking.memory()
+    criterion.tips()
+    counts = [len(criterion.sight.crack.number)]
+    for step in range(6):
+        if step < 5:
+            state, _ = scene.stepper.advance(state)
+        else:
+            breaking.recall(before)
+        anew = CrackTips(scene.balance.stress, breaking.graph, criterion.strength, criterion.toughness, criterion.cut)
+        anew.tips()
+        kept, found = seen(scene), anew.sight.look(*breaking.evaluate())
+        np.testing.assert_array_equal(kept.tips.cell, found.tips.cell)
+        np.testing.assert_array_equal(kept.tips.mature, found.tips.mature)
+        np.testing.assert_allclose(kept.tips.behind, found.tips.behind, rtol=1e-12)
+        expected = found.forces()
+        np.testing.assert_allclose(kept.forces(), expected, atol=1e-12 * np.abs(expected).max())
+        rows = np.arange(len(kept.tips))
+        np.testing.assert_allclose(kept.means(rows), found.means(rows), rtol=1e-9, atol=1e-3)
+        counts.append(len(criterion.sight.crack.number))
+    assert counts[-2] > counts[0] + 20 and counts[-1] == counts[0]  # cells that are cut
 
 
 @pytest.mark.slow
