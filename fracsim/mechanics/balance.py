@@ -81,7 +81,7 @@ class Balance:
         self.motion, self.mass, self.scheme, self.blow = motion, mass, scheme, Blow.of(scheme)
         self.c_a, self.c_v = scheme.rates(step)
         self._assembler, self._coupled, self.pattern_changed = assembler, False, False
-        self._mixed = False  # whether what is no constant has been added to the tangent's own entries
+        self._mixed = False  # whether what is no constant has ever been added to the tangent's own entries
         self._touches = True  # whether the tangent has contact in it
         self._positive: Positive | None = None
         self.low_rank: list[tuple[Values, Values]] = []
@@ -286,7 +286,6 @@ class Balance:
         """What K has without terms that add to it."""
         if self._coupled:
             K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
-        self._mixed = False
         self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
         if factor := sum(term.mass_factor for term in self.terms):
             self.mass.add_to(K, factor)
