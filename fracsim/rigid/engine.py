@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ..errors import NotConverged
 from .bodies import Bodies
 from .contacts import Contacts
 from .meeting import Meetings, flown, meetings
@@ -28,9 +29,7 @@ from .tumbling import rotated, tumbled
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-TURN = (
-    1.0  # rad that what is in touch turns in a step, at most: contacts that turn farther are none; a crumb would whirl
-)
+TURN = 1.0  # rad that what is in touch turns in a step, at most: contacts are of one place, and a crumb would whirl
 ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farther than was thought,
 FARTHER = 1.5  # by as many times
 ROOM = 2.0  # times how far bodies come as they move: what is struck in a crowd goes farther
@@ -177,7 +176,7 @@ class Engine:
         )
 
     def _add_planes(self, bodies: Bodies, reach: Values, speeds: Values) -> None:
-        """Contacts of hulls with planes, after those that MuJoCo finds."""
+        """Contacts of hulls with planes, after those that MuJoCo finds. Raises NotConverged where there is no room."""
         planes, data = self._model.planes, self._data
         for number, parts, gaps, points in planes.near(bodies, self._way, reach, speeds, self._rules.step):
             first, alike = data.ncon, self._plane_contacts[number]
@@ -185,7 +184,11 @@ class Engine:
             data.ncon = first + len(parts)
             made = data.contact
             data.parena = data.ncon * made.dist.strides[0]
-            assert data.parena < data.narena, "see MEMORY of rigid.model"
+            if data.parena >= data.narena:
+                raise NotConverged(
+                    f"{data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a "
+                    "larger mesh.h has fewer"
+                )
             for name in FIELDS:
                 getattr(made, name)[first:] = getattr(alike, name)
             made.dist[first:], made.pos[first:] = gaps, points

@@ -215,11 +215,8 @@ class _Meshes:
         name = self._names.get(id(corners))
         if name is None:
             mesh, name = spec.add_mesh(), f"part{len(self._names)}"
-            mesh.name, mesh.uservert, mesh.inertia = (
-                name,
-                corners.reshape(-1),
-                mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-            )
+            mesh.name, mesh.uservert = name, corners.reshape(-1)
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             self._names[id(corners)] = name
         return name
 
