@@ -50,7 +50,6 @@ def one(study: str, text: str, render: str) -> Entry:
 
 CUTS = "--set mesh.h=0.012 --set time.end=0.2 --set output.cut="
 AVERAGED = "doormat --set fracture.radius=0.05 --set fracture.strength=2e5 --set time.step=4e-4"
-VASE = "--floor --zoom 1.2"
 ENTRIES = (
     one("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,15,20,-1 --floor"),
     Entry(
@@ -74,7 +73,7 @@ ENTRIES = (
     ),
     one("jelly-figure", "A figure of jelly pulled by its limbs: before and after.", "--sheet 0,-1 --view 0.3,-1.6,0.4"),
     one("struck-figure", "A figure of jade, struck on its chest; pieces moved apart.", "--field piece --explode 0.2"),
-    one("struck-vase", "A porcelain vase, struck on its belly: at most 150 surfaces.", VASE),
+    one("struck-vase", "A porcelain vase, struck on its belly: at most 150 surfaces.", "--floor --zoom 1.2"),
     Entry(
         "vase-50-150-300", "At most 50, 150 and 300 surfaces (M22 fig. 16).",
         (("vase-50", "struck-vase --set brittle.surfaces=50"), ("struck-vase", "struck-vase"),

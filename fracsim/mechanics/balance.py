@@ -115,9 +115,7 @@ class Balance:
 
     def _cells_at_supports(self) -> npt.NDArray[np.int32]:
         """Owned cells with a prescribed dof."""
-        touched = np.zeros(len(self.domain.nodes), bool)
-        touched[self.motion.dofs // self.domain.dim] = True
-        return np.flatnonzero(touched[self.domain.all_cell_nodes].any(axis=1)).astype(np.int32)
+        return np.flatnonzero(self.motion.held[self.domain.all_cell_nodes].any(axis=1)).astype(np.int32)
 
     # --- a step, or a look at a state ---
 

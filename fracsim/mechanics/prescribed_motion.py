@@ -60,6 +60,13 @@ class PrescribedMotion:
         self._values.x.array[self.dofs] = values
 
     @property
+    def held(self) -> Flags:
+        """(nodes,) which have a component whose motion is prescribed, ghosts included."""
+        held = np.zeros(len(self._domain.nodes), bool)
+        held[self.dofs // self._domain.dim] = True
+        return held
+
+    @property
     def values(self) -> Values:
         """(owned,) what each of `owned` shall be at, m."""
         result: Values = self._values.x.array[self.owned]

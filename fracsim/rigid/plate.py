@@ -73,10 +73,6 @@ class Plates:
         blocks = K.reshape(-1, 6, 3, 6, 3)
         return np.einsum("nai,nkalb,nbj->nkilj", self.axes, blocks, self.axes, optimize=True).reshape(-1, 18, 18)
 
-    def to_plane(self, u: Values) -> Values:
-        """(n, 18) unknowns in the axes of the triangles from (n, 3, 6) in those of space."""
-        return np.einsum("nai,nki->nka", self.axes, u.reshape(-1, 6, 3)).reshape(-1, 18)
-
     def membrane(self) -> Values:
         """(n, 3, 18) strain (xx, yy, 2 xy) of the middle surface."""
         B = np.zeros((len(self.area), 3, 3, 6))

@@ -114,10 +114,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strengt
         return None
     from ..fracture.joining import Joining
 
-    domain = balance.domain
-    held = np.zeros(len(domain.nodes), bool)
-    held[balance.motion.dofs // domain.dim] = True
-    return Joining(balance.stress, graph, strength, held)
+    return Joining(balance.stress, graph, strength, balance.motion.held)
 
 
 def average_of(study: Study, domain: Domain) -> Average | None:

@@ -122,10 +122,8 @@ def _tethers(parts: Parts) -> Term | None:
     from ..mechanics.tethers import Tethers
 
     domain = parts.domain
-    held = np.zeros(len(domain.nodes), bool)
-    held[parts.motion.dofs // domain.dim] = True
     young = domain.comm.allreduce(float(np.max(parts.stress.material.young, initial=0.0)), op=MPI.MAX)
-    return Tethers(domain, parts.u, young, parts.mass.lumped, held)
+    return Tethers(domain, parts.u, young, parts.mass.lumped, parts.motion.held)
 
 
 def _inertia(parts: Parts) -> Term | None:

@@ -103,6 +103,10 @@ class FreeObstacles(Flights):
                 self._place()
         return super().touching()
 
+    def _set_off(self) -> None:
+        """Newton's method begins, with poses that belong to no points yet."""
+        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
+
     def _walk(self) -> None:
         """To where all belong, or as far as closes no gap by more than is safe: before a body that has not given way
         yet what is heavy would come to rest a hair's breadth away, with a force that tells nothing (collective)."""
@@ -243,7 +247,7 @@ class FreeObstacles(Flights):
         """(owned dofs,) a first guess that has passed through nothing on its way from the start: free obstacles stop,
         or the body with them, before they meet (collective)."""
         u, level = super().reachable(u), self._level
-        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
+        self._set_off()
         for each in self.free.values():
             each.forget_way()
         if not level.dt:
@@ -308,7 +312,7 @@ class FreeObstacles(Flights):
         for each in self.free.values():
             each.stay()
         self._place()
-        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
+        self._set_off()
         super().hold_back()
 
 
