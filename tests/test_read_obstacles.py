@@ -328,6 +328,19 @@ def test_a_weight_dropped_on_a_body_comes_to_rest(tmp_path: Path) -> None:
     assert found["contact_block_z"] == pytest.approx(20.0 * G, rel=1e-3)
 
 
+def test_a_free_solid_beside_a_plane_that_is_held(tmp_path: Path) -> None:
+    """Falls freely, away from both: the plane is held, though something is free."""
+    tables = thrown(tmp_path, at=[3.0, 0.5, 1.0])
+    tables["obstacle"].append({"name": "floor", "shape": "plane", "at": [0.0, 0.0, -0.6], "normal": [0.0, 0.0, 1.0]})
+    scene, state = make_scene(
+        **tables, load={"gravity": [0.0, 0.0, -G]}, boundary=[{"on": "bottom", "fix": "xyz"}],
+        time={"scheme": "backward-euler", "step": 0.02, "end": 0.8},
+    )  # fmt: skip
+    before = last(scene)["velocity_block_z"]
+    march(scene, state, 2)
+    assert last(scene)["velocity_block_z"] - before == pytest.approx(-G * 0.04)
+
+
 @pytest.mark.slow
 def test_a_free_solid_rests_on_a_floor_and_hangs_on_a_hinge(tmp_path: Path) -> None:
     """Away from the body: dropped on a plane, turned, it comes to lie flat on it; a quarter of a swing on a hinge takes

@@ -55,7 +55,7 @@ def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: Materi
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
     entries = obstacle_entries(study, domain.dim)
     law = _law(study.contact or Contact(), domain, material)
-    if not any(each.free for each in study.obstacle):
+    if not any(each.free for each in entries):
         return Obstacles(domain, u, entries, law)
     from ..mechanics.contact.free_obstacles import FreeObstacles
 
@@ -72,7 +72,7 @@ def explicit_obstacles_of(
     entries = obstacle_entries(study, domain.dim)
     contact = study.contact or Contact()
     law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
-    if not any(each.free for each in study.obstacle):
+    if not any(each.free for each in entries):
         return ExplicitObstacles(domain, u, entries, law, mass, most)
     from ..mechanics.contact.explicit_free import ExplicitFreeObstacles
 
