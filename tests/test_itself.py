@@ -10,6 +10,7 @@ import pytest
 
 from fracsim.errors import InputError
 from fracsim.mechanics.contact.itself import SelfContact
+from fracsim.mechanics.contact.stiffening import TIGHT
 from fracsim.meshes.builders.box import Box
 from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
@@ -101,6 +102,48 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
     assert abs(carried[2] - carried[0]) < 1e-6 * carried[0]
+
+
+def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
+    """Blocks pressed together by a twentieth, with a millionth of the stiffness that contact has by itself: a step or
+    two later it presses alike, in as many iterations, and is not halved. What that adds is in the books."""
+    gaps, its, forces = [], [], []
+    for stiffness in ({}, {"stiffness": 3e-3}):
+        ends = [{"on": {"box": [[-1.0, -1.0], [0.01, 2.0]]}, "fix": "xy"},
+                {"on": {"box": [[2.04, -1.0], [2.2, 2.0]]}, "velocity": [-0.6, 0.0]}]  # fmt: skip
+        scene, state = make_scene(
+            mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact=stiffness, boundary=ends, solver={},
+            probe=[{"name": "held", "on": ends[0]["on"]}], time={"scheme": "backward-euler", "step": 0.05, "end": 0.5},
+        )  # fmt: skip
+        (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+        reports = march(scene, state)
+        assert len(reports) == 10
+        gaps.append(contact.least_gap() / contact.law.distance)
+        its.append([report.solve.newton for report in reports])
+        forces.append(scene.probes()[0])
+    assert min(gaps) > TIGHT
+    assert sum(its[1][5:]) <= sum(its[0][5:]) + 5
+    assert forces[1] == pytest.approx(forces[0], rel=0.05)  # the gap itself is 3 % of the way
+    assert contact.law.stiffness > 100 * 3e-3
+    again, _ = make_scene(mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"stiffness": 3e-3})
+    (other,) = [term for term in again.balance.terms if isinstance(term, SelfContact)]
+    other.restore(contact.saved())
+    assert other.law.stiffness == pytest.approx(contact.law.stiffness)
+
+
+def test_what_stiffer_contact_stores_is_known(tmp_path: Path) -> None:
+    """Against the energy before and after; nothing where no gap is all but closed."""
+    scene, _ = make_scene(mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"distance": 0.02})
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    X = positions(scene)
+    for gap, stiffer in ((0.01, False), (2e-5, True)):
+        u = np.where(X[:, :1] > 1.01, [[gap - 0.05, 0.0]], 0.0).reshape(-1)
+        scene.balance.look_at(0.0, u, 0 * u, dt=1e-3)
+        before, stiffness = contact.stored(), contact.law.stiffness
+        gained = contact.stiffen()
+        scene.balance.look_at(0.0, u, 0 * u, dt=1e-3)
+        assert contact.stored() - before == pytest.approx(gained, abs=1e-9 * before)
+        assert (contact.law.stiffness > 2 * stiffness) == stiffer == (gained > 0)
 
 
 def test_bodies_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:

@@ -470,6 +470,11 @@ class Balance:
         work, lost = zip(*(term.driven() for term in self.terms), strict=True)
         return sum(work), sum(lost)
 
+    def stiffen(self) -> float:
+        """Contact that is too soft acts stiffer from here on; what energy it gets for that, this rank's share, J
+        (collective)."""
+        return sum(term.stiffen() for term in self.terms)
+
     @property
     def symmetric(self) -> bool:
         """Whether K is symmetric, as all terms say of their share."""

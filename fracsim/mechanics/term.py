@@ -195,6 +195,11 @@ class Term:
         rank's share, J; asked once a step (collective)."""
         return 0.0, 0.0
 
+    def stiffen(self) -> float:
+        """Act stiffer from here on, where the end of the step shows that contact is too soft for what presses on it;
+        what energy it stores for that at the same u, this rank's share, J (collective)."""
+        return 0.0
+
     def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
         it keeps apart is apart; `at`: where it is without, `elements` (m, d) the points of its segments or triangles.

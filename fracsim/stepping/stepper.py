@@ -278,7 +278,8 @@ class BalanceStepper:
         balance = self.balance
         elastic += sum(term.stored() for term in balance.terms if term is not balance.stress)
         worked, rubbed = balance.driven()
-        work, lost = work + worked, lost + rubbed
+        stiffened = balance.stiffen()
+        work, lost, elastic = work + worked + stiffened, lost + rubbed, elastic + stiffened
         kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
         work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(

@@ -116,6 +116,11 @@ class Surface:
             self.pairs = self._pairs_of(np.delete(self.made.elements, elements, axis=0))
         self._out = elements
 
+    def stiffen(self, factor: float) -> None:
+        """The barrier is stiffer by that factor from here on."""
+        self._how["stiffness"] *= factor
+        self.pairs.stiffen(factor)
+
     def memory(self) -> Memory:
         """Shares of arms, elements that are left out, and when room is looked for again."""
         return self.at.share, self._out, self._pause

@@ -101,6 +101,10 @@ class ExplicitSelfContact(SelfContact):
         assert self._skeleton is not None and self._mass is not None
         return Pushes(self._skeleton, pattern, self.law, u, self._surface, self._mass, self._most)
 
+    def stiffen(self) -> float:
+        """A penalty knows no gap that is all but closed."""
+        return 0.0
+
     # --- where nothing is near, nothing is gathered until nodes have gone far enough to change that ---
 
     def begin(self, level: Level) -> None:

@@ -7,6 +7,7 @@ timings of Pairs: for 50,000 triangles less than a step of the body inside them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..stiff import Stiff
 from ..term import Level, Term
 from .crowd import Law, Surface
 from .slip import Friction
+from .stiffening import stiffening
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -107,12 +109,15 @@ class SelfContact(Term):
             self._surface.recall(memory[0])
 
     def saved(self) -> dict[str, Values]:
-        """Shares of arms, numbers of elements that are left out, and steps to the next look for room."""
+        """Shares of arms, numbers of elements that are left out, steps to the next look for room, and stiffness."""
         share, out, pause = (np.empty(0), np.empty(0), (0, 0)) if self._surface is None else self._surface.memory()
-        return {"share": share, "left_out": np.asarray(out, float), "pause": np.array(pause, float)}
+        return {"share": share, "left_out": np.asarray(out, float), "pause": np.array(pause, float),
+                "stiffness": np.array([self.law.stiffness])}  # fmt: skip
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
+        if "stiffness" in saved:
+            self._stiffer(float(saved["stiffness"][0]) / self.law.stiffness)
         if self._surface is not None:
             pause, waits = (int(each) for each in saved.get("pause", (1, 1)))
             self._surface.recall((saved["share"], saved["left_out"].astype(np.int64), (pause, waits)))
@@ -218,6 +223,27 @@ class SelfContact(Term):
         if self._stored is None:  # asked for in turn by whether it acts, the line search, and the book of energies
             self._stored = 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
         return self._stored
+
+    def stiffen(self) -> float:
+        """A barrier that is all but closed where the step ends is stiffer from here on (stiffening)."""
+        x = self._places()
+
+        def found() -> tuple[float, float]:
+            assert self._surface is not None and x is not None
+            pairs = self._surface.pairs
+            factor = stiffening(pairs.least_gap(x) / self.law.distance)
+            return factor, (factor - 1) * pairs.energy(x) if factor > 1 else 0.0
+
+        factor, gained = from_root(self.comm, found)
+        if factor > 1:
+            self._stiffer(factor)
+        return gained if self.comm.rank == 0 else 0.0
+
+    def _stiffer(self, factor: float) -> None:
+        self.law = replace(self.law, stiffness=factor * self.law.stiffness)
+        self._stiff *= factor
+        if self._surface is not None:
+            self._surface.stiffen(factor)
 
     def drag(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""

@@ -5,7 +5,8 @@ Two kinds of pairs: points against elements, and in 3D edges against edges, each
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import ipctk
 import numpy as np
@@ -22,17 +23,24 @@ CCD = ipctk.AdditiveCCD(ROUNDS, 1.0 - KEPT)
 
 @dataclass(frozen=True)
 class Kind:
-    """The barrier of one kind of pairs, and the name of its list among ipctk's candidates."""
+    """The barrier of one kind of pairs, from `distance` m on with `stiffness` Pa, and the `name` of its list among
+    ipctk's candidates."""
 
-    barrier: ipctk.BarrierPotential
+    distance: float
+    stiffness: float
     name: str
+
+    @cached_property
+    def barrier(self) -> ipctk.BarrierPotential:
+        """That of ipctk."""
+        return ipctk.BarrierPotential(self.distance, self.stiffness, True)
 
     def touching(self, candidates: ipctk.Candidates, mesh: ipctk.CollisionMesh, x: Values) -> ipctk.NormalCollisions:
         """Those of the candidates on which the barrier acts."""
         pairs = ipctk.NormalCollisions()
         pairs.use_area_weighting = True
         pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
-        pairs.build(candidates, mesh, x, self.barrier.dhat)
+        pairs.build(candidates, mesh, x, self.distance)
         return pairs
 
 
@@ -56,6 +64,11 @@ class Near:
             self._found = [(kind, kind.touching(candidates, self._mesh, x)) for kind, candidates in each]
             self._found_at = x.copy()
         return self._found
+
+    def stiffen(self, factor: float) -> None:
+        """Barriers are stiffer by that factor from here on; what touches stays."""
+        self._kinds = [replace(kind, stiffness=factor * kind.stiffness) for kind in self._kinds]
+        self._found = [(kind, pairs) for kind, (_, pairs) in zip(self._kinds, self._found, strict=False)]
 
     def candidates(self, x: Values) -> list[ipctk.Candidates]:
         """Of each kind; the same ones while they hold."""

@@ -55,7 +55,7 @@ class Pairs:
         # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
         kinds = [((1 + solid) * stiffness, 1.0, "fv_candidates" if solid else "ev_candidates")]
         kinds += [(stiffness, EDGES, "ee_candidates")] if solid else []
-        made = [Kind(ipctk.BarrierPotential(share * distance, k, True), name) for k, share, name in kinds]
+        made = [Kind(share * distance, k, name) for k, share, name in kinds]
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
@@ -79,6 +79,10 @@ class Pairs:
         on, how = self._mesh.vertices(x), projection(exact=exact)
         found = sum(kind.barrier.hessian(pairs, self._mesh, on, how) for kind, pairs in self._near.touching(on))
         return csr_matrix(self._mesh.to_full_dof(found))
+
+    def stiffen(self, factor: float) -> None:
+        """The barrier is stiffer by that factor from here on."""
+        self._near.stiffen(factor)
 
     def least_gap(self, x: Values) -> float:
         """The least distance between elements on which the barrier acts, m; infinite where there is none."""

@@ -65,7 +65,7 @@ class Pushing(Pairs):
         self.held: Values = np.zeros(len(rest))
         self._rate, self._width, self._elements = rate, distance, elements
         self._used = np.unique(elements)  # ipctk's points
-        kind = Kind(ipctk.BarrierPotential(distance, 1.0, True), "ee_candidates")
+        kind = Kind(distance, 1.0, "ee_candidates")
         self._near = Near(self._mesh, [kind], FARTHEST * distance, MARGIN * distance)
         self._found: ipctk.Candidates | None = None  # of which `_every` are, and `_some` near where points were then
         self._every: Ints

@@ -183,6 +183,11 @@ class Facings:
                 H = H + each.hessian(each.with_solid(x), exact=exact)[:size, :size]
         return csr_matrix(H)
 
+    def stiffen(self, factor: float) -> None:
+        """Barriers are stiffer by that factor from here on."""
+        for each in self.each:
+            each.stiffen(factor)
+
     def least_gap(self, x: Values) -> float:
         """The least distance within the barrier, m; infinite where there is none."""
         return min((each.least_gap(each.with_solid(x)) for each in self.each if not each.is_far(x)), default=np.inf)

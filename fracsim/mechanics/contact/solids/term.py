@@ -152,6 +152,10 @@ class Solids(SelfContact):
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
         return 0.0 if self._is_far() else super().stored()
 
+    def stiffen(self) -> float:
+        """As of SelfContact (collective)."""
+        return 0.0 if self._is_far() else super().stiffen()
+
     def potential(self) -> float:
         """Barrier and friction as they enter that of r, on rank 0, J (collective)."""
         return 0.0 if self._is_far() else super().potential()
