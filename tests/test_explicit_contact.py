@@ -233,7 +233,6 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"contact": {"friction": 0.2}}, r"contact\.friction of the body with itself needs an implicit scheme"),
         ({"contact": {"itself": False, "creep": 1e-3}}, "creep is for implicit schemes.*remove it"),
     ],
 )  # fmt: skip

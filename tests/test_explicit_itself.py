@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -12,6 +13,7 @@ from scipy.sparse import eye
 
 from fracsim.mechanics.contact.explicit_itself import ExplicitSelfContact, Pushes
 from fracsim.mechanics.contact.pushing import Pushing, rates
+from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import break_across, each_step, make_scene, march, positions
@@ -54,7 +56,7 @@ def pushed(dim: int) -> tuple[Pushing, Values]:
 def test_forces_are_a_derivative_and_sum_to_nothing(dim: int) -> None:
     """Of points before facets and of some that are through: against differences; force and moment vanish."""
     pairs, x = pushed(dim)
-    met, gradient, h = pairs._met(x), pairs.gradient(x), 1e-7
+    met, gradient, h = pairs.met(x), pairs.gradient(x), 1e-7
     assert (met.at.gap < 0).sum() > 1 and (met.at.gap > 0).sum() > 3
     assert ((met.at.share > 0).all(axis=1)).any()
     way = np.random.default_rng(1).normal(size=(6, *x.shape))
@@ -72,7 +74,7 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
     """omega^2 of M^-1 times the stiffness along the normals, dense; and with k_p that bodies of the same mesh on both
     sides have, no more than was asked for."""
     pairs, x = pushed(dim)
-    n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs._met(x)
+    n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs.met(x)
     K = np.zeros((n * dim, n * dim))
     for p, corners, share, normal, rate in zip(
         met.at.points, met.at.corners, met.at.share, met.at.normal, met.rate, strict=True
@@ -112,7 +114,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         x = contact._places()
         assert x is not None
         touched += contact.stored() > 0
-        assert surface.pairs._met(x).at.gap.min(initial=1.0) > -0.01
+        assert surface.pairs.met(x).at.gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
     assert min(steps) > 0.75 * max(steps)
@@ -168,7 +170,8 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
-    """A plate that is crushed and breaks, its pieces in touch: stopped and resumed, the same but for round-off."""
+    """A plate that is crushed and breaks, its pieces in touch and rubbing: stopped and resumed, the same but for
+    round-off."""
     time = {"scheme": "explicit", "step": 0.05, "end": 1.0}
     tables: dict[str, Any] = RUNS["rammed"] | {"output": {"picture": False, "interval": 1.0}, "time": time}
     going, stopped, again = going_stopped_resumed(tables, tmp_path, 20, 4)
@@ -207,3 +210,70 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
         assert (m * state.v.reshape(-1, 2))[X[:, 0] > 1.01, 0].sum() > 0.02  # they have met
     np.testing.assert_array_equal(*ends)
     assert abs(ends[0][: len(ends[0]) // 2]).max() > 0.1 and looks[0] < looks[1] / 2
+
+
+# --- friction ---
+
+
+def slab_and_block(path: Path, gap: float) -> str:
+    """A file with a slab of 3 x 0.25 m and a block of 1 x 0.5 m over it, `gap` apart, their meshes not alike."""
+    low = Box(size=(3.0, 0.25), h=0.21).build()
+    high = Box(size=(1.0, 0.5), h=0.25, origin=(0.52, 0.25 + gap)).build()
+    points = np.pad(np.concatenate([low.points, high.points]), ((0, 0), (0, 1)))
+    cells = np.concatenate([low.cells, high.cells + len(low.points)])
+    meshio.Mesh(points, [("triangle", cells)]).write(path / "slab.vtu")
+    return str(path / "slab.vtu")
+
+
+@pytest.mark.parametrize(("share", "sticks"), [(1.2, True), (0.8, False)])
+def test_a_block_on_a_slope(tmp_path: Path, share: float, sticks: bool) -> None:
+    """tan(theta) = 0.5 and mu = `share` of it: the block stays on the slab, or slides with g (sin - mu cos)."""
+    slope, distance = 0.5, 0.0125
+    along, down = np.array([slope, -1.0]) / np.hypot(1, slope) * 9.81
+    scene, state = make_scene(
+        mesh={"file": slab_and_block(tmp_path, distance)}, material=SOFT | {"young": 1e6, "density": 1000.0},
+        contact={"distance": distance, "friction": share * slope}, load={"gravity": [along, down]},
+        boundary=[{"on": {"box": [[-1.0, -1.0], [4.0, 0.25]]}, "fix": "xy"}],
+        damping={"mass": 20.0 * sticks, "stiffness": 1e-3}, time={"scheme": "explicit", "step": 0.01, "end": 0.5},
+    )  # fmt: skip
+    high = positions(scene)[:, 1] > 0.255
+    m, moved = scene.balance.mass.lumped[::2] * high, []
+    for _ in each_step(scene, state):
+        moved.append((state.t, float(m @ state.u[::2]) / m.sum()))
+    t, way = np.array(moved[1:]).T
+    if sticks:
+        assert abs(way[-1] - way[len(way) // 2]) < 1e-4 and way[-1] < 0.01
+    else:
+        late = t > 0.2
+        assert 2 * np.polyfit(t[late], way[late], 2)[0] == pytest.approx(along + share * slope * down, rel=0.05)
+
+
+def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
+    """Blocks that meet askew: momentum to round-off, friction mu times what presses at most and against the sliding;
+    what it takes is what is missing, and is more than nothing."""
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, 2, 0.03)}, material=SOFT, contact={"friction": 0.3},
+        time={"scheme": "explicit", "step": 0.02, "end": 0.32},
+    )  # fmt: skip
+    contact, surface = contact_of(scene)
+    X, m = positions(scene), scene.balance.mass.lumped.reshape(-1, 2)
+    v = np.zeros_like(X)
+    v[X[:, 0] < 1.01] = [0.5, 0.5]
+    state.v = v.reshape(-1)
+    state.settle()
+    before, slid = (m * v).sum(axis=0), 0.0
+    began = 0.5 * float((m * v * v).sum())
+    for report in each_step(scene, state):
+        after = (m * state.v.reshape(-1, 2)).sum(axis=0)
+        np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
+        assert report.kinetic + report.elastic + state.dissipated == pytest.approx(began, rel=0.02)
+        x = contact._places()
+        assert x is not None and contact._rubbing is not None
+        met = surface.pairs.met(x)
+        pull = met.rate * np.linalg.norm(contact._rubbing.slips(x), axis=1)
+        assert (pull <= 0.3 * met.rate * (surface.pairs.width - met.at.gap) * (1 + 1e-12)).all()
+        slid = max(slid, float(pull.sum()))
+    right = X[:, 0] > 1.01
+    assert slid > 0 and state.dissipated > 0.005 * began
+    given = (m * state.v.reshape(-1, 2))[right].sum(axis=0)
+    assert 0 < given[1] <= 0.3 * given[0] * (1 + 1e-9)

@@ -186,14 +186,8 @@ class Study(Table):
     @model_validator(mode="after")
     def _contact_fits_the_scheme(self) -> Study:
         scheme = f'time.scheme = "{self.time.scheme}"'
-        if self.contact is not None and not self.time.kind.implicit:
-            if self.contact.itself and self.contact.friction:
-                raise ValueError(
-                    f"contact.friction of the body with itself needs an implicit scheme, not {scheme}; choose "
-                    '"backward-euler", or leave it out'
-                )
-            if self.contact.creep is not None:
-                raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
+        if self.contact is not None and not self.time.kind.implicit and self.contact.creep is not None:
+            raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
         solids = [number for number, each in enumerate(self.obstacle) if each.shape == "mesh"]
         if solids and not self.time.kind.implicit:
             raise ValueError(

@@ -305,12 +305,12 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.03, "radius": 0.1}, "contact": {"itself": "pieces", "friction": 0.2},
         "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.4}, "probe": [{"name": "grip", "on": "right"}],
     },
-    # the same in explicit steps, walls inside pieces touching, too
+    # the same in explicit steps, walls inside pieces touching and rubbing, too
     "rammed": {
         "mesh": MESHES["2d"], "material": SOFT | {"energy": "neo-hookean"},
         "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
             "time": [0.0, 0.4], "value": [[0.0, 0.0], [-0.3, 0.15]]}}],
-        "fracture": {"strength": 0.03, "radius": 0.1}, "contact": {},
+        "fracture": {"strength": 0.03, "radius": 0.1}, "contact": {"friction": 0.3},
         "time": {"scheme": "explicit", "step": 0.05, "end": 0.3}, "probe": [{"name": "grip", "on": "right"}],
     },
     # broken by an axe that is read from a file

@@ -6,6 +6,7 @@ near each other add to the square of the highest frequency sets the step.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar, cast
 
 import numpy as np
@@ -22,6 +23,7 @@ from .crowd import Law, Surface
 from .itself import SelfContact
 from .pairs import areas
 from .pushing import NONE, Pushing, rates
+from .sticking import Sticking
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -58,13 +60,14 @@ class Pushes(Surface):
             self._rates = rates(self.at.weights, area, self.mass, pressure, self._most)
         pairs = Pushing(self._rest, elements, self._rates, distance=self._law.distance)
         if (last := getattr(self, "pairs", None)) is not None:
-            pairs.hold(last.by, last.held)
+            pairs.hold(last.by, last.held, last.slip)
         elif self._earlier is not None:
             pairs.hold(*self._pushed_before(self._earlier, self._rates))
         return pairs
 
-    def _pushed_before(self, before: Pushes, most: Values) -> tuple[Ints, Values]:
-        """What is pushed still is, and no harder: corners (n, d) and k_p (n,) of `before` for the points of now."""
+    def _pushed_before(self, before: Pushes, most: Values) -> tuple[Ints, Values, Values]:
+        """What is pushed still is, and no harder: corners (n, d), k_p (n,) and slips (n, d) of `before` for the points
+        of now."""
         old, new, pairs = before.at.copies, self.at.copies, before.pairs
         nodes = min(old.min(initial=len(pairs.by)), new.min(initial=len(most)))  # have kept their numbers
         now = np.full(len(pairs.by), NONE)
@@ -72,16 +75,19 @@ class Pushes(Surface):
         again = found_again(before._identity(), self._identity())
         now[old[again >= 0]] = new[again[again >= 0]]
         held, by = np.zeros(len(most)), np.full((len(most), pairs.by.shape[1]), NONE)
+        slip = np.zeros(by.shape)
         which = np.flatnonzero((now >= 0) & (pairs.held > 0))
         corners = pairs.by[which]
         by[now[which]], held[now[which]] = np.where(corners >= 0, now[corners], NONE), pairs.held[which]
-        return by, np.minimum(held, most)
+        slip[now[which]] = pairs.slip[which]
+        return by, np.minimum(held, most), slip
 
 
 class ExplicitSelfContact(SelfContact):
     """A body that explicit steps keep apart from itself."""
 
     _surface: Pushes | None
+    _rubbing: Sticking | None  # type: ignore[assignment]
     # displacements (owned dofs,) where nothing was near, m; None: something was; and how far from there nothing is, m
     _since: Values | None = None
     _room = 0.0
@@ -95,7 +101,8 @@ class ExplicitSelfContact(SelfContact):
         """
         gathered = domain.gather_nodes(mass.reshape(-1, domain.dim))
         self._mass, self._most = None if gathered is None else gathered[:, 0].copy(), most
-        super().__init__(domain, u, law)
+        self._friction, self._lost = law.friction, 0.0
+        super().__init__(domain, u, replace(law, friction=0.0))  # that of implicit steps
 
     def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
         assert self._skeleton is not None and self._mass is not None
@@ -109,9 +116,14 @@ class ExplicitSelfContact(SelfContact):
 
     def begin(self, level: Level) -> None:
         """As of SelfContact."""
-        if not self._is_idle():
-            return super().begin(level)
-        self._level, self._moved, self._idle = level, True, None
+        idle, self._lost = self._is_idle(), 0.0 if level.dt else self._lost
+        if idle:
+            self._level, self._moved, self._idle = level, True, None
+        else:
+            super().begin(level)
+        if self._friction and self._surface is not None:
+            start = self._start if level.dt and not idle else None
+            self._rubbing = Sticking(self._surface.pairs, self._friction, start)
 
     def displaced(self) -> None:
         """What touches has to be found anew."""
@@ -164,8 +176,15 @@ class ExplicitSelfContact(SelfContact):
         return None if self._is_idle() else super().scale()
 
     def stored(self) -> float:
-        """Energy of the penalty at the current u, on rank 0, J (collective)."""
-        return 0.0 if self._is_idle() else super().stored()
+        """Energy of the penalty, and of the springs of friction, at the current u, on rank 0, J (collective)."""
+        if self._is_idle():
+            return 0.0
+        energy, x = super().stored(), self._places()
+        return energy if self._rubbing is None or x is None else energy + self._rubbing.energy(x)
+
+    def driven(self) -> tuple[float, float]:
+        """What friction takes, on rank 0, J."""
+        return 0.0, self._lost
 
     def frequency(self) -> float:
         """What contact adds at most, were all points in touch that are near, 1/s^2 (collective)."""
@@ -187,18 +206,21 @@ class ExplicitSelfContact(SelfContact):
 
         def noted() -> None:
             assert self._surface is not None and x is not None
-            self._surface.pairs.arrive(x)
+            slips = None
+            if self._rubbing is not None:
+                slips, self._lost = self._rubbing.slips(x), self._rubbing.lost(x)
+            self._surface.pairs.arrive(x, slips)
 
         on_root(self.comm, noted)
 
     def memory(self) -> object:
         """With what is pushed."""
-        pushed = self._surface and (self._surface.pairs.by, self._surface.pairs.held)
+        pushed = self._surface and (self._surface.pairs.by, self._surface.pairs.held, self._surface.pairs.slip)
         return super().memory(), pushed, (self._since, self._room, self._age)
 
     def recall(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
-        surface, pushed, idle = cast("tuple[object, tuple[Ints, Values] | None, _Idle]", memory)
+        surface, pushed, idle = cast("tuple[object, tuple[Ints, Values, Values] | None, _Idle]", memory)
         super().recall(surface)
         if self._surface is not None and pushed is not None and pushed[1] is not self._surface.pairs.held:
             self._surface.pairs.hold(*pushed)
@@ -208,15 +230,16 @@ class ExplicitSelfContact(SelfContact):
         self._idle = None
 
     def saved(self) -> dict[str, Values]:
-        """With the facets that push points."""
+        """With the facets that push points, and the springs of friction."""
         if self._surface is None:
-            return super().saved() | {"by": np.empty((0, 0)), "held": np.empty(0)}
+            return super().saved() | {"by": np.empty((0, 0)), "held": np.empty(0), "slip": np.empty((0, 0))}
         pairs = self._surface.pairs
-        return super().saved() | {"by": pairs.by.astype(float), "held": pairs.held}
+        return super().saved() | {"by": pairs.by.astype(float), "held": pairs.held, "slip": pairs.slip}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         self._since = self._idle = None
         super().restore(saved)
         if self._surface is not None and "by" in saved:
-            self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"])
+            slip = saved.get("slip", np.zeros(saved["by"].shape))
+            self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"], slip)

@@ -55,7 +55,8 @@ class Pushing(Pairs):
 
     Attributes:
         by: (n, d) corners of the facets that pushed points as the last step ended, or NONE.
-        held: (n,) k_p of these, N/m; 0 of others.
+        held: (n,) k_p of these, N/m; 0 of others.    width: D, m.
+        slip: (n, d) m, of their springs, where there is friction (sticking).
     """
 
     def __init__(self, rest: Values, elements: Ints, rate: Values, *, distance: float) -> None:
@@ -63,7 +64,8 @@ class Pushing(Pairs):
         super().__init__(rest, elements, distance=distance, stiffness=1.0)
         self.by: Ints = np.full((len(rest), rest.shape[1]), NONE, np.int64)
         self.held: Values = np.zeros(len(rest))
-        self._rate, self._width, self._elements = rate, distance, elements
+        self.slip: Values = np.zeros_like(rest)
+        self._rate, self.width, self._elements = rate, distance, elements
         self._used = np.unique(elements)  # ipctk's points
         kind = Kind(distance, 1.0, "ee_candidates")
         self._near = Near(self._mesh, [kind], FARTHEST * distance, MARGIN * distance)
@@ -76,38 +78,40 @@ class Pushing(Pairs):
 
     def energy(self, x: Values) -> float:
         """E(x), J."""
-        met = self._met(x)
-        return 0.5 * float(met.rate @ (self._width - met.at.gap) ** 2)
+        met = self.met(x)
+        return 0.5 * float(met.rate @ (self.width - met.at.gap) ** 2)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
-        met, found = self._met(x), np.zeros_like(x)
-        force = (met.rate * (self._width - met.at.gap))[:, None] * met.at.normal
+        met, found = self.met(x), np.zeros_like(x)
+        force = (met.rate * (self.width - met.at.gap))[:, None] * met.at.normal
         np.add.at(found, met.at.points, -force)
         np.add.at(found, met.at.corners, met.at.share[:, :, None] * force[:, None])
         return found
 
     def least_gap(self, x: Values) -> float:
         """The least gap that is below D, m; infinite where there is none."""
-        return float(self._met(x).at.gap.min(initial=np.inf))
+        return float(self.met(x).at.gap.min(initial=np.inf))
 
-    def arrive(self, x: Values) -> None:
-        """A step is over with points at x (n, d)."""
-        met = self._met(x)
+    def arrive(self, x: Values, slips: Values | None = None) -> None:
+        """A step is over with points at x (n, d), and `slips` (k, d) of what is pushed, m."""
+        met = self.met(x)
         if not len(met.rate) and not self.held.any():
             return
-        by, held = np.full_like(self.by, NONE), np.zeros(len(x))
+        by, held, slip = np.full_like(self.by, NONE), np.zeros(len(x)), np.zeros_like(x)
         by[met.at.points], held[met.at.points] = met.at.corners, met.rate
-        self.hold(by, held)
+        if slips is not None:
+            slip[met.at.points] = slips
+        self.hold(by, held, slip)
 
-    def hold(self, by: Ints, held: Values) -> None:
+    def hold(self, by: Ints, held: Values, slip: Values) -> None:
         """What is pushed from here on."""
-        self.by, self.held, self._met_at = by, held, None
+        self.by, self.held, self.slip, self._met_at = by, held, slip, None
 
     def fastest(self, x: Values, weights: csr_matrix, mass: Values) -> float:
         """What it adds at most to the square of a frequency (carried), 1/s^2, with points near x (n, d) that follow
         nodes of `mass` (nodes,), kg, by `weights` (n, nodes)."""
-        near = self._before(x, AHEAD * self._width)
+        near = self._before(x, AHEAD * self.width)
         k, d = near.at.corners.shape
         if not k:
             return 0.0
@@ -121,15 +125,15 @@ class Pushing(Pairs):
         """By how much any two points at x (n, d) may come closer before a look is due, m: 0 unless none are near."""
         if self.held.any() or len(self._may_meet(x)):
             return 0.0
-        on, found, reach = centred(self._mesh.vertices(x)), ipctk.Candidates(), SEEN * self._width
+        on, found, reach = centred(self._mesh.vertices(x)), ipctk.Candidates(), SEEN * self.width
         found.build(self._mesh, on, on, reach / 2, ipctk.LBVH())
         points, facets = self._numbers(found).T
-        return max(0.0, nearest(x, points, self._elements[facets], reach) - AHEAD * self._width)
+        return max(0.0, nearest(x, points, self._elements[facets], reach) - AHEAD * self.width)
 
-    def _met(self, x: Values) -> Pushed:
+    def met(self, x: Values) -> Pushed:
         """What is pushed."""
         if self._met_at is None or self._met_at[0] is not self._facing(x):
-            self._met_at = self._facing(x), self._before(x, self._width)
+            self._met_at = self._facing(x), self._before(x, self.width)
         return self._met_at[1]
 
     def _before(self, x: Values, reach: float) -> Pushed:
@@ -148,7 +152,7 @@ class Pushing(Pairs):
         """What points are before, or behind; that of the last x is kept."""
         if self._last is None or not np.array_equal(x, self._last[0]):
             points, facets = self._may_meet(x).T
-            found = before(x, points, self._elements[facets], FARTHEST * self._width, ALIKE * self._edge)
+            found = before(x, points, self._elements[facets], FARTHEST * self.width, ALIKE * self._edge)
             self._last = x.copy(), found
         return self._last[1]
 
@@ -166,10 +170,10 @@ class Pushing(Pairs):
         here = centred(on)
         if found is not self._found:
             self._found, self._every = found, self._numbers(found)
-        elif longest(here - self._from) <= MARGIN * self._width:
+        elif longest(here - self._from) <= MARGIN * self.width:
             return self._some
         points, facets = self._every.T
-        reach = (FARTHEST + 2 * MARGIN) * self._width
+        reach = (FARTHEST + 2 * MARGIN) * self.width
         self._some, self._from = self._every[nearer(x, points, self._elements[facets], reach)], here
         return self._some
 
