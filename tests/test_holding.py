@@ -95,8 +95,3 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     run.write_frame()
     rows = [line.split(",") for line in (tmp_path / "pieces.csv").read_text().splitlines()]
     assert rows[0][-1] == "dust" and sorted((row[2], row[-1]) for row in rows[1:])[0] == ("1", "1")
-
-
-def test_not_with_an_energy() -> None:
-    with pytest.raises(ValueError, match="crumbs"):
-        make_study(mesh=MESH, fracture={"strength": 1.0, "energy": 1.0, "crumbs": False})

@@ -34,9 +34,12 @@ HELD = -np.inf  # the load of an edge that joins already, or both ends of which 
 class Joining:
     """Spares, of edges that fail, those that nodes without a whole cell stay joined by."""
 
-    def __init__(self, stress: Stress, graph: EdgeGraph, strength: Strength, held: Flags) -> None:
-        """`held`: (nodes,) whose motion is prescribed, ghosts too."""
+    def __init__(
+        self, stress: Stress, graph: EdgeGraph, strength: Strength, held: Flags, *, cracks: bool = False
+    ) -> None:
+        """`held`: (nodes,) whose motion is prescribed, ghosts too; `cracks` cut what fails: it joins last."""
         self._stress, self._graph, self._strength, self._held = stress, graph, strength, held
+        self._cracks = cracks
         self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
         self._around = CellsAround(graph.domain)
 
@@ -65,6 +68,8 @@ class Joining:
             return np.zeros(len(fails), bool)
         at = np.flatnonzero(~graph.broken & without[graph.edge_nodes].any(axis=1))
         load = self._loads(at, without, stress)
+        if self._cracks:
+            load[fails[at]] = np.finfo(float).max
         load[joined[at] | (self._both & ~fails)[at]] = HELD
         keys, ends = graph.edge_keys(at), graph.edge_nodes[at]
         swapped = graph.domain.node_input[ends[:, 0]] != keys[:, 0]

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..fracture.brittle.rules import SurfaceRules
     from ..fracture.brittle.surfaces import BrittleSurfaces
     from ..fracture.criterion import Average, OverloadedEdges
+    from ..fracture.energy.joined import JoinedTips
+    from ..fracture.energy.tips import CrackTips
     from ..fracture.holding import Holding
     from ..fracture.joining import Joining
     from ..fracture.strength import Strength
@@ -75,7 +77,12 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     pace = tips.pace() if moves and not given else None
     kind = ClosingSplitting if stress.closes else Splitting
     splitting = kind(stress, graph, tips.release_rate() if moves else None)
-    return Breaking(stress, graph, tips, passes=passes, opened=opened, degradation=splitting, pace=pace)
+    criterion: CrackTips | JoinedTips = tips
+    if (joining := _joining(study, balance, graph, strength)) is not None:
+        from ..fracture.energy.joined import JoinedTips
+
+        criterion = JoinedTips(tips, graph, joining)
+    return Breaking(stress, graph, criterion, passes=passes, opened=opened, degradation=splitting, pace=pace)
 
 
 def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
@@ -114,7 +121,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strengt
         return None
     from ..fracture.joining import Joining
 
-    return Joining(balance.stress, graph, strength, balance.motion.held)
+    return Joining(balance.stress, graph, strength, balance.motion.held, cracks=table.energy is not None)
 
 
 def average_of(study: Study, domain: Domain) -> Average | None:

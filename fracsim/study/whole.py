@@ -148,7 +148,6 @@ class Study(Table):
             "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
             "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
             "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
-            "fracture.crumbs": (not table.crumbs, "a crack leaves none: remove it"),
             'output.cut = "forces"': (self.output.cut == "forces", "cracks say where they cut: remove it"),
             "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
             "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),

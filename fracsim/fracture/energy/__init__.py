@@ -12,6 +12,7 @@ seen       the body as tips see it
 mixed      where a crack in tension and sliding turns, and what that releases
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
+joined     the same, without those that would cut a node off
 splitting  what is left of a cell that has come apart
 
 METHOD section 12 says what was tried. A tip cell is whole and has a broken edge; a split cell has come apart.

@@ -81,6 +81,7 @@ class CrackTips:
     Attributes:
         cut: (edges,) where cracks cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
         toughness: G_c in J/m^2, a number or (cells,).    strength: of each edge in each cell.
+        cells: (n,) of this rank that were chosen last.    barred: (cells,) not to be cut (joined).
     """
 
     def __init__(
@@ -97,6 +98,8 @@ class CrackTips:
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
         self._idle = True
+        self.cells: Ints = np.empty(0, np.int64)
+        self.barred: Flags = np.zeros(domain.cell_count, bool)
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
@@ -106,8 +109,11 @@ class CrackTips:
         proposals = [self._grown(self.sight.look(stress, psi)) if found else self._none(0)]
         proposals.append(self._begun(weak, stress) if begun else self._none(1))
         if not found + begun:
+            self.cells = np.empty(0, np.int64)
             return np.empty(0, np.int64), np.empty(0)
-        edges = self._cut(*self._chosen(*proposals))
+        chosen = self._chosen(*proposals)
+        self.cells = np.concatenate([each.cells for each in chosen])
+        edges = self._cut(*chosen)
         return edges, np.ones(len(edges))
 
     def tips(self) -> Tips:
@@ -155,7 +161,7 @@ class CrackTips:
             mature &= size > 0  # a force back is that of other tips in the disc
             turns = mature & np.any(turned, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
-        may = np.flatnonzero(~mature | (size >= toughness))
+        may = np.flatnonzero((~mature | (size >= toughness)) & ~self.barred[tips.cell])
         mean = seen.means(may)
         sigma = largest(mean)
         active = (sigma > 0) & (mature[may] | (sigma >= self._strength_of(tips.cell[may])))
@@ -184,7 +190,7 @@ class CrackTips:
     def _weak(self, stress: Values) -> Ints:
         """Whole cells, farther than R from any crack, whose stress reaches the strength."""
         graph, d, least = self._graph, self._domain.dim, self.strength.weakest
-        cells = np.flatnonzero(~graph.damaged & (frobenius_norm(stress, d) >= least)).astype(np.int64)
+        cells = np.flatnonzero(~(graph.damaged | self.barred) & (frobenius_norm(stress, d) >= least)).astype(np.int64)
         cells = cells[upper_bound(tensors(stress[cells], d)) >= least]
         if len(cells) and len(self.sight.crack.number):
             far = self.sight.crack.tree.query(self.sight.centres[cells])[0]

@@ -1,0 +1,61 @@
+"""Tips that would cut a node off stay where they are: a crack that takes an energy leaves no crumb.
+
+A node that is left without a whole cell stays joined by an edge (fracture.joining). Where a cut itself would break the
+last edge that can join it, the cell is not cut: what it holds is that node and nothing else, so it carries the node's
+inertia alone, has no energy to release, and parts no body from another. A cell is cut as its crack goes or not at all:
+an edge spared of a cut would leave a tip inside the crack, where the energy released is that of its neighbours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ...mesh.edges import EdgeGraph
+from ...mesh.ranks import total
+from ..criterion import Edges
+from ..joining import Joining
+from .tips import CrackTips
+
+Values = npt.NDArray[np.float64]
+
+
+class JoinedTips:
+    """Crack tips without those that would leave a node to itself."""
+
+    def __init__(self, tips: CrackTips, graph: EdgeGraph, joining: Joining) -> None:
+        self._tips, self._graph, self._joining = tips, graph, joining
+        self._pattern = graph.pattern.copy()  # of cells that are barred, as they were barred
+
+    @property
+    def cut(self) -> Values:
+        """(edges,) where cracks cut local edges."""
+        return self._tips.cut
+
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
+        """The edges that cracks cut now, none of them one that has to join (collective)."""
+        graph, barred = self._graph, self._tips.barred
+        barred &= self._pattern == graph.pattern  # it is cut from another side: it may go on
+        while True:
+            edges, load = self._tips(stress, psi)
+            spared = np.zeros(len(graph.broken), bool)
+            spared[edges[~self._joining(edges, stress)]] = True
+            cells = self._tips.cells
+            stuck = cells[spared[graph.cell_edges[cells]].any(axis=1)]
+            if not total(graph.domain.comm, len(stuck))[0]:
+                return edges, load
+            barred[stuck], self._pattern[stuck] = True, graph.pattern[stuck]
+            self._tips.cut[edges] = np.nan
+
+    def moving(self, v: Values, a: Values) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2."""
+        self._tips.moving(v, a)
+
+    def memory(self) -> object:
+        """Where cracks cut."""
+        return self._tips.memory()
+
+    def recall(self, memory: object) -> None:
+        """No more cuts than that; what is barred is found again."""
+        self._tips.barred[:] = False
+        self._tips.recall(memory)
