@@ -17,10 +17,10 @@ from fracsim.mechanics.drawn import Drawn
 from fracsim.output.fields_file import Field
 from fracsim.output.surface.files import SurfaceFiles
 from fracsim.output.surface.frame import Surface
-from fracsim.report.pictures.lettering import in_seconds, in_words, nice
+from fracsim.report.pictures.lettering import in_seconds, in_words, lettered, nice
 from fracsim.report.pictures.look import SIZE, Look, limits_of, size_of
 from fracsim.report.pictures.obstacles import COLOUR
-from fracsim.report.pictures.picture import GAP, render
+from fracsim.report.pictures.picture import GAP, render, tiled
 from fracsim.report.pictures.rims import opening
 from fracsim.report.pictures.skins import SKINS
 from fracsim.study.running import LOOKS
@@ -173,6 +173,62 @@ def test_numbers_in_words() -> None:
     assert [nice(x) for x in (0.0123, 0.7, 49.0)] == pytest.approx([0.01, 0.5, 20.0])
     assert [in_words(x) for x in (0.01, 0.005, 2e-5, 5.0, 0.5)] == ["1 cm", "5 mm", "20 µm", "5 m", "50 cm"]
     assert [in_seconds(t) for t in (0.0, 1.2e-4, 0.45, 2.0)] == ["t = 0 s", "t = 120 µs", "t = 450 ms", "t = 2 s"]
+
+
+@pytest.mark.parametrize("ground", (40, 90, 140, 190, 250))
+def test_letters_can_be_read_on_any_ground(ground: int) -> None:
+    """They differ from their ground, and from their rim, by a contrast of 4.5 and more (WCAG 2.1); where part of the
+    ground is dark and part light, in either part; on a light one they are plain ink."""
+    even = np.full((300, 420, 3), ground, np.uint8)
+    half = even.copy()
+    half[:, 40:] = 250
+    for paper in (even, half):
+        written_on = lettered(paper, title="A title across it all", time="t = 340 µs", pixel=1e-3)
+        changed = np.any(written_on != paper, axis=2)
+        for rows in (slice(0, 26), slice(26, 60), slice(240, 300)):  # title, time, scale bar
+            for columns in (slice(0, 40), slice(40, 420)):
+                letters = written_on[rows, columns][changed[rows, columns]]
+                seen = luminance(np.concatenate([letters, paper[rows, columns].reshape(-1, 3)[:1]]))
+                assert (seen.max() + 0.05) / (seen.min() + 0.05) > 4.5 and len(letters) > 8
+    if ground > 200:
+        assert written_on.max() == ground
+
+
+def luminance(pixels: npt.NDArray[np.integer]) -> Values:
+    """(n,) relative, of sRGB (n, 3)."""
+    share = pixels / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_a_look_colours_skin_and_inside(tmp_path: Path) -> None:
+    """That of the study, or another that is asked for: its skin has that of the bread and of the jade in hue (the ratio
+    of its channels), where the two lie on different sides of red and green; the walls of the crack are paler."""
+    folder = written(tmp_path, 1.0)
+    (folder / "study.toml").write_text('title = "x"\n[output]\nlook = "bread"\n')
+    look = Look(view="1,-2,0.3", size=SMALL, bare=True)
+    for name in ("bread", "jade"):
+        pixels = shown(render(folder, look=look if name == "bread" else replace(look, skin=name)))
+        skin, inside, back = (rgb_of(each) for each in (SKINS[name].skin, SKINS[name].inside, SKINS[name].backdrop))
+        body = pixels[np.abs(pixels - back).max(axis=2) > 12]
+        for part, least in ((skin, 0.3), (inside, 0.01)):
+            apart = np.linalg.norm(body / body.sum(axis=1, keepdims=True) - part / part.sum(), axis=1)
+            assert np.mean(apart < 0.03) > least
+
+
+def rgb_of(colour: str) -> Values:
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], float)
+
+
+def test_a_sheet_is_read_from_left_to_right_and_down() -> None:
+    """Five pictures: three and two, and paper where there is no sixth; up to three stand in one row."""
+    pictures = [np.full((4, 6, 3), 10 * k, np.uint8) for k in range(1, 6)]
+    sheet = tiled(pictures)
+    assert sheet.shape == (2 * 4 + GAP, 3 * 6 + 2 * GAP, 3)
+    down, along = 4 + GAP, 6 + GAP
+    assert [sheet[0, 0, 0], sheet[0, along, 0], sheet[0, 2 * along, 0]] == [10, 20, 30]
+    assert [sheet[down, 0, 0], sheet[down, along, 0], sheet[down, 2 * along, 0]] == [40, 50, 255]
+    assert tiled(pictures[:3]).shape == (4, 3 * 6 + 2 * GAP, 3)
 
 
 # --- floor ---

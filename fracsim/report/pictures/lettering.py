@@ -15,7 +15,10 @@ import numpy.typing as npt
 from .colouring import colours
 
 Pixels = npt.NDArray[np.uint8]
-INK, PALE = (34, 38, 44), (120, 126, 134)
+Colour = tuple[int, int, int]
+INK, PALE = (34, 38, 44), (104, 110, 118)
+LIGHT = (244, 246, 248)  # what is written on a dark ground
+PAPER, EVEN = 230, 150  # of 255: a ground that is nowhere darker needs no more than pale letters, or ink
 SMALL = 1.0 / 45.0  # of the height of the picture: the type
 TICKS = 5
 PREFIXES = {1e3: "km", 1.0: "m", 1e-2: "cm", 1e-3: "mm", 1e-6: "µm"}
@@ -46,21 +49,57 @@ def lettered(
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(pixels)
-    draw, unit = ImageDraw.Draw(image), max(9, round(SMALL * image.height))
+    unit = max(9, round(SMALL * image.height))
+    pen = _Pen(image, ImageDraw.Draw(image), unit)
     edge, bottom = unit, image.height - unit
     if title:
-        draw.text((edge, edge), title, INK, _font(round(1.25 * unit)))
-    draw.text((edge, edge + (1.9 * unit if title else 0)), time, PALE if title else INK, _font(unit))
+        pen.write((edge, edge), title, large=True)
+    pen.write((edge, edge + (1.9 * unit if title else 0)), time, PALE if title else INK)
     if legend is not None:
-        _bar(draw, image, legend, unit)
+        _bar(pen, legend)
     elif keys:
-        _keys(draw, keys, image.width - edge, bottom, unit)
+        _keys(pen, keys, image.width - edge, bottom)
     if pixel > 0:
         length = nice(0.16 * image.width * pixel)
         x, y = edge, bottom
-        draw.rectangle((x, y - max(2, unit // 6), x + round(length / pixel), y), INK)
-        draw.text((x, y - 1.7 * unit), in_words(length), INK, _font(unit))
+        pen.bar((x, y - max(2, unit // 6), x + round(length / pixel), y))
+        pen.write((x, y - 1.7 * unit), in_words(length))
     return np.asarray(image)
+
+
+class _Pen:
+    """Writes so that it can be read on any ground: in light letters on a dark one, and with a rim where a ground is not
+    light all over. On a light ground it is plain ink."""
+
+    def __init__(self, image: Any, draw: Any, unit: int) -> None:
+        self.image, self.draw, self.unit = image, draw, unit
+
+    def write(
+        self, at: tuple[float, float], text: str, ink: Colour = INK, *, anchor: str = "la", large: bool = False
+    ) -> None:
+        """A line of text; `anchor`: Pillow's."""
+        font = _font(round(1.25 * self.unit) if large else self.unit)
+        darkest, most = self._ground(self.draw.textbbox(at, text, font, anchor))
+        if darkest >= EVEN:
+            self.draw.text(at, text, ink if darkest >= PAPER else INK, font, anchor)
+        else:
+            ink, rim = _on(most)
+            self.draw.text(at, text, ink, font, anchor, stroke_width=max(1, self.unit // 8), stroke_fill=rim)
+
+    def bar(self, box: tuple[float, float, float, float]) -> None:
+        """One of the scale."""
+        darkest, most = self._ground(box)
+        self.draw.rectangle(box, *((INK,) if darkest >= EVEN else _on(most)))
+
+    def _ground(self, box: tuple[float, float, float, float]) -> tuple[float, float]:
+        """How light the darkest pixel of a ground is, and the one in the middle, of 255."""
+        ground = np.asarray(self.image.crop(tuple(round(each) for each in box)).convert("L"))
+        return (float(ground.min()), float(np.median(ground))) if ground.size else (255.0, 255.0)
+
+
+def _on(ground: float) -> tuple[Colour, Colour]:
+    """Ink and its rim."""
+    return (INK, LIGHT) if ground >= EVEN else (LIGHT, INK)
 
 
 def nice(length: float) -> float:
@@ -88,30 +127,32 @@ def in_seconds(t: float) -> str:
     return f"t = {t / unit:.4g} {name}" if t else "t = 0 s"
 
 
-def _bar(draw: Any, image: Any, legend: Legend, unit: int) -> None:
+def _bar(pen: _Pen, legend: Legend) -> None:
     """At the lower edge, in the middle."""
     from PIL import Image
 
+    image, draw, unit = pen.image, pen.draw, pen.unit
     width, height = round(0.4 * image.width), unit
     x, y = (image.width - width) // 2, round(image.height - 2.9 * unit)
     low, high = legend.limits
     row = colours(np.linspace(low, high, width), (low, high), "#000000")
     image.paste(Image.fromarray(np.tile(row, (height, 1, 1))), (x, y))
     draw.rectangle((x - 1, y - 1, x + width, y + height), outline=PALE)
-    draw.text((x + width / 2, y - 0.4 * unit), legend.title, INK, _font(unit), anchor="mb")
+    pen.write((x + width / 2, y - 0.4 * unit), legend.title, anchor="mb")
     for share in np.linspace(0, 1, TICKS):
         at = x + share * (width - 1)
         draw.line((at, y + height, at, y + height + unit / 4), INK)
-        draw.text((at, y + height + 0.4 * unit), number(low + share * (high - low)), INK, _font(unit), anchor="mt")
+        pen.write((at, y + height + 0.4 * unit), number(low + share * (high - low)), anchor="mt")
 
 
-def _keys(draw: Any, keys: Sequence[tuple[str, str]], right: float, bottom: float, unit: int) -> None:
+def _keys(pen: _Pen, keys: Sequence[tuple[str, str]], right: float, bottom: float) -> None:
     """One above the other, in the lower right corner."""
+    draw, unit = pen.draw, pen.unit
     wide = max(draw.textlength(text, _font(unit)) for _, text in keys)
     for row, (colour, text) in enumerate(reversed(keys)):
         y = bottom - 1.5 * row * unit
         draw.rectangle((right - wide - 1.6 * unit, y - unit, right - wide - 0.6 * unit, y), colour, PALE)
-        draw.text((right - wide, y), text, INK, _font(unit), anchor="lb")
+        pen.write((right - wide, y), text, anchor="lb")
 
 
 @cache
