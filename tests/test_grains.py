@@ -71,7 +71,7 @@ def test_cuts_are_where_energies_are_equal(dim: int, spread: float) -> None:
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_settled_nodes_have_a_cell_of_their_grain(dim: int) -> None:
-    """Far fewer nodes are without a cell within their grain, and only such nodes have changed their grain."""
+    """No node is without a cell within its grain, and hardly more have changed their grain than were."""
     table = {"count": {2: 60, 3: 12}[dim], "spread": 0.2}
     body, plain = grains_of(dim, **table)
     _, settled = grains_of(dim, settle=True, **table)
@@ -83,7 +83,7 @@ def test_settled_nodes_have_a_cell_of_their_grain(dim: int) -> None:
         return flags
 
     before, after = lost(plain.of_node), lost(settled.of_node)
-    assert before.sum() > 0 and after.sum() <= 0.2 * before.sum()
+    assert before.sum() > 0 and not after.any()
     assert (plain.of_node != settled.of_node).sum() <= 2 * before.sum()
 
 

@@ -93,21 +93,50 @@ def least(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]
 
 
 def _settled(cells: Ints, grain: Ints) -> Ints:
-    """Grains (N,) with the nodes moved over that have no cell within their own grain, into one where they have."""
+    """Grains (N,) with the nodes moved over that have no cell within their own grain: into one where they have, alone
+    or, where there is none, with the other corners of the cell that most of are of one grain."""
     grain = grain.copy()
-    for _ in range(ROUNDS):
-        of = grain[cells]
-        within = np.all(of == of[:, :1], axis=1)
-        lost = np.ones(len(grain), bool)
-        lost[cells[within]] = False
+    lost = _lost(cells, grain)
+    for attempt in range(2 * ROUNDS):
         if not lost.any():
             break
-        moved = grain.copy()
-        for corner in range(cells.shape[1]):
-            rest = np.delete(of, corner, axis=1)
-            one = np.all(rest == rest[:, :1], axis=1) & lost[cells[:, corner]]
-            moved[cells[one, corner]] = rest[one, 0]
+        moved = _moved_alone(cells, grain, lost) if attempt < ROUNDS else grain
         if np.array_equal(moved, grain):
-            break
-        grain = moved
+            moved = _moved_with_cells(cells, grain, lost)
+            if np.count_nonzero(_lost(cells, moved)) >= np.count_nonzero(lost):
+                break
+        grain, lost = moved, _lost(cells, moved)
     return grain
+
+
+def _lost(cells: Ints, grain: Ints) -> Flags:
+    """(N,) nodes without a cell within their own grain."""
+    of = grain[cells]
+    lost = np.ones(len(grain), bool)
+    lost[cells[np.all(of == of[:, :1], axis=1)]] = False
+    return lost
+
+
+def _moved_alone(cells: Ints, grain: Ints, lost: Flags) -> Ints:
+    """Lost nodes in the grain that all other corners of a cell of theirs are of."""
+    of, moved = grain[cells], grain.copy()
+    for corner in range(cells.shape[1]):
+        rest = np.delete(of, corner, axis=1)
+        one = np.all(rest == rest[:, :1], axis=1) & lost[cells[:, corner]]
+        moved[cells[one, corner]] = rest[one, 0]
+    return moved
+
+
+def _moved_with_cells(cells: Ints, grain: Ints, lost: Flags) -> Ints:
+    """All corners of one cell of each lost node in the grain that most of the cell's corners are of."""
+    near = cells[lost[cells].any(axis=1)]
+    of = grain[near]
+    like = (of[:, :, None] == of[:, None, :]).sum(axis=2)
+    most = of[np.arange(len(near)), like.argmax(axis=1)]
+    row, corner = np.nonzero(lost[near])
+    order = np.lexsort((row, -like.max(axis=1)[row], near[row, corner]))
+    _, first = np.unique(near[row, corner][order], return_index=True)
+    chosen = row[order][first]
+    moved = grain.copy()
+    moved[near[chosen]] = most[chosen, None]
+    return moved
