@@ -35,7 +35,7 @@ class Entry:
 
     Attributes:
         name: of its file.    text: what is seen.    runs: arguments of `fracsim run` with the name of the folder first.
-        render: arguments of `fracsim render` but for its folders and files.
+        render: arguments of `fracsim render` but for its folders and files; without runs a module that draws the file.
     """
 
     name: str
@@ -50,6 +50,10 @@ def one(study: str, text: str, render: str) -> Entry:
 
 
 CUTS = "--set mesh.h=0.012 --set time.end=0.2 --set output.cut="
+NVE36 = (
+    "--set 'material.like=steel NVE 36 at 23 C' --set material.energy=corotated --set plasticity.update=implicit"
+    " --set fracture.energy=false --set fracture.radius=8e-4 --set time.step=1e-5 --set time.breaking_step=1e-5"
+)
 AVERAGED = "doormat --set fracture.radius=0.05 --set fracture.strength=2e5 --set time.step=4e-4"
 ENTRIES = (
     one("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,15,20,-1 --floor"),
@@ -57,6 +61,10 @@ ENTRIES = (
         "cuts", "Edges cut in the middle, by nodal forces, and so that the crack is smooth (M22 fig. 12).",
         tuple((f"cut-{each}", f"loaf {CUTS}{each}") for each in ("middle", "forces", "smooth")),
         "--view 1.1,-1.0,0.5 --zoom 1.4 --size 1400x1100",
+    ),
+    Entry(
+        "loaf-frames", "The loaf as it tears, from left to right and down (M22 fig. 13).", (("loaf", "loaf"),),
+        "--sheet 4,13,15,17,19,22,26,32,-1 --floor --size 1200x800",
     ),
     one("bread", "Bread that flows before it tears (M22 fig. 15).", "--sheet 0,30,40,-1 --floor"),
     one("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
@@ -102,7 +110,22 @@ ENTRIES = (
     one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor --zoom 1.2"),
     one("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.3"),
     one("rigid-boats", "Rowing boats dropped in a heap.", "--sheet 0,6,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.2"),
+    Entry(
+        "rigid-beside", "The same vase dropped as a body that deforms, after 1 ms, and as a rigid one, after 32 ms.",
+        (("dropped-vase", "dropped-vase"), ("rigid-dropped-vase", "rigid-dropped-vase")),
+        "--frame 16 --field piece --view 0.4,-1.5,0.3 --size 1100x800",
+    ),
+    Entry(
+        "rigid-trials", "A bar cracked by snapshots of a penalty, strained by three pins; strain of rotations.", (),
+        "fracsim.studies.rigid_trials",
+    ),
     one("brazilian", "A disk of granite split between platens.", "--field stress:xx --zoom 0.85"),
+    Entry(
+        "steels", "Charpy and Izod bars of steel A516 at -40 C, which snap, and of NVE 36 at 23 C, which bend.",
+        (("charpy-A516", "charpy"), ("charpy-NVE36", f"charpy {NVE36}"),
+         ("izod-A516", "izod"), ("izod-NVE36", f"izod {NVE36}")), "--size 1400x600",
+    ),
+    one("kalthoff", "A plate of steel struck below its notch: stress upwards.", "--field stress:yy --zoom 0.8"),
 )  # fmt: skip
 
 
@@ -132,9 +155,12 @@ def simulate(folder: str, arguments: str, *, again: bool) -> None:
 
 def draw(entry: Entry) -> None:
     """Its picture."""
-    folders = [str(RUNS / folder) for folder, _ in entry.runs]
     target = picture_of(entry)
-    subprocess.run(["fracsim", "render", *folders, "-o", str(target), *shlex.split(entry.render)], check=True)
+    if entry.runs:
+        folders = [str(RUNS / folder) for folder, _ in entry.runs]
+        subprocess.run(["fracsim", "render", *folders, "-o", str(target), *shlex.split(entry.render)], check=True)
+    else:
+        subprocess.run([sys.executable, "-m", entry.render, str(target)], check=True)
     make_small(target)
 
 
@@ -166,11 +192,10 @@ def text_of(entry: Entry) -> str:
     seconds = sum(cpu_of(RUNS / folder) for folder, _ in entry.runs) or told(entry.name)
     lines = [f"    ./env fracsim run {arguments} -o {RUNS / folder}" for folder, arguments in entry.runs]
     folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
-    lines.append(f"    ./env fracsim render {folders} {entry.render}")
-    body = "\n".join(lines)
-    return (
-        f"## {entry.name}\n\n![{entry.text}](gallery/{entry.name}.png)\n\n{entry.text} {seconds:.0f} s.\n\n{body}\n\n"
-    )
+    last = f"fracsim render {folders} {entry.render}" if entry.runs else f"python3 -m {entry.render} {entry.name}.png"
+    body = "\n".join([*lines, f"    ./env {last}"])
+    said = f"{entry.text} {seconds:.0f} s." if entry.runs else entry.text
+    return f"## {entry.name}\n\n![{entry.text}](gallery/{entry.name}.png)\n\n{said}\n\n{body}\n\n"
 
 
 def told(name: str) -> float:
