@@ -1,12 +1,13 @@
 """Analyses of bodies that were struck in one step, spread over ranks; the engine is on the first of them.
 
 Every rank has the mesh, and the damage of its copies. Strikes of a step do not feel one another: each sees the surfaces
-that there were before, and may open its share of those that are left, so that what comes of it is the same on any
-number of ranks. Those that have used theirs up share what the others left.
+that there were before, and may open its share of those that are left of its copy, so that what comes of it is the same
+on any number of ranks. Those that have used theirs up share what the others left.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -57,20 +58,26 @@ class Analyses:
 
     def __call__(self, strikes: list[Strike]) -> dict[int, int]:
         """How many edges broke, by the names of bodies. Raises NotConverged."""
-        bodies, broken = self._bodies, {each.name: 0 for each in strikes}
-        waiting = strikes
-        while waiting and bodies.left:
-            few, more = divmod(bodies.left, len(waiting))
-            tasks = [replace(each, share=few + (k < more)) for k, each in enumerate(waiting)]
-            found = self._spread([each for each in tasks if each.share])
-            bodies.take(found)
+        broken = {each.name: 0 for each in strikes}
+        while tasks := self._shared(strikes):
+            found = self._spread(tasks)
+            self._bodies.take(found)
             for opened in found:
                 broken[opened.name] += len(opened.keys)
-            spent = {
-                opened.name for opened, task in zip(found, tasks, strict=False) if len(opened.starts) == task.share
-            }
-            waiting = [each for each in waiting if each.name in spent] + waiting[len(found) :]
+            having = {each.name for each in tasks}
+            spent = {each.name for each, task in zip(found, tasks, strict=True) if len(each.starts) == task.share}
+            strikes = [each for each in strikes if each.name in spent or each.name not in having]
         return broken
+
+    def _shared(self, strikes: list[Strike]) -> list[Strike]:
+        """Strikes with their shares of the surfaces that their copies have left; without those that get none."""
+        left = [self._bodies.left(each.name) for each in strikes]
+        of, before, tasks = Counter(number for number, _ in left), Counter[int](), list[Strike]()
+        for each, (number, many) in zip(strikes, left, strict=True):
+            few, more = divmod(many, of[number])
+            tasks.append(replace(each, share=few + (before[number] < more)))
+            before[number] += 1
+        return [each for each in tasks if each.share]
 
     def _spread(self, strikes: list[Strike]) -> list[Opened]:
         """What opened, in their order."""

@@ -221,11 +221,6 @@ class Breakable:
         return self._kept[key]
 
     @property
-    def started(self) -> int:
-        """Surfaces that have opened."""
-        return 0 if self._criterion is None else len(self._criterion.starts)
-
-    @property
     def left(self) -> int:
         """Surfaces that may still open."""
         return 0 if self._criterion is None else self._criterion.left

@@ -70,11 +70,11 @@ class Copies:
         """Cells that have come apart."""
         return sum(int(np.count_nonzero(each.graph.split)) for each in self._made.values())
 
-    @property
-    def left(self) -> int:
-        """Surfaces that may still open, in all of them."""
-        made = [*self._made.values()] or [self.copy(0)]
-        return made[0].left - sum(each.started for each in made[1:])
+    def left(self, name: int) -> tuple[int, int]:
+        """The copy that the body of a name is of, and the surfaces that may still open in it: each copy has its own, or
+        what is struck first would take those of all."""
+        number = name // self.nodes
+        return number, self.copy(number).left
 
     # --- strikes ---
 
@@ -82,7 +82,7 @@ class Copies:
         """Whether forces of this sum (N) could break the body of a name; see `Breakable`."""
         number, node = divmod(name, self.nodes)
         each = self.copy(number)
-        return self.left > 0 and each.may_break(each.piece_of(node), force)
+        return each.may_break(each.piece_of(node), force)
 
     def opened(self, name: int, points: Values, force: Values, radius: Values, share: int) -> Opened:
         """What forces (k, 3) on circles of radii (k,) about points (k, 3) of a body at rest open, N and m; at most

@@ -103,7 +103,7 @@ class Grains(Table):
 class Brittle(Table):
     """[brittle]: instead of single edges, surfaces from the cells of highest averaged principal stress break."""
 
-    surfaces: Annotated[int, Field(ge=1, strict=True)]  # most surfaces of the run: more of them, more debris
+    surfaces: Annotated[int, Field(ge=1, strict=True)]  # most of the run, of each rigid body: more, more debris
     spacing: Positive | None = None  # m between places where surfaces start; default: about two mesh edges
     shape: Literal["planar", "curved"] = "planar"  # curved: turns with the principal direction
     seed: Annotated[int, Field(ge=0, strict=True)] = 0  # of the direction where several principal stresses are equal

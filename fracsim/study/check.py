@@ -273,7 +273,7 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"bodies      {copies} times the mesh; motion on one rank, no fields.xdmf"
     if study.brittle is not None and study.fracture is not None:
         yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
-        yield f"brittle     {_brittle(study.brittle)}"
+        yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
     else:
         yield "fracture    off: nothing is analysed"
     yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle) or 'none'}"
