@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
+import fracsim.rigid.engine as engine_of_mujoco
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.engine import Engine
@@ -83,6 +84,23 @@ def test_a_ball_bounces_with_its_restitution(restitution: float) -> None:
         after, _ = run(Engine(bodies, [[ball]], [floor()], Rules(step, FREE, 0.0, restitution)), bodies, 100)
         assert after.velocity[0, 2] / 2.0 == pytest.approx(restitution, abs=2e-4)
         assert after.place[0, 2] >= 0.5 - 1e-9
+
+
+def test_soft_contacts_first_lead_to_the_same_hard_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty-four blocks that spin and fall in a heap: solved at once, and from softer contacts on, which is for crowds
+    that Newton's method alone gets lost in."""
+    grid = 1.02 * np.indices((4, 4, 4)).reshape(3, -1).T + 0.53
+    spin = 5.0 * np.random.default_rng(1).normal(size=(64, 3))
+    falling = replace(cubes(grid.tolist()), velocity=np.tile(6.0 * DOWN / G, (64, 1)), spin=spin)
+    found = []
+    for at_once in (engine_of_mujoco.AT_ONCE, 1):
+        monkeypatch.setattr(engine_of_mujoco, "AT_ONCE", at_once)
+        engine = Engine(falling, [[CUBE]] * 64, [floor()], Rules(5e-3, DOWN, 0.4))
+        found.append(run(engine, falling, 1))
+    (one, touches), (other, others) = found
+    assert len(touches[0]) > 100 and not np.array_equal(one.velocity, other.velocity)
+    assert np.allclose(one.velocity, other.velocity, atol=1e-5) and np.allclose(one.spin, other.spin, atol=1e-4)
+    assert np.allclose(received(touches, 64), received(others, 64), rtol=1e-5)
 
 
 def test_what_spins_onto_a_floor_does_not_sink_into_it() -> None:

@@ -22,7 +22,7 @@ Part = Values | Primitive  # corners (n, 3) of a hull about the body's centre, i
 
 HARD = 0.9999  # impedance of contacts, which MuJoCo lets be no harder: what they give way by, in steps, is 1 - HARD
 IMPEDANCE = [HARD, HARD, 1e-3, 0.5, 2.0]
-TOLERANCE = 1e-10  # of MuJoCo's solver, to the mean inertia
+TOLERANCE, ITERATIONS = 1e-10, 200  # of MuJoCo's solver, to the mean inertia, and at most
 HELD = 1e6  # mass of what is driven, in masses of all bodies
 LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
 SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
@@ -163,7 +163,7 @@ def _spec(rules: Rules) -> Any:
     option = spec.option
     option.timestep, option.gravity = rules.step, rules.gravity
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.tolerance, option.iterations = TOLERANCE, 200
+    option.tolerance, option.iterations = TOLERANCE, ITERATIONS
     spec.compiler.balanceinertia = True  # of a sliver, which round-off has made flatter than flat
     spec.default.geom.solref, spec.default.geom.solimp = _law(rules), IMPEDANCE
     spec.default.geom.condim = 3
