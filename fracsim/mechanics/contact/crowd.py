@@ -173,8 +173,9 @@ class Surface:
         share[tight] = np.maximum(IN * share[tight], least := np.minimum(LEAST, share[tight]))
         changed = not np.array_equal(share, self.at.share)
         if changed:
+            every = np.unique(self.made.elements[self._walls])
             end = (x := self.at(u)).copy()
-            end[tight] = self.at.some(u, tight, least)
+            end[every] = self.at.some(u, every, np.minimum(LEAST, self.at.share[every]))
             self.pairs.look_along(x, end)  # once for all the shares that follow
             self.at = self.at.drawn_in(share)
         return changed
