@@ -72,8 +72,9 @@ def run(
 
 
 def _dust(summary: dict[str, Any]) -> str:
-    """How many of the pieces are single nodes."""
-    return f", {dust} of them dust (single nodes)" if (dust := summary.get("dust")) else ""
+    """How many of the pieces are single nodes, and what leaves none."""
+    dust = summary.get("dust")
+    return f", {dust} of them dust (single nodes; [fracture] crumbs = false leaves none)" if dust else ""
 
 
 @app.command()
