@@ -178,6 +178,12 @@ def test_a_crack_in_space_has_an_area(tmp_path: Path) -> None:
     assert rows["crack_area"][-1] == pytest.approx(0.25**2 * np.hypot(1, 0.2), rel=1e-9)
 
 
+def test_a_body_in_space_without_a_crack_has_none_in_its_history(tmp_path: Path) -> None:
+    """With a fracture energy, and nothing broken yet."""
+    rows = run(BAR, tmp_path / "out", fracture={"strength": 1e9, "energy": 1e9}, time={"end": 0.01}, probe=[])
+    assert rows["crack_area"][-1] == 0.0
+
+
 # --- check tells, and refuses ---------------------------------------------------------------------------------------
 
 

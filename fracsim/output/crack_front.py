@@ -67,7 +67,7 @@ class CrackFront:
     def _corners(self, cells: npt.NDArray[np.integer], count: int) -> Values:
         """(n, count, d) places of the cuts of cells with so many."""
         points = self._points(cells)
-        return points[~np.isnan(points[..., 0])].reshape(len(cells), count, -1)
+        return points[~np.isnan(points[..., 0])].reshape(len(cells), count, points.shape[-1])
 
     def _tips(self) -> Values:
         """(n, 3 + d) of this rank's cells that cracks have come into and not left: when, which edge (two input nodes),
