@@ -59,7 +59,7 @@ class Holding:
         kept = fails[edges]
         return edges[kept], load[kept]
 
-    def moving(self, v: Values, a: Values) -> None:
+    def moving(self, v: Values, a: Values, dt: float) -> None:
         """Stress is all that counts."""
 
     def memory(self) -> object:

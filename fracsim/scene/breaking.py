@@ -13,6 +13,7 @@ from ..mesh.domain import Domain
 from ..stepping.after_step import Flow, NoFlow
 from ..study import Brittle, Study
 from ..study.conditions import cracks, fibre_direction
+from ..study.tearing import refuse_forks
 from .material import per_cell
 
 Values = npt.NDArray[np.float64]
@@ -70,9 +71,10 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     from ..fracture.energy.tips import CrackTips
 
     assert study.fracture is not None and study.fracture.energy is not None
+    refuse_forks(study, balance.domain.dim)
     stress, strength = balance.stress, strength_of(study, balance.domain, graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
-    tips = CrackTips(stress, graph, strength, toughness, opened)
+    tips = CrackTips(stress, graph, strength, toughness, opened, branching=study.fracture.branching)
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     pace = tips.pace() if moves and not given else None
     kind = ClosingSplitting if stress.closes else Splitting

@@ -35,6 +35,7 @@ class Fracture(Table):
 
     strength: Strength
     energy: Positive | None = None  # G_c, J/m^2: cracks advance where they release it; None: edges break one by one
+    branching: Flag = False  # with energy, in the plane and with inertia: a tip to which 2 G_c flows goes on as two
     approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     # neighbours: no radius, one average over the cells that share a node

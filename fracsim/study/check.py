@@ -28,7 +28,7 @@ from .lengths import fits
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 from .order import bent, has_round_sides
 from .resultants import resultants
-from .tearing import tearing
+from .tearing import refuse_forks, tearing
 from .turning import MUCH, turned
 
 if TYPE_CHECKING:
@@ -208,6 +208,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     like = f"; like {study.material.like}" if study.material.like else ""
     yield f"material    {study.material.energy}{plane}{regions}{like}"
     if study.fracture is not None and study.fracture.energy is not None:
+        refuse_forks(study, anatomy.dim)
         first, *others = tearing(study, anatomy.h, float(np.max(np.subtract(anatomy.upper, anatomy.lower))))
         yield f"fracture    {first}"
         yield from (f"            {line}" for line in others)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from ..errors import InputError
 from . import Study
 from .body import Region
 
@@ -28,6 +29,12 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
         yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa"
         yield f"{where}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
         yield from _unfit(length, strength, h, side)
+
+
+def refuse_forks(study: Study, dim: int) -> None:
+    """InputError where cracks in space are to branch."""
+    if dim == 3 and study.fracture is not None and study.fracture.branching:
+        raise InputError("fracture.branching: cracks branch in the plane only; remove it, or take a 2D mesh")
 
 
 def plane_modulus(study: Study, region: Region) -> float:

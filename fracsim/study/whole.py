@@ -141,6 +141,14 @@ class Study(Table):
     @model_validator(mode="after")
     def _energy_stands_alone(self) -> Study:
         table = self.fracture
+        if table is not None and table.branching:
+            if table.energy is None:
+                raise ValueError("fracture.branching needs fracture.energy: tips branch where that of two cracks flows")
+            if self.time.scheme == "quasi-static":
+                raise ValueError(
+                    "fracture.branching needs inertia: a slow crack is given no more than it takes; remove it, or "
+                    'choose time.scheme = "explicit" or "newmark"'
+                )
         if table is None or table.energy is None:
             return self
         others = {

@@ -66,7 +66,7 @@ class BrittleSurfaces:
         edges = self._cut_edges(opened)
         return edges, np.ones(len(edges))
 
-    def moving(self, v: Values, a: Values) -> None:
+    def moving(self, v: Values, a: Values, dt: float) -> None:
         """Stress is all that counts."""
 
     def memory(self) -> tuple[Values, Values]:

@@ -10,6 +10,7 @@ neighbourhoods  what lies around the tips, kept until cracks change
 front      in space: the crack that an advance makes, by which g is divided
 seen       the body as tips see it
 mixed      where a crack in tension and sliding turns, and what that releases
+branching  where a crack becomes two, and tips that share a disc
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
 joined     the same, without those that would cut a node off

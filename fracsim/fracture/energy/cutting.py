@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ...mesh.simplices import local_edges
 from ..cracks import CLOSEST
+from .branching import ANGLE, rotated
 from .front import partitions
 
 Flags = npt.NDArray[np.bool_]
@@ -73,6 +74,27 @@ def leave(corners: Values, entry: Ints, point: Values, normal: Values, ahead: Va
     aside = np.take_along_axis(turned, first, 1) & less & (worse == 0)
     edge = np.take_along_axis(ways, np.where((worse > 0) | aside, 1 - first, first), 1)[:, 0]
     return Cuts(rows[:, 0], edge, share[rows[:, 0], edge])
+
+
+def fork(
+    corners: Values, entry: Ints, point: Values, normal: Values, ahead: Values, torn: Flags, branches: Flags
+) -> Cuts:
+    """Where cracks leave their cells: as `leave` has it, and those that branch (n,) by both other edges where lines at
+    ANGLE to `ahead` do; in a cell where they do not they go on as one, to branch in the next."""
+    one = leave(corners, entry, point, normal, ahead, torn)
+    rows = np.flatnonzero(branches)
+    if not len(rows):
+        return one
+    ways = []
+    for angle in (ANGLE, -ANGLE):
+        way = rotated(ahead[rows], angle)
+        ways.append(leave(corners[rows], entry[rows], point[rows], rotated(way, np.pi / 2), way, torn[rows]))
+    two = ways[0].edge != ways[1].edge
+    single = np.ones(len(entry), bool)
+    single[rows[two]] = False
+    parts = [Cuts(one.row[single], one.edge[single], one.share[single])]
+    parts += [Cuts(rows[two], each.edge[two], each.share[two]) for each in ways]
+    return Cuts(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("row", "edge", "share")))
 
 
 def _along(exits: Values, point: Values, ahead: Values) -> Values:

@@ -47,9 +47,9 @@ class JoinedTips:
             barred[stuck], self._pattern[stuck] = True, graph.pattern[stuck]
             self._tips.cut[edges] = np.nan
 
-    def moving(self, v: Values, a: Values) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2."""
-        self._tips.moving(v, a)
+    def moving(self, v: Values, a: Values, dt: float) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2, in a step of dt s."""
+        self._tips.moving(v, a, dt)
 
     def memory(self) -> object:
         """Where cracks cut."""

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from ...mesh.edges import EdgeGraph
 from ..brittle.principal import largest
-from .around import Around, pairs_within
+from . import branching
+from .around import Around, Pairs, pairs_within
 from .crack import Crack
 from .force import plateau, plateau_gradient
 from .front import Front, advance
@@ -46,7 +47,10 @@ class Tips:
     Attributes:
         cell: (n,) local, rising.    pattern: (n,) of its cut edges.    point: (n, d) m.
         behind: (n, d) the middle of the crack nearer than R, m.    mature: (n,) whether there is any beyond R.
-        ahead: (n, d) in space the crack that an advance makes, m; in the plane 0.
+        ahead: (n, d) the crack that an advance makes: in space m, in the plane in tips (branching).
+        course: (n, d) from the middle of the crack nearer than 2 R to the tip, m; only where cracks branch.
+        parts: (n, d) whither it goes abreast of another in its disc; 0 where there is none, and in space.
+        waits: (n,) whether it lets that other go first.    alone: (n,) whether no other tip's disc lies over its own.
         surface: (n, d) int q n dA of the body's own surface in the disc, m^2.
     """
 
@@ -56,6 +60,10 @@ class Tips:
     behind: Values
     mature: Flags
     ahead: Values
+    course: Values
+    parts: Values
+    waits: Flags
+    alone: Flags
     surface: Values
 
     def __len__(self) -> int:
@@ -78,10 +86,14 @@ class Neighbourhoods:
         tips: as they were when `update` was called last.    asked: the cells around them.
     """
 
-    def __init__(self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach) -> None:
+    def __init__(
+        self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach, *, forks: bool
+    ) -> None:
+        """`forks`: whether cracks branch."""
         self._around, self._crack, self._graph, self._front, self._reach = around, crack, graph, front, reach
-        none, nowhere = np.empty(0, np.int64), np.empty((0, graph.domain.dim))
-        self.tips = Tips(none, none.astype(np.uint8), nowhere, nowhere, none > 0, nowhere, nowhere)
+        self._forks = forks
+        none, nowhere, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
+        self.tips = Tips(none, none.astype(np.uint8), nowhere, nowhere, no, nowhere, nowhere, nowhere, no, no, nowhere)
         self._split = np.zeros(len(around.number), bool)
         # the tip and the cell (among those near) of each pair, and the cell's weights in the sums of `_Sum`
         self._place: Ints = none
@@ -166,12 +178,12 @@ class Neighbourhoods:
         order = np.argsort(every, kind="stable")
         self._place, self._cell = every[order], np.concatenate([self._cell[stays], cells])[order]
         self._weights = np.concatenate([self._weights[stays], weights])[order]
-        behind, ahead, surfaces = np.zeros((3, *point.shape))
-        mature = np.zeros(len(cell), bool)
+        behind, ahead, course, parts, surfaces = np.zeros((5, *point.shape))
+        mature, waits, alone = np.zeros((3, len(cell)), bool)
         surfaces[new] = surface
-        self.tips = Tips(cell, graph.pattern[cell], point, behind, mature, ahead, surfaces)
-        for now, then in ((behind, old.behind), (mature, old.mature), (ahead, old.ahead), (surfaces, old.surface)):
-            now[kept] = then[row[kept]]
+        self.tips = Tips(cell, graph.pattern[cell], point, behind, mature, ahead, course, parts, waits, alone, surfaces)
+        for each in ("behind", "mature", "ahead", "course", "parts", "waits", "alone", "surface"):
+            getattr(self.tips, each)[kept] = getattr(old, each)[row[kept]]
         return ~kept
 
     def _surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
@@ -191,7 +203,10 @@ class Neighbourhoods:
             return np.zeros(len(self.tips), bool)
         disc, beyond = self._reach.disc[self.tips.cell], self._reach.beyond[self.tips.cell]
         apart = cKDTree(changed).query(self.tips.point)[0]
-        return np.asarray(apart <= np.maximum(disc + beyond, disc * (1 + 1 / LEAST_DISC)))
+        farthest = (
+            disc * (1 + 1 / LEAST_DISC) if changed.shape[1] == 3 else 2 * (1 + self._forks) * disc
+        )  # others' tips, and what they see
+        return np.asarray(apart <= np.maximum(disc + beyond, farthest))
 
     def _look_back(self, rows: Ints) -> None:
         """Find the crack behind tips."""
@@ -200,15 +215,41 @@ class Neighbourhoods:
         full, split = disc + self._reach.beyond[tips.cell[rows]], np.flatnonzero(crack.split)
         pairs = pairs_within(cKDTree(crack.centre[split]), point, np.maximum(full, disc * (1 + 1 / LEAST_DISC)))
         cells, r = split[pairs.other], disc[pairs.place]
-        within = (pairs.distance < r).astype(float)
-        back = within[:, None] * (crack.middle[cells] - point[pairs.place])
-        tips.behind[rows] = point + over(pairs.sum(back), pairs.sum(within)[:, None])
+        tips.behind[rows] = self._behind(pairs, cells, point, disc)
         tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < full[pairs.place]))
         if point.shape[1] == 3:
             sides = np.zeros((len(r), 3))
             near = np.flatnonzero(pairs.distance < r * (1 + 1 / LEAST_DISC))
             sides[near] = advance(crack.polygon[cells[near]], point[pairs.place[near]], r[near])
             tips.ahead[rows] = along_the_surface(pairs.sum(sides), tips.surface[rows], disc)
+        else:
+            self._look_aside(rows, disc)
+
+    def _behind(self, pairs: Pairs, cells: Ints, point: Values, disc: Values) -> Values:
+        """(n, d) mean of the cuts of split cells (pairs,) of the crack nearer than `disc` to points, m."""
+        within = (pairs.distance < disc[pairs.place]).astype(float)
+        back = within[:, None] * (self._crack.middle[cells] - point[pairs.place])
+        return point + over(pairs.sum(back), pairs.sum(within)[:, None])
+
+    def _look_aside(self, rows: Ints, disc: Values) -> None:
+        """Find the tips whose discs lie over those of tips, in the plane."""
+        tips, crack = self.tips, self._crack
+        every = np.flatnonzero(~crack.split)
+        pairs = pairs_within(cKDTree(crack.middle[every]), tips.point[rows], (1 + self._forks) * disc)
+        other = crack.middle[every[pairs.other]]
+        along = self._way(other, disc[pairs.place])
+        tips.ahead[rows] = branching.advance(pairs, along, disc)
+        if self._forks:
+            tips.alone[rows] = np.bincount(pairs.place, minlength=len(rows)) == 1
+            tips.course[rows] = course = self._way(tips.point[rows], 2 * disc)
+            theirs = self._way(other, 2 * disc[pairs.place])
+            tips.parts[rows], tips.waits[rows] = branching.parted(pairs, course[pairs.place], theirs, disc)
+
+    def _way(self, point: Values, radius: Values) -> Values:
+        """(n, d) from the middle of the crack nearer than `radius` to points, m."""
+        split = np.flatnonzero(self._crack.split)
+        pairs = pairs_within(cKDTree(self._crack.centre[split]), point, radius)
+        return point - self._behind(pairs, split[pairs.other], point, radius)
 
 
 def along_the_surface(ahead: Values, surface: Values, radius: Values) -> Values:

@@ -83,8 +83,8 @@ class Sight:
         motion: (owned dofs,) velocity in m/s and acceleration in m/s^2; None where nothing moves.
     """
 
-    def __init__(self, stress: Stress, graph: EdgeGraph, reach: Reach) -> None:
-        """(Collective)."""
+    def __init__(self, stress: Stress, graph: EdgeGraph, reach: Reach, *, forks: bool = False) -> None:
+        """`forks`: whether cracks branch (collective)."""
         self._stress, self._graph, self._reach = stress, graph, reach
         domain = self._domain = stress.domain
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
@@ -92,7 +92,7 @@ class Sight:
         farthest = domain.comm.allreduce(float(np.max(reach.disc, initial=0.0)), op=MPI.MAX)
         self._near, self._front = Around(domain, farthest), Front(domain, graph)
         self.crack = Crack(graph, self._front, self.centres)
-        self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach)
+        self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks)
         # of the coordinates of cells, NaN until somebody looks there
         self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
         self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))

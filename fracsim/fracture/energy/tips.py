@@ -8,6 +8,7 @@ strength f_t, or, at a tip, the mean square over 3 h that of a crack at G_c.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,8 @@ from ..criterion import Edges
 from ..edge_stress import frobenius_norm
 from ..strength import Strength, hashed
 from .around import local_size
-from .cutting import Cuts, cleave, leave, through_centre
+from .branching import TIPS, each, rotated, unit
+from .cutting import Cuts, cleave, fork, through_centre
 from .mixed import gain, kink, phase
 from .neighbourhoods import Reach, Tips
 from .seen import Seen, Sight
@@ -51,8 +53,8 @@ class Proposal:
         rank: (n, d + 4): 0 for a tip and 1 for a new crack, - sigma_1 in Pa, a hash, the place, and how near no other
             may be, m.
         cells: (n,) local.    stress: (n, d, d) averaged, Pa.
-        entry, ahead, turns: (n,) local edge where the crack came in, (n, d) whither it goes, and (n,) whether it goes
-            just there, not across the first principal stress; None of new cracks.
+        entry, ahead, turns, branches: (n,) local edge where the crack came in, (n, d) whither it goes, (n,) whether it
+            goes just there, not across the first principal stress, and whether it branches; None of new cracks.
     """
 
     rank: Values
@@ -61,6 +63,7 @@ class Proposal:
     entry: Ints | None = None
     ahead: Values | None = None
     turns: Flags | None = None
+    branches: Flags | None = None
 
     @property
     def place(self) -> Values:
@@ -72,7 +75,8 @@ class Proposal:
         entry = None if self.entry is None else self.entry[rows]
         ahead = None if self.ahead is None else self.ahead[rows]
         turns = None if self.turns is None else self.turns[rows]
-        return Proposal(self.rank[rows], self.cells[rows], self.stress[rows], entry, ahead, turns)
+        branches = None if self.branches is None else self.branches[rows]
+        return Proposal(self.rank[rows], self.cells[rows], self.stress[rows], entry, ahead, turns, branches)
 
 
 class CrackTips:
@@ -85,19 +89,28 @@ class CrackTips:
     """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, toughness: PerCell, opened: Values | None = None
+        self,
+        stress: Stress,
+        graph: EdgeGraph,
+        strength: Strength,
+        toughness: PerCell,
+        opened: Values | None = None,
+        *,
+        branching: bool = False,
     ) -> None:
-        """`opened`: (edges,) where the cracks that are there already cut edges (collective)."""
+        """`opened`: (edges,) where the cracks that are there already cut edges; `branching`: whether a tip may become
+        two (collective)."""
         self._stress, self._graph, self.strength, self.toughness = stress, graph, strength, toughness
         domain = self._domain = stress.domain
         self.cut: Values = np.full(len(graph.broken), np.nan) if opened is None else opened.copy()
         self._h = local_size(domain)
         self.disc = DISC[domain.dim]
-        self.sight = Sight(stress, graph, Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h))
+        reach = Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h)
+        self.sight = Sight(stress, graph, reach, forks=branching)
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
-        self._idle = True
+        self._idle, self._branching, self._dt = True, branching, np.inf
         self.cells: Ints = np.empty(0, np.int64)
         self.barred: Flags = np.zeros(domain.cell_count, bool)
 
@@ -120,9 +133,9 @@ class CrackTips:
         """Those of this rank (collective)."""
         return self.sight.follow(self.cut)
 
-    def moving(self, v: Values, a: Values) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2."""
-        self.sight.motion = v, a
+    def moving(self, v: Values, a: Values, dt: float) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2; cracks may branch where a step sees the waves at a tip."""
+        self.sight.motion, self._dt = (v, a), dt
 
     def memory(self) -> Values:
         """Where cracks cut."""
@@ -142,9 +155,13 @@ class CrackTips:
             shear * (0.862 + 1.14 * poisson) / (1 + poisson) / (self.disc * self._h)
         )  # c_R: Viktorov (1967)
 
+    @cached_property
+    def _rate(self) -> Values:
+        return self.release_rate()
+
     def pace(self) -> float:
         """Passes a second in which a tip, cell by cell, keeps up with a Rayleigh wave and no more (collective)."""
-        fastest = float(np.max(self.release_rate(), initial=0.0))
+        fastest = float(np.max(self._rate, initial=0.0))
         return CELLS[self._domain.dim] * self.disc * float(self._domain.comm.allreduce(fastest, op=MPI.MAX))
 
     # --- what is active ---
@@ -154,14 +171,19 @@ class CrackTips:
         tips, d = seen.tips, self._domain.dim
         h, toughness = self._h[tips.cell], np.broadcast_to(self.toughness, len(self._h))[tips.cell]
         force, mature = seen.forces(), tips.mature.copy()
-        size, turns = np.linalg.norm(force, axis=1), np.zeros(len(tips), bool)
-        ahead = np.where(mature[:, None], force, tips.point - tips.behind)
+        size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
+        ahead, apart = np.where(mature[:, None], force, tips.point - tips.behind), APART[d] * h
         if d == 2:
-            size, turned = self._turned(seen.means(np.arange(len(tips)), whole=True), tips.point - tips.behind, force)
+            size, turned = self._turned(seen.means(np.arange(len(tips)), whole=True), tips, force)
             mature &= size > 0  # a force back is that of other tips in the disc
-            turns = mature & np.any(turned, axis=1)
+            turns, abreast = mature & np.any(turned, axis=1), np.any(tips.parts, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
-        may = np.flatnonzero((~mature | (size >= toughness)) & ~self.barred[tips.cell])
+            if self._branching:
+                branches = turns & tips.alone & (size >= TIPS * toughness)
+                branches &= self._rate[tips.cell] * self._dt <= 1  # a Rayleigh wave stays in the disc within a step
+                ahead = np.where(branches[:, None], tips.course, ahead)
+            apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
+        may = np.flatnonzero((~mature | (size >= toughness)) & ~(tips.waits | self.barred[tips.cell]))
         mean = seen.means(may)
         sigma = largest(mean)
         active = (sigma > 0) & (mature[may] | (sigma >= self._strength_of(tips.cell[may])))
@@ -169,23 +191,21 @@ class CrackTips:
         strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips.cell] * toughness / (AVERAGE * h))[may[weak]]
         active[weak] = np.sqrt(seen.squares(may[weak])) >= strained
         rows = may[active]
-        rank = self._ranked(0, sigma[active], tips.point[rows], APART[d] * h[rows])
+        rank = self._ranked(0, sigma[active], tips.point[rows], apart[rows])
         entry = np.argmax(~self._graph.intact(tips.cell[rows]), axis=1)
-        return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows])
+        return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows], branches[rows])
 
     @staticmethod
-    def _turned(stress: Values, along: Values, force: Values) -> tuple[Values, Values]:
+    def _turned(stress: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
         """(n,) what cracks that turn release, J/m^2, and (n, 2) whither; 0 where nothing lies behind.
 
         Of the force that along the crack: the stress along its sides, and the wave in it, push across it besides.
         """
-        length = np.linalg.norm(along, axis=1)
-        tangent = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
-        psi = phase(stress, tangent)
-        c, s = np.cos(kink(psi)), np.sin(kink(psi))
-        turned = np.column_stack([c * tangent[:, 0] - s * tangent[:, 1], s * tangent[:, 0] + c * tangent[:, 1]])
-        straight = np.einsum("ni,ni->n", force, tangent)
-        return np.where(length > 0, straight * gain(psi), np.linalg.norm(force, axis=1)), turned
+        tangent, abreast = unit(tips.point - tips.behind), np.any(tips.parts, axis=1)
+        psi = np.where(abreast, 0.0, phase(stress, tangent))
+        straight = each(force, tips.ahead, tangent) * gain(psi)
+        turned = np.where(abreast[:, None], tips.parts, rotated(tangent, kink(psi)))
+        return np.where(np.any(tangent, axis=1), straight, np.linalg.norm(force, axis=1)), turned
 
     def _weak(self, stress: Values) -> Ints:
         """Whole cells, farther than R from any crack, whose stress reaches the strength."""
@@ -209,7 +229,7 @@ class CrackTips:
     def _none(self, kind: int) -> Proposal:
         """Nothing of a kind."""
         d, none = self._domain.dim, np.empty(0, np.int64)
-        return Proposal(np.empty((0, d + 4)), none, np.empty((0, d, d)), none, np.empty((0, d)), none > 0)
+        return Proposal(np.empty((0, d + 4)), none, np.empty((0, d, d)), none, np.empty((0, d)), none > 0, none > 0)
 
     def _strength_of(self, cells: Ints) -> Values:
         """(n,) Pa: the mean over the edges of each cell."""
@@ -273,11 +293,10 @@ class CrackTips:
         corners, normals = self._corners(grown.cells), self._normals(grown.stress, grown.cells)
         if self._domain.dim == 3:
             return cleave(corners, ~self._graph.intact(grown.cells), grown.place, normals)
-        assert grown.turns is not None
-        across = np.column_stack([-grown.ahead[:, 1], grown.ahead[:, 0]])
-        normals = np.where(grown.turns[:, None], across, normals)
+        assert grown.turns is not None and grown.branches is not None
+        normals = np.where(grown.turns[:, None], rotated(grown.ahead, np.pi / 2), normals)
         torn = self._torn()[self._graph.cell_edges[grown.cells]]
-        return leave(corners, grown.entry, grown.place, normals, grown.ahead, torn)
+        return fork(corners, grown.entry, grown.place, normals, grown.ahead, torn, grown.branches)
 
     def _through(self, begun: Proposal) -> Cuts:
         return through_centre(self._corners(begun.cells), self._normals(begun.stress, begun.cells))

@@ -1,0 +1,76 @@
+"""Where a crack branches, and how tips go that share a disc (in the plane).
+
+    g = G a,   a = sum_k q(x_k) t_k      of tips x_k in the disc, along t_k, that take up G each
+    G >= 2 G_c                           the crack branches
+
+A disc with several tips advances them all, so that its force is over all of them, as that in space is over the crack
+that an advance makes (front). Two cracks take up 2 G_c: a tip that is given so much goes on as two (Eshelby 1970). A
+crack at rest can, too: each of two short branches releases 0.52 of what the one does straight on. Only where waves
+carry energy to a tip faster than it gets on: a slow crack never sees more than G_c, and where steps are longer than
+that a crack runs on within them. And only where no other tip's disc lies over its own.
+
+The stress in discs that lie over each other is neither tip's, nor does their force say which is to go. Until branches
+are two discs' radii apart they keep level, and each goes straight on, at the angle at which short branches open and do
+not slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there as well).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from .around import Pairs
+from .force import plateau
+
+Flags = npt.NDArray[np.bool_]
+Values = npt.NDArray[np.float64]
+
+TIPS = 2.0  # G over G_c from which on there is enough for two
+ABREAST, LEAD = 0.5, 0.2  # of R: tips no more apart along their way go abreast; and the one that is so far ahead waits
+ANGLE = np.radians(27.0)  # between each branch and the crack that they come from
+
+
+def unit(vectors: Values) -> Values:
+    """(n, 2) of length 1; 0 stays."""
+    length = np.linalg.norm(vectors, axis=1)[:, None]
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def rotated(vectors: Values, angle: float | Values) -> Values:
+    """(n, 2) turned anti-clockwise by an angle or (n,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
+
+
+def advance(pairs: Pairs, along: Values, radius: Values) -> Values:
+    """(n, 2) a, of pairs of places and the tips in their discs, which go `along` (pairs, 2); a place is one of them."""
+    return pairs.sum(plateau(pairs.distance, radius[pairs.place])[:, None] * unit(along))
+
+
+def each(force: Values, advance: Values, tangent: Values) -> Values:
+    """(n,) G, J/m^2: g . a / |a|^2, or along the tip's own tangent where the others in its disc come towards it."""
+    square = np.einsum("ni,ni->n", advance, advance)
+    towards = (square < 1) | (np.einsum("ni,ni->n", advance, tangent) < 1)
+    shared = np.einsum("ni,ni->n", force, advance) / np.where(towards, 1.0, square)
+    return np.where(towards, np.einsum("ni,ni->n", force, tangent), shared)
+
+
+def parted(pairs: Pairs, own: Values, other: Values, radius: Values) -> tuple[Values, Flags]:
+    """(n, 2) whither tips go that run abreast of another, 0 for others, and (n,) whether they wait.
+
+    `own`, `other`: (pairs, 2) how the place and the other tip go, of any length. `radius`: (n,) R, m. Each at ANGLE to
+    the way of both, away from the nearest other.
+    """
+    both, disc = unit(own + other), radius[pairs.place]
+    left = -np.einsum("ni,ni->n", pairs.apart, rotated(both, np.pi / 2))
+    lead = -np.einsum("ni,ni->n", pairs.apart, both)
+    abreast = (np.abs(lead) <= ABREAST * disc) & (np.einsum("ni,ni->n", own, other) > 0) & (left != 0)
+    rows = np.flatnonzero(abreast)
+    rows = rows[np.lexsort([pairs.distance[rows], pairs.place[rows]])]
+    place, first = np.unique(pairs.place[rows], return_index=True)
+    rows = rows[first]
+    way, waits = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
+    near = pairs.distance[rows] < disc[rows]
+    way[place[near]] = rotated(both[rows[near]], np.sign(left[rows[near]]) * ANGLE)
+    waits[place] = lead[rows] > LEAD * disc[rows]
+    return way, waits

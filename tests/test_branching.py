@@ -1,0 +1,239 @@
+"""Where cracks branch: the share of tips in a disc against energy, the angle against fine elements, and a strip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gmsh
+import numpy as np
+import numpy.typing as npt
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import LinearProblem
+from dolfinx.io import gmshio
+from mpi4py import MPI
+
+from fracsim.errors import InputError
+from fracsim.fracture.energy.around import Pairs
+from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
+from fracsim.fracture.energy.cutting import fork, leave
+from fracsim.mesh.domain import distribute
+from fracsim.scene import Scene, build_scene, scene_on
+from fracsim.study.check import check_study
+from support.scenes import make_scene, make_study, march
+from support.squares import square
+from support.strip import run_of_a_strip
+from support.tearing import RUNS
+from support.tips import seen, tips
+
+Values = npt.NDArray[np.float64]
+
+YOUNG, POISSON = 1.0, 0.3
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_each_tip_of_a_disc_takes_up() -> None:
+    """g = G (t_1 + q t_2) of tips that go apart; one that comes towards the tip is left out."""
+    t = rotated(np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([0.4, -0.4]))
+    advance = t[:1] + 0.7 * t[1:]
+    np.testing.assert_allclose(each(3 * advance, advance, t[:1]), 3.0)
+    towards = t[:1] - 0.6 * t[:1]
+    np.testing.assert_allclose(each(2 * t[:1], towards, t[:1]), 2.0)
+
+
+def test_tips_abreast_go_apart() -> None:
+    """Each at ANGLE to the way of both, from the other, and the one that is ahead by over h = R / 5 waits; not those
+    behind one another, nor those that meet."""
+    ways = rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.2, -0.2]))
+
+    def pair(apart: list[float], own: Values, other: Values) -> tuple[Values, bool]:
+        vector, none = np.array([apart]), np.zeros(1, np.int64)
+        both = Pairs(none, none, vector, np.linalg.norm(vector, axis=1), 1)
+        way, waits = parted(both, own[None], other[None], np.array([2.0]))
+        return way[0], bool(waits[0])
+
+    c, s = np.cos(ANGLE), np.sin(ANGLE)
+    np.testing.assert_allclose(pair([0.1, -1.0], ways[0], ways[1])[0], [c, s])
+    np.testing.assert_allclose(pair([0.1, 1.0], ways[1], ways[0])[0], [c, -s])
+    assert [pair([lead, 1.0], ways[1], ways[0])[1] for lead in (0.5, -0.39, -0.41)] == [False, False, True]
+    assert not pair([1.1, 1.0], ways[1], ways[0])[0].any()
+    assert not pair([0.1, 1.0], ways[1], -ways[1])[0].any()
+    assert not pair([0.0, 0.0], ways[1], ways[1])[0].any()
+
+
+def test_a_cell_is_cut_in_three_where_both_ways_out_are_free() -> None:
+    """A crack that comes in at the middle of a side and makes for the corner leaves by both others, at ANGLE to where
+    it goes; one that makes for the middle of a side goes on as one."""
+    corners = np.repeat([[[0.0, -1.0], [0.0, 1.0], [1.0, 0.0]]], 2, axis=0)
+    entry, point = np.array([2, 2]), np.zeros((2, 2))  # local edges: opposite to 0, 1 and 2
+    ahead = rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.1, 0.8]))
+    torn, yes = np.zeros((2, 3), bool), np.ones(2, bool)
+    one = leave(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn)
+    cuts = fork(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn, yes)
+    assert sorted(cuts.row) == [0, 0, 1] and len(set(cuts.edge[cuts.row == 0])) == 2
+    assert cuts.share[cuts.row == 1] == one.share[1] and cuts.edge[cuts.row == 1] == one.edge[1]
+    ends = {0: (1, 2), 1: (0, 2)}
+    for edge, share in zip(cuts.edge[cuts.row == 0], cuts.share[cuts.row == 0], strict=True):
+        first, second = (corners[0, k] for k in ends[int(edge)])
+        place = first + share * (second - first)
+        assert abs(abs(np.arctan2(place[1], place[0]) - 0.1) - ANGLE) < 1e-9
+    whole = fork(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn, ~yes)
+    np.testing.assert_array_equal(whole.edge, one.edge)
+
+
+# --- against energy, and fine elements -------------------------------------------------------------------------------
+
+
+def forked(length: float, n: int = 40) -> Scene:
+    """A plate of 1 m, pulled by 1 mm, cracked to its middle, with two branches at ANGLE."""
+    at = np.array([0.5, 0.503])
+    ends = at + length * rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([ANGLE, -ANGLE]))
+    study = make_study(
+        material={"energy": "linear", "young": YOUNG, "poisson": POISSON, "density": 1.0},
+        fracture={"strength": 1e9, "energy": 1e9},
+        crack=[{"segment": [[-0.1, at[1]], at.tolist()]}, *({"segment": [at.tolist(), end.tolist()]} for end in ends)],
+        boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": [0.0, 1e-3]}],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )  # fmt: skip
+    scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", n)), study)
+    scene.stepper.advance(scene.start())
+    return scene
+
+
+def test_two_tips_in_a_disc_share_its_force() -> None:
+    """G of branches shorter than R, whose discs lie over each other, is what the plate lets go as both get longer, to a
+    fifth; the force on each is twice that."""
+    books = []
+    for length in (0.03, 0.05, 0.07):
+        scene = forked(length)
+        now, reached = seen(scene), tips(scene)
+        assert len(reached) == 2
+        along = now.tips.point - now.tips.behind
+        tangent = along / np.linalg.norm(along, axis=1)[:, None]
+        force = now.forces()
+        released = each(force, now.tips.ahead, tangent)
+        size = np.linalg.norm(reached - [0.5, 0.503], axis=1).sum()
+        books.append((scene.balance.stress.stored(), size, released.mean(), np.linalg.norm(force, axis=1).mean()))
+    (before, start, *_), (_, _, G, whole), (after, end, *_) = books
+    taken = (before - after) / (end - start)
+    assert pytest.approx(taken, rel=0.2) == G
+    assert whole > 1.8 * taken
+
+
+def branch(angle: float, length: float = 0.02, finest: float = 5e-5) -> tuple[float, float]:
+    """K_I and K_II, over that of the crack, of two short branches of a long crack under K_I.
+
+    Quadratic elements on the upper half of a disk with the field of the crack around it; both from the opening and
+    sliding along the branch, extrapolated to its tip. Shares no code with the program.
+    """
+    mu, kappa = YOUNG / 2 / (1 + POISSON), 3 - 4 * POISSON
+    lmbda = YOUNG * POISSON / (1 + POISSON) / (1 - 2 * POISSON)
+    c, s = np.cos(angle), np.sin(angle)
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Terminal", 0)
+    g = gmsh.model.geo
+    below, above = (g.addPoint(0, 0, 0, length / 10) for _ in range(2))
+    tip = g.addPoint(length * c, length * s, 0, finest)
+    right, far, top, left = (g.addPoint(*each, 0, 0.1) for each in ((1, 0), (c, s), (0, 1), (-1, 0)))
+    under, over, on, axis = (g.addLine(*each) for each in ((below, tip), (above, tip), (tip, far), (below, right)))
+    arcs = [g.addCircleArc(a, below, b) for a, b in ((right, far), (far, top), (top, left))]
+    side = g.addLine(left, above)
+    wedge = g.addPlaneSurface([g.addCurveLoop([axis, arcs[0], -on, -under])])
+    rest = g.addPlaneSurface([g.addCurveLoop([over, on, arcs[1], arcs[2], side])])
+    g.synchronize()
+    for dim, tags, number in ((2, [wedge, rest], 1), (1, [axis], 2), (1, arcs, 3)):
+        gmsh.model.addPhysicalGroup(dim, tags, number)
+    gmsh.model.mesh.generate(2)
+    mesh, _, facets = gmshio.model_to_mesh(gmsh.model, MPI.COMM_SELF, 0, gdim=2)
+    gmsh.finalize()
+
+    def field(x: Values) -> Values:
+        r, t = np.hypot(x[0], x[1]), np.arctan2(x[1], x[0])
+        cos, sin = np.cos(t / 2), np.sin(t / 2)
+        return np.asarray(np.sqrt(r / 2 / np.pi) / 2 / mu * np.array(
+            [cos * (kappa - 1 + 2 * sin**2), sin * (kappa + 1 - 2 * cos**2)]
+        ))  # fmt: skip
+
+    V = fem.functionspace(mesh, ("P", 2, (2,)))
+    outer = fem.Function(V)
+    outer.interpolate(field)
+    across, _ = V.sub(1).collapse()
+    held = fem.locate_dofs_topological((V.sub(1), across), 1, facets.find(2))
+    conditions = [
+        fem.dirichletbc(outer, fem.locate_dofs_topological(V, 1, facets.find(3))),
+        fem.dirichletbc(fem.Function(across), held, V.sub(1)),
+    ]
+
+    def strain(w: Any) -> Any:
+        return ufl.sym(ufl.grad(w))
+
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    stress = 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(2)
+    nothing = ufl.inner(fem.Constant(mesh, (0.0, 0.0)), v) * ufl.dx
+    options = {"ksp_type": "preonly", "pc_type": "lu"}
+    solved = LinearProblem(ufl.inner(stress, strain(v)) * ufl.dx, nothing, conditions, petsc_options=options).solve()
+
+    x, moved = V.tabulate_dof_coordinates()[:, :2], solved.x.array.reshape(-1, 2)
+    along, off = x @ [c, s], np.abs(x @ [-s, c])
+    near = np.flatnonzero((off < 1e-9) & (along > 0.9 * length) & (along < length - 3 * finest))
+    near = near[np.lexsort([np.arctan2(*moved[near].T), np.round(along[near], 9)])].reshape(-1, 2)
+    jump = moved[near[:, 0]] - moved[near[:, 1]]
+    jump *= np.sign(jump @ [-s, c])[:, None]
+    r = length - along[near[:, 0]]
+    scale = (mu * np.sqrt(2 * np.pi / r) / (kappa + 1))[:, None]
+    opening, sliding = np.polyfit(r, scale * jump @ np.array([[-s, c], [c, s]]).T, 1)[1]
+    return float(opening), float(sliding)
+
+
+def test_short_branches_open_and_do_not_slide() -> None:
+    """K_II is 0 at ANGLE, to 2 degrees, where each branch releases 0.52 of what the crack straight on does."""
+    angles = ANGLE + np.radians([-6, 6])
+    (opening, low), (_, high) = map(branch, angles)
+    assert np.interp(0.0, [low, high], angles) == pytest.approx(ANGLE, abs=np.radians(2))
+    assert opening**2 == pytest.approx(0.52, abs=0.015)
+
+
+# --- cracks that run -------------------------------------------------------------------------------------------------
+
+
+def test_a_strip_branches_where_it_stores_enough_for_two() -> None:
+    """One that stores 1.5 G_c a metre has one crack, for two would take more than there is; with 2.5 it has two."""
+    assert run_of_a_strip(1.5, "explicit", "unstructured", 12, branching=True).tips == 1
+    assert run_of_a_strip(2.5, "explicit", "unstructured", 12, branching=True).tips == 2
+
+
+def test_a_crack_that_is_loaded_slowly_does_not_branch() -> None:
+    """A step four times as long as starts the crack, without inertia, tears the plate along one line."""
+    tables = RUNS["notched"] | {"time": {"scheme": "quasi-static", "step": 6.0, "end": 12.0}}
+    study = make_study(**{key: value for key, value in tables.items() if key != "mesh"})
+    scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", 16)), study)
+    state = scene.start()
+    while not scene.ended(state):
+        state, _ = scene.stepper.advance(state)
+    assert scene.fracture.graph.split.sum() > 10
+    assert not np.any(scene.fracture.graph.pattern == 7)
+
+
+def test_a_step_that_sees_no_waves_makes_no_branches() -> None:
+    """The plate whose crack branches on every rank count, in steps in which a wave leaves the disc of a tip."""
+    tables = RUNS["forked"]
+    for step, end, branches in ((5e-4, 8e-3, True), (7e-3, 14e-3, False)):
+        scene, state = make_scene(**tables | {"time": tables["time"] | {"step": step, "end": end}})
+        for _ in march(scene, state):
+            pass
+        assert scene.fracture.graph.split.sum() > 10
+        assert np.any(scene.fracture.graph.pattern == 7) == branches
+
+
+def test_cracks_in_space_do_not_branch() -> None:
+    """Refused by `check` and by a run, in one sentence."""
+    study = make_study(
+        mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.5},
+        fracture={"strength": 1.0, "energy": 1.0, "branching": True},
+    )
+    for way in (check_study, lambda study: build_scene(MPI.COMM_SELF, study)):
+        with pytest.raises(InputError, match="in the plane only"):
+            list(way(study))
