@@ -170,7 +170,7 @@ class Surface:
     def _shorten(self, u: Values, walls: Ints) -> bool:
         """Whether the arms of any of these walls can be shortened, which they are."""
         share, tight = self.at.share.copy(), np.unique(self.made.elements[walls])
-        share[tight] = np.maximum(IN * share[tight], least := np.minimum(LEAST, share[tight]))
+        share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
         changed = not np.array_equal(share, self.at.share)
         if changed:
             every = np.unique(self.made.elements[self._walls])
