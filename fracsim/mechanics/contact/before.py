@@ -37,10 +37,36 @@ class Before:
         )  # fmt: skip
 
 
-def nearer(x: Values, points: Ints, corners: Ints, reach: float) -> Flags:
-    """(k,) whether points are nearer than `reach` m to facets (k, d), with points at x (n, d)."""
-    _, way = _nearest(x, points, corners)
-    return np.asarray(np.einsum("kd,kd->k", way, way) < reach**2)
+class Watched:
+    """Nearest places of points (k,) on facets with corners (k, d), found anew where either has moved."""
+
+    def __init__(self, points: Ints, corners: Ints) -> None:
+        self.points, self.corners = points, corners
+        self._share, self._way = np.zeros(corners.shape), np.zeros(corners.shape)
+        self._known = np.zeros(len(points), bool)
+        self._x: Values | None = None
+
+    def __call__(self, x: Values, rows: Ints) -> tuple[Values, Values]:
+        """(r, d) shares of the nearest places of some of them, and ways (r, d) from there to the points at x (n, d),
+        m."""
+        if self._x is None or x.shape != self._x.shape:
+            self._known[:] = False
+        elif x is not self._x:
+            self._known &= ~self.of((x != self._x).any(axis=1))
+        self._x = x
+        if len(new := rows[~self._known[rows]]):
+            self._share[new], self._way[new] = _nearest(x, self.points[new], self.corners[new])
+            self._known[new] = True
+        return self._share[rows], self._way[rows]
+
+    def of(self, moved: Flags) -> Flags:
+        """(k,) those of which the point or a corner is among (n,)."""
+        return np.asarray(moved[self.points] | moved[self.corners].any(axis=1))
+
+    def nearer(self, x: Values, rows: Ints, reach: float) -> Flags:
+        """(r,) whether some of them are nearer than `reach` m."""
+        _, way = self(x, rows)
+        return np.asarray(np.einsum("kd,kd->k", way, way) < reach**2)
 
 
 def nearest(x: Values, points: Ints, corners: Ints, most: float) -> float:
@@ -49,13 +75,13 @@ def nearest(x: Values, points: Ints, corners: Ints, most: float) -> float:
     return min(most, float(np.linalg.norm(way, axis=1).min(initial=most)))
 
 
-def before(x: Values, points: Ints, corners: Ints, reach: float, alike: float) -> Before:
-    """Those nearer than `reach`, m, one facet for each place: of facets that share it, at distances `alike` but
-    for so many m, the one that looks most towards the point or away from it, which tells the side."""
-    share, way = _nearest(x, points, corners)
+def before(x: Values, watched: Watched, rows: Ints, reach: float, alike: float) -> Before:
+    """Of some pairs those nearer than `reach`, m, one facet for each place: of facets that share it, at distances
+    `alike` but for so many m, the one that looks most towards the point or away from it, which tells the side."""
+    share, way = watched(x, rows)
     distance = np.linalg.norm(way, axis=1)
     close = np.flatnonzero(distance < reach)
-    points, corners = points[close], corners[close]
+    points, corners = watched.points[rows[close]], watched.corners[rows[close]]
     share, way, distance = share[close], way[close], distance[close]
     normal = normals(x[corners])
     along = np.einsum("kd,kd->k", way, normal)

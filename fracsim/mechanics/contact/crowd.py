@@ -9,6 +9,7 @@ again, and those left out come back, where nothing acts on them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, repeat
 from typing import ClassVar
 
 import numpy as np
@@ -34,6 +35,7 @@ Memory = tuple[Values, Ints, tuple[int, int]]
 
 GAP = 2.0  # between the sides of a new crack, in distances of the barrier (recede)
 IN, LEAST = 0.7, 0.2  # what is left of an arm each time that it is shortened, and in all
+GENTLY = 4  # times, and then at once: in a crowd one wall makes room for the next, and each look costs
 LONGEST_PAUSE = 16  # steps
 NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
 ROUND_OFF = 1e-6  # of a pressure
@@ -167,10 +169,10 @@ class Surface:
     def _cutting(self, u: Values) -> Ints:
         return np.intersect1d(self._walls, self.pairs.overlaps(self.at(u)))
 
-    def _shorten(self, u: Values, walls: Ints) -> bool:
-        """Whether the arms of any of these walls can be shortened, which they are."""
+    def _shorten(self, u: Values, walls: Ints, left: float) -> bool:
+        """Whether the arms of any of these walls can be shortened, which they are: to that share of what they were."""
         share, tight = self.at.share.copy(), np.unique(self.made.elements[walls])
-        share[tight] = np.maximum(IN * share[tight], np.minimum(LEAST, share[tight]))
+        share[tight] = np.maximum(left * share[tight], np.minimum(LEAST, share[tight]))
         changed = not np.array_equal(share, self.at.share)
         if changed:
             every = np.unique(self.made.elements[self._walls])
@@ -183,9 +185,10 @@ class Surface:
     def _settle(self, u: Values, load: Values) -> None:
         """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
         so. Pairs are those of all elements."""
-        start = self.at.share
-        while self._shorten(u, self._pressed(u, load)) or self._shorten(u, cut := self._cutting(u)):
-            pass
+        start, left = self.at.share, chain(repeat(IN, GENTLY), repeat(LEAST))
+        for each in left:
+            if not (self._shorten(u, self._pressed(u, load), each) or self._shorten(u, cut := self._cutting(u), each)):
+                break
         crowded = np.union1d(self._pressed(u, np.maximum(load, self.close * self._how["stiffness"])), cut)
         self._leave_out(crowded)
         if len(crowded):  # what is out is to come back as it was, not smaller each time

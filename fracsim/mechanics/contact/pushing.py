@@ -21,13 +21,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .before import Before, before, nearer, nearest
+from .before import Before, Watched, before, nearest
 from .carried import SOME
-from .near import Kind, Near, centred, longest
+from .near import Kind, Near, centred
 from .pairs import Pairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 FARTHEST = 3.0  # distances D: gaps that are looked at; what is deeper has gone through
 MARGIN = 1.0  # distances D: how far points may go before candidates are looked for again
@@ -69,9 +70,9 @@ class Pushing(Pairs):
         self._used = np.unique(elements)  # ipctk's points
         kind = Kind(distance, 1.0, "ee_candidates")
         self._near = Near(self._mesh, [kind], FARTHEST * distance, MARGIN * distance)
-        self._found: ipctk.Candidates | None = None  # of which `_every` are, and `_some` near where points were then
-        self._every: Ints
-        self._some: Ints
+        self._found: ipctk.Candidates | None = None  # all of which are watched, and some close where points were then
+        self._watched: Watched
+        self._close: Flags
         self._from: Values
         self._last: tuple[Values, Before] | None = None
         self._met_at: tuple[Before, Pushed] | None = None
@@ -151,9 +152,8 @@ class Pushing(Pairs):
     def _facing(self, x: Values) -> Before:
         """What points are before, or behind; that of the last x is kept."""
         if self._last is None or not np.array_equal(x, self._last[0]):
-            points, facets = self._may_meet(x).T
-            found = before(x, points, self._elements[facets], FARTHEST * self.width, ALIKE * self._edge)
-            self._last = x.copy(), found
+            here, rows = x.copy(), self._may_meet(x)
+            self._last = here, before(here, self._watched, rows, FARTHEST * self.width, ALIKE * self._edge)
         return self._last[1]
 
     def _rates_of(self, at: Before) -> Values:
@@ -163,19 +163,22 @@ class Pushing(Pairs):
         return np.where(held > 0, held, np.minimum(self._rate[at.points], takes))
 
     def _may_meet(self, x: Values) -> Ints:
-        """(k, 2) points and facets that may be as near, or as deep, as counts: of ipctk's candidates those that were
-        when points were last near here."""
+        """(k,) which of the pairs that are watched may be as near, or as deep, as counts: those that were when their
+        points were last near here."""
         on = self._mesh.vertices(x)
         (found,) = self._near.candidates(on)
-        here = centred(on)
+        here, reach = centred(on), (FARTHEST + 3 * MARGIN) * self.width
         if found is not self._found:
-            self._found, self._every = found, self._numbers(found)
-        elif longest(here - self._from) <= MARGIN * self.width:
-            return self._some
-        points, facets = self._every.T
-        reach = (FARTHEST + 2 * MARGIN) * self.width
-        self._some, self._from = self._every[nearer(x, points, self._elements[facets], reach)], here
-        return self._some
+            points, facets = self._numbers(found).T
+            self._found, self._watched, self._from = found, Watched(points, self._elements[facets]), here
+            self._close = self._watched.nearer(x.copy(), np.arange(len(points)), reach)
+        elif (gone := np.sum((here - self._from) ** 2, axis=1) > (MARGIN * self.width) ** 2).any():
+            moved = np.zeros(len(x), bool)
+            moved[self._used[gone]] = True
+            rows = np.flatnonzero(self._watched.of(moved))
+            self._close[rows] = self._watched.nearer(x.copy(), rows, reach)
+            self._from = np.where(gone[:, None], here, self._from)
+        return np.flatnonzero(self._close)
 
     def _numbers(self, found: ipctk.Candidates) -> Ints:
         """(k, 2) points and facets of ipctk's candidates."""
