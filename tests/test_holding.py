@@ -15,10 +15,12 @@ from fracsim.fracture.holding import LIMIT, Holding
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
+from fracsim.study.check import check_study
 from support.failing import Failing
 from support.scenes import make_scene, make_study
 
 Values = npt.NDArray[np.float64]
+MATERIAL = {"young": 1.0, "poisson": 0.3, "density": 1.0}
 MESH = {"builder": "box", "size": [1.0, 1.0], "h": 0.25, "pattern": "unstructured"}
 
 
@@ -98,3 +100,12 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     run.write_frame()
     rows = [line.split(",") for line in (tmp_path / "pieces.csv").read_text().splitlines()]
     assert rows[0][-1] == "dust" and sorted((row[2], row[-1]) for row in rows[1:])[0] == ("1", "1")
+
+
+@pytest.mark.parametrize(("energy", "approach", "said"), [("corotated", "edge", True), ("linear", "edge", False)])
+def test_check_says_where_nodes_come_off_all_the_same(energy: str, approach: str, said: bool) -> None:
+    tables = {
+        "material": MATERIAL | {"energy": energy},
+        "fracture": {"strength": 1.0, "approach": approach, "crumbs": False},
+    }
+    assert any("crumbs = false" in line for line in check_study(make_study(mesh=MESH, **tables))) == said

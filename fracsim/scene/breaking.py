@@ -115,11 +115,10 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
 
 
 def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining | None:
-    """What nodes without a whole cell stay joined by. None with crumbs, nor where cells are turned back before their
-    strain is projected: what hangs on one edge is held along it alone, has no rotation, and steps fail."""
+    """What nodes without a whole cell stay joined by."""
     table = study.fracture
     assert table is not None
-    if table.crumbs or (table.approach == "edge" and study.material.energy == "corotated"):
+    if not table.joins(study.material.energy):
         return None
     from ..fracture.joining import Joining
 

@@ -49,6 +49,11 @@ class Fracture(Table):
     heterogeneity: Heterogeneity | None = None
     fibre: Fibre | None = None
 
+    def joins(self, energy: str) -> bool:
+        """Whether nodes without a whole cell stay joined. Not with crumbs, nor where cells are turned back before their
+        strain is projected: what hangs on one edge is held along it alone, has no rotation, and steps fail."""
+        return not (self.crumbs or (self.approach == "edge" and energy == "corotated"))
+
     @model_validator(mode="after")
     def _neighbours_have_no_radius(self) -> Fracture:
         if self.kernel == "neighbours" and self.radius:

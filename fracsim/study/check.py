@@ -214,6 +214,10 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         yield from (f"            {line}" for line in others)
     else:
         yield f"fracture    {_fracture(study)}"
+        table = study.fracture
+        if table is not None and not table.crumbs and not table.joins(study.material.energy):
+            yield '            note: crumbs = false holds no node with approach = "edge" and the corotated energy;'
+            yield '            energy = "linear" or approach = "chi" keeps them'
     for line in fits(study, _least_side(anatomy)):
         yield f"            {line}"
     yield f"plasticity  {_plasticity(study)}"
