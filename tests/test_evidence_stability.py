@@ -391,6 +391,15 @@ def test_angle_of_kalthoffs_crack(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert experiments.measured_kalthoff(tmp_path)["angle"] == pytest.approx(np.degrees(1.1))
 
 
+def test_the_branches_of_a_crack() -> None:
+    """A straight crack, from 20 mm on two at 20 and 30 degrees, with a short one aside; none where there is one."""
+    x, aside = np.arange(0.0, 0.05, 2e-4), np.column_stack([np.arange(5.0), np.arange(5.0)]) * 2e-4 + [0.01, 0.0]
+    arms = [np.column_stack([x, np.maximum(x - 0.02, 0) * slope]) for slope in np.tan(np.radians([20, -30]))]
+    where, upper, lower = experiments.branches(np.concatenate([*arms, aside]), 2e-3) or (0.0, 0.0, 0.0)
+    assert (where, upper, lower) == (pytest.approx(0.02, abs=1e-3), pytest.approx(20, abs=1), pytest.approx(30, abs=1))
+    assert experiments.branches(arms[0], 2e-3) is None
+
+
 def test_a_curve_that_begins_late_is_read_from_where_its_line_does() -> None:
     """2 N/m from - 1 m on, to 20 N, then a drop; and no table of a plate that was not run."""
     way = [*np.linspace(0, 9, 10), 9.5]
@@ -407,7 +416,7 @@ def test_section_of_experiments() -> None:
         records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
     records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
     (section,) = experiments.sections(records)
-    assert [claim.holds for claim in section.claims] == [False, True, True, None, None, None, None]
+    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 5]
     every, spreads = section.tables
     assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
     assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))

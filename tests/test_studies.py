@@ -26,6 +26,7 @@ COARSE = {
     "bent-bar": ["mesh.h=0.01"],
     "bowl": ["mesh.count=8"],
     "brazilian": ["mesh.h=0.03"],
+    "branching": ["mesh.h=0.003"],
     "bread": ["mesh.h=0.02"],
     "charpy": ["mesh.h=0.002", "mesh.h_notch=0.0006"],
     "charpy-klst": ["mesh.h=0.001", "mesh.h_notch=0.0003"],
