@@ -83,7 +83,7 @@ class ImplicitStepper(BalanceStepper):
     def _damage_changed(self, result: PassResult) -> None:
         super()._damage_changed(result)
         if result.broken:
-            self.solver.damage_changed()
+            self.solver.damage_changed(result.broken)
 
 
 UNLIMITED = 10_000  # passes: there is no body with more left to break in one step

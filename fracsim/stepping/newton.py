@@ -23,6 +23,7 @@ from .stepper import SolveResult
 
 if TYPE_CHECKING:
     from .downhill import Downhill
+    from .loose_parts import LooseParts
 
 Values = npt.NDArray[np.float64]
 
@@ -94,8 +95,9 @@ class Solver:
         self._single = chosen["snes_type"] == "ksponly"
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
-            snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given)
-        )
+            snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given),
+            loosen=self._loosen, nodes=balance.domain.space.dofmap.index_map.size_global,
+        )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self._linearly = is_linear(balance, given, snes.ksp.getType())
         self._ending = Ending(snes.comm, int(snes.ksp.max_it)) if self._linearly and self._iterative else None
@@ -104,6 +106,11 @@ class Solver:
         self._first = self._last_little = 0.0
         self._factors = Factors(self._preconditioner)
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
+
+    def _loosen(self, body: PETSc.PC) -> LooseParts | None:
+        from .loose_parts import loose_parts
+
+        return loose_parts(self.balance, body)
 
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
@@ -301,7 +308,7 @@ class Solver:
         if self._asked:
             little = min(little, self._asked * self.balance.vector.norm())
         self._assemble_tangent(tangent)
-        solved = ending.solve(tangent, preconditioner.pc, self.balance.vector, self._correction, little)
+        solved = ending.solve(tangent, preconditioner.serving, self.balance.vector, self._correction, little)
         preconditioner.its = ending.to_share(float(self.snes.ksp.rtol))
         return (ending.left, ending.its) if solved else None
 
@@ -371,7 +378,7 @@ class Solver:
 
     def _hold(self) -> None:
         """Precondition with the body's springs as well, where there are any."""
-        ksp, body = self.snes.ksp, self._preconditioner.pc
+        ksp, body = self.snes.ksp, self._preconditioner.serving
         springs = [each for each in self.balance.springs if len(each.stiffness)]
         if not springs:
             ksp.setPC(body)
@@ -383,9 +390,10 @@ class Solver:
         ksp.setPC(pc)
         pc.destroy()
 
-    def damage_changed(self) -> None:
-        """Some cells lost stiffness: refresh the preconditioner at the next tangent."""
-        self._preconditioner.damage_changed()
+    def damage_changed(self, broke: int | None = None) -> None:
+        """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh the
+        preconditioner at the next tangent, where that pays."""
+        self._preconditioner.damage_changed(broke)
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
@@ -432,6 +440,7 @@ class Solver:
         """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
         self._options.remove()
         self._factors.forget()
+        self._preconditioner.forget_parts()
         for kept in (*self._made, self._x, self._correction):
             kept.destroy()
         if self._downhill is not None:

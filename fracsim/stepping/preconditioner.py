@@ -3,22 +3,28 @@
 It is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a Newton iteration. It
 is made anew where CG takes a third more iterations than when it was fresh, or the tangent has given up entries of dead
 cells (mechanics.tangent), and refreshed (new coarse operators and smoothers on the same coarse spaces) after edges
-broke.
+broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh.
 
 Where a body comes apart, cells hang from it by a node or an edge and turn there against nothing but their inertia.
 Smoothed aggregation with Jacobi's smoother needs three times the iterations then, and a set-up that a few broken edges
-spoil. Aggregates without smoothing cost a fifth of the set-up, and a sweep of SSOR deals with what hangs: 18 iterations
-where the whole body took 9 and the cut one 27 (33,000 tetrahedra, 10 planes), a step in 0.85 of the time; after 100
-planes 0.7.
+spoil. Where steps are so long that inertia is next to nothing, it is a hundred times, and what hangs is solved for by
+itself (loose_parts). In shorter ones other aggregates do: those without smoothing cost a fifth of the set-up, and a
+sweep of SSOR deals with what hangs: 18 iterations where the whole body took 9 and the cut one 27 (33,000 tetrahedra, 10
+planes), a step in 0.85 of the time; after 100 planes 0.7.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from petsc4py import PETSc
 
 from .petsc_options import Options, OptionSet
+
+if TYPE_CHECKING:
+    from .loose_parts import LooseParts
 
 MULTIGRID: Options = {
     "pc_type": "gamg",
@@ -37,6 +43,10 @@ OF_PIECES: Options = {
 REBUILD_ABOVE = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
 REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
+MANY = 0.02  # edges that broke, for each node, after which it is refreshed
+REFRESH_ITS = 10  # iterations that a refresh costs
+
+type Loosen = Callable[[PETSc.PC], LooseParts | None]
 
 
 class Due(IntEnum):
@@ -53,26 +63,40 @@ class Preconditioner:
     Attributes:
         due: what has to be done before the next solve.    keep: whether it serves more than one tangent.
         pc: that of the body alone, also where the KSP uses one that is made of it.
+        serving: that, or one made of it that sees to loose parts.
         its: iterations of the last solve, where the KSP does not know; 0: nothing is known; None: it does.
     """
 
-    def __init__(self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool) -> None:
-        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart."""
+    def __init__(
+        self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool, loosen: Loosen, nodes: int
+    ) -> None:
+        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
+        that sees to loose parts out of `pc`, None where that would be no use; `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
+        self.serving, self._loosen, self._nodes = self.pc, loosen, nodes
+        self._loose: LooseParts | None = None
+        self._sees_to_parts = False
+        self._broke = self._extra = 0  # edges and iterations since it was set up
         self.due, self.keep = Due.REBUILD, keep
         self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
         self.its: int | None = None
         self._fresh_its = self._whole_its = 0
 
-    def damage_changed(self) -> None:
-        """Some cells lost stiffness: refresh at the next tangent."""
-        self.due, self._broken = max(self.due, Due.REFRESH), True
+    def damage_changed(self, broke: int | None) -> None:
+        """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh at the next
+        tangent, where that pays."""
+        self._broken = True
+        self._broke += self._nodes if broke is None else broke
+        if self._broke > MANY * self._nodes:
+            self.due = max(self.due, Due.REFRESH)
 
     def refresh(self, tangent: PETSc.Mat) -> None:
         """Set up what is due for a tangent that is solved with next. Done here, since SNES knows a fixed lag only."""
         self.look()
+        self._count()
         ksp = self._ksp
         if self.due == Due.NOTHING:
+            self._follow(tangent)
             return
         if self.due == Due.REBUILD:
             self.pc.reset()
@@ -81,16 +105,44 @@ class Preconditioner:
         self.pc.setReusePreconditioner(False)
         ksp.setOperators(tangent)
         ksp.setUp()
-        self.due = Due.NOTHING
+        self.due, self._broke, self._extra = Due.NOTHING, 0, 0
+        if self._sees_to_parts:
+            self.forget_parts()
+            self._loose = self._loosen(self.pc)
+        self._follow(tangent)
+
+    def _follow(self, tangent: PETSc.Mat) -> None:
+        """What serves is brought to a tangent that is solved with next."""
+        self.serving, loose = self.pc, self._loose
+        if loose is not None and loose.body is self.pc and loose.follow(tangent):
+            self.pc.setReusePreconditioner(True)
+            self.serving = loose.pc
+
+    def forget_parts(self) -> None:
+        """Give the memory of loose parts back."""
+        if self._loose is not None:
+            self._loose.forget()
+            self._loose = None
 
     def look(self) -> None:
         """See from the iterations of the last solve whether a rebuild is due (more than once does no harm)."""
-        its = self._ksp.its if self.its is None else self.its
+        its = self._last_its
         if self.due == Due.NOTHING:
             self._look_at(its)
         # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
         if self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
             self.due = Due.REBUILD
+
+    @property
+    def _last_its(self) -> int:
+        return int(self._ksp.its) if self.its is None else self.its
+
+    def _count(self) -> None:
+        """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due."""
+        if self._broke:
+            self._extra += max(self._last_its - self._fresh_its, 0)
+        if self._extra > REFRESH_ITS:
+            self.due = max(self.due, Due.REFRESH)
 
     def _look_at(self, its: int) -> None:
         """Iterations of a solve since it was set up."""
@@ -103,6 +155,10 @@ class Preconditioner:
             self.due = max(self.due, Due.REFRESH)
 
     def _change(self) -> None:
+        if (loose := self._loosen(self.pc)) is not None:
+            self._may_change, self._sees_to_parts, self.due = False, True, max(self.due, Due.REFRESH)
+            loose.forget()
+            return
         self._may_change, self._rebuild_above, self.due = False, REBUILD_ABOVE_OF_PIECES, Due.REBUILD
         self._options.change(OF_PIECES)
         self.pc.reset()

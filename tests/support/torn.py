@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx.fem import IntegralType
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.holding import Holding
@@ -17,9 +18,11 @@ from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hashed
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.parts import parts_of_nodes
 from fracsim.mesh.pieces import find_pieces
 from fracsim.mesh.ranks import total
 from fracsim.scene import Scene, build_scene
+from fracsim.stepping.loose_parts import loose_parts
 from fracsim.stepping.state import State
 
 from .failing import Failing
@@ -193,6 +196,45 @@ def dead_cells() -> Found:
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
         balance.damage_changed()
     return found
+
+
+def some_whole(cells: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Two thirds of the cells, of input numbers (n,)."""
+    return np.cos(cells) > -0.5
+
+
+def hanging() -> Found:
+    """Parts of a body of which a third of the cells has come apart, in steps so long that inertia holds nothing: what
+    is made of Jacobi's preconditioner for it, applied to anything, and to the forces of a part that turns."""
+    fixed = [{"on": "left", "fix": "xyz"}]
+    scene, state = make_scene(
+        mesh=MESHES["3d"], material=SOFT | {"energy": "neo-hookean"}, fracture={"strength": 1e9}, boundary=fixed,
+        time={"scheme": "backward-euler", "step": 1e3, "end": 1e4}, solver=TIGHT,
+    )  # fmt: skip
+    domain, balance = scene.domain, scene.balance
+    whole, chi = some_whole(domain.cell_input), balance.stress.chi
+    assert chi is not None
+    chi.x.array[: domain.cell_count] = whole
+    balance.begin(1e3, 1e3, state.u, state.v, state.a)
+    balance.assemble_tangent(balance.tangent)
+    jacobi = PETSc.PC().create(domain.comm)
+    jacobi.setType("jacobi")
+    jacobi.setOperators(balance.tangent)
+    count, part = parts_of_nodes(domain, whole)
+    loose = loose_parts(balance, jacobi)
+    assert loose is not None and loose.follow(balance.tangent)
+    x = domain.nodes[: domain.node_count]
+    turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
+    turned[~balance.motion.free.reshape(-1, 3)] = 0.0
+    a, b = balance.vector.duplicate(), balance.vector.duplicate()
+    a.array_w[:] = turned.reshape(-1)
+    balance.tangent.mult(a, b)
+    loose.pc.apply(b, a)
+    b.array_w[:] = np.cos(1e3 * x).reshape(-1)
+    found = {"hanging-turned": turned, "hanging-found": a.array_r.reshape(-1, 3).copy(), "hanging-part": part}
+    loose.pc.apply(b, a)
+    found |= {"hanging-any": a.array_r.reshape(-1, 3).copy()}
+    return {name: domain.gather_nodes(each) for name, each in found.items()} | {"hanging-count": np.array(count)}
 
 
 def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) -> Found:
@@ -390,4 +432,4 @@ def compared(folder: Path) -> Found:
         found |= run(name, folder if name in SURFACES else None)
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
-    return found | dead_cells() | squeezed() | by_rows()
+    return found | dead_cells() | hanging() | squeezed() | by_rows()
