@@ -1,0 +1,111 @@
+"""Shards of shells that fly at one another: none passes through another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.fracture.brittle.rules import SurfaceRules
+from fracsim.mesh.topology import MeshTopology
+from fracsim.meshes.builders.ornament import Ornament
+from fracsim.rigid.copies import Copies
+from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.hertz import Hertz
+from fracsim.rigid.model import Rules
+from fracsim.rigid.placing import Place, Poses
+from fracsim.rigid.stepper import RigidState, RigidStepper
+from support.rigid import DENSITY, breakable
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+RADIUS, THICKNESS = 0.04, 0.001
+
+
+def pierced(x: Values, triangles: Ints, piece: Ints) -> list[tuple[int, int, float]]:
+    """(piece, piece, m) where an edge of one goes through a triangle of another, and how far its shorter end sticks out
+    behind it: by signed volumes, which share nothing with the engine. Points x (n, 3), triangles (m, 3) of pieces
+    (m,)."""
+    found = []
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    of_edge = np.tile(piece, 3)
+    low, high = x[edges].min(axis=1), x[edges].max(axis=1)
+    for corners, mine in zip(x[triangles], piece, strict=True):
+        near = (low <= corners.max(axis=0)).all(axis=1) & (high >= corners.min(axis=0)).all(axis=1) & (of_edge != mine)
+        p, q = np.swapaxes(x[edges[near]], 0, 1)
+        a, b, c = corners
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal)
+        above, below = (p - a) @ normal, (q - a) @ normal
+        sides = np.stack([np.einsum("ki,ki->k", q - p, np.cross(u - p, v - p)) for u, v in ((a, b), (b, c), (c, a))])
+        through = (above * below < 0) & ((sides > 0).all(axis=0) | (sides < 0).all(axis=0))
+        out = np.minimum(np.abs(above), np.abs(below))[through]
+        found += [(int(mine), int(k), float(depth)) for k, depth in zip(of_edge[near][through], out, strict=True)]
+    return found
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Balls, copies of one shell: triangles (m, 3) of their middle surfaces between points (n, 3) at rest."""
+
+    stepper: RigidStepper
+    middle: Values
+    triangles: Ints
+
+    @classmethod
+    def of(cls, places: list[Values], step: float, surfaces: int) -> Scene:
+        """At some places, without weight."""
+        mesh = Ornament(radius=RADIUS, neck=0.0, thickness=THICKNESS, h=0.012).build()
+        assert mesh.shell is not None
+        poses = Poses.of([Place(at, *np.zeros((3, 3))) for at in places])
+        sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
+        made = Copies(lambda _: breakable(mesh, 1e6, SurfaceRules(surfaces)), poses, sizes)
+        rules = Rules(step, np.zeros(3), 0.3)
+        stepper = RigidStepper(made, Geometry(mesh, poses), DENSITY, [], rules, Hertz(1e9, 0.2))
+        middle, first = mesh.shell.middle + np.array(places)[:, None], len(mesh.points) * np.arange(len(places))
+        triangles = mesh.shell.triangles + first[:, None, None]
+        return cls(stepper, middle.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
+
+    def piercings(self, state: RigidState) -> list[tuple[int, int, float]]:
+        """Of the middle surfaces of all pieces, without the triangles that cracks run through."""
+        of_node = self.stepper.shapes.piece_of_node
+        of = of_node[self.triangles]
+        whole = (of == of[:, :1]).all(axis=1)
+        return pierced(state.bodies.to_space(self.middle, of_node), self.triangles[whole], of[whole, 0])
+
+
+def test_piercing_is_seen() -> None:
+    """An edge through a triangle, 0.2 of it behind; beside it, before it and in one piece there is none."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.2], [0.2, 0.2, 0.8], [0.2, 5, 0.8]])
+    two = np.array([[0, 1, 2], [3, 4, 5]])
+    assert (0, 1, pytest.approx(0.2)) in pierced(x, two, np.array([0, 1]))
+    assert not pierced(x, two, np.array([0, 0]))
+    for shift in ([1.0, 0, 0], [0, 0, 0.3]):
+        assert not pierced(np.concatenate([x[:3], x[3:] + shift]), two, np.array([0, 1]))
+
+
+@pytest.mark.slow
+def test_shards_do_not_pass_through_one_another_at_twenty_metres_a_second() -> None:
+    """Two glass balls that meet: at every frame no shard of one sticks in a shard of the other by more than the
+    thickness, nor one in its sibling by more than the hulls of neighbours may overlap from birth."""
+    speed, step = 20.0, 1e-3
+    scene = Scene.of([np.zeros(3), np.array([0.01, 0.02, 2.05 * RADIUS])], step, 20)
+    stepper, state = scene.stepper, scene.stepper.start()
+    meeting = np.array([[0.0, 0, speed / 2], [0, 0, -speed / 2]])
+    state, across, within = replace(state, bodies=replace(state.bodies, velocity=meeting)), 0.0, 0.0
+    for _ in range(12):
+        for _ in range(2):
+            state, _ = stepper.advance(state)
+        ball = stepper.shapes.names // stepper.copies.nodes
+        for a, b, depth in scene.piercings(state):
+            if ball[a] != ball[b]:
+                across = max(across, depth)
+            else:
+                within = max(within, depth)
+    assert len(state.bodies) > 20 and across < THICKNESS and within < 2 * THICKNESS
+    squeezed = replace(state, bodies=replace(state.bodies, place=0.5 * state.bodies.place))
+    assert len(scene.piercings(squeezed)) > 20, "it would be seen"
