@@ -75,6 +75,18 @@ def test_a_block_slides_as_coulomb_says(friction: float) -> None:
     assert np.abs(after.velocity).max() < 1e-3
 
 
+def test_what_slides_stays_on_its_floor() -> None:
+    """At 20 m/s, in steps of 10 ms and with mu = 0.5: a convex problem of friction alone has it hover mu v dt = 0.1 m
+    over its floor, and throws it up there at mu v = 10 m/s."""
+    bodies = replace(cubes([[0.0, 0.0, 0.51]]), velocity=np.array([[20.0, 0.0, -1.0]]))
+    engine = Engine(bodies, [[CUBE]], [floor()], Rules(1e-2, DOWN, 0.5))
+    for _ in range(50):
+        bodies, _ = engine.advance(bodies)
+        assert -2e-3 < (CUBE @ bodies.turn[0].T + bodies.place[0])[:, 2].min() < 0.015, "c_0 dt below it, at most"
+    landed = np.sqrt(1.0 + 2 * G * 0.01)  # the blow rubs, too
+    assert bodies.velocity[0, 0] == pytest.approx(20.0 - 0.5 * (landed + G * 0.49), abs=0.05)
+
+
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
 def test_a_ball_bounces_with_its_restitution(restitution: float) -> None:
     """Without gravity; at two steps, wherever in a step it meets the floor; its lowest place is the floor."""
@@ -257,6 +269,31 @@ def test_a_round_body_meets_a_floor_with_few_of_its_corners() -> None:
     assert 6 <= len(engine._data.contact.dist) <= 24
     low = (ball @ after.turn[0].T + after.place[0])[:, 2].min()
     assert -5e-4 < low < 5e-3
+
+
+def test_what_spins_fast_and_touches_keeps_the_spin_that_friction_leaves_it() -> None:
+    """A ball that turns by two radians a step slides: dv/dt = mu g, and I dw/dt = -mu m g r with I = m / 6."""
+    step, steps, friction, radius = 4e-3, 50, 0.3, 0.5
+    ball, bodies = primitive(Sphere(radius, 3), "ball"), cubes([[0.0, 0.0, radius]])
+    bodies = replace(bodies, spin=np.array([[0.0, 500.0, 0.0]]))
+    after, _ = run(Engine(bodies, [[ball]], [floor(friction)], Rules(step, DOWN, friction)), bodies, steps)
+    gained = friction * G * step * steps
+    assert after.velocity[0] == pytest.approx([gained, 0.0, 0.0], rel=1e-4, abs=1e-4)
+    assert after.spin[0] == pytest.approx([0.0, 500.0 - 6 * radius * gained, 0.0], rel=1e-6, abs=1e-4)
+
+
+def test_what_spins_fast_keeps_angular_momentum_where_it_strikes() -> None:
+    """A block that turns by two radians a step meets another in the air, which rubs along: both momenta stay."""
+    bodies = cubes([[0.0, 0.0, 0.0], [0.2, 0.1, 1.01]])
+    bodies = replace(
+        bodies, velocity=np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]]), spin=np.array([[0, 0, 500.0], 3 * [0]])
+    )
+    engine = Engine(bodies, [[CUBE]] * 2, [], Rules(4e-3, FREE, 0.4))
+    after, touches = run(engine, bodies, 2)
+    assert any(len(each) for each in touches) and after.kinetic < bodies.kinetic
+    assert np.abs(after.spin[1]).max() > 1.0, "it is taken along"
+    assert after.momentum == pytest.approx(bodies.momentum, abs=1e-6 * MASS)
+    assert after.angular_momentum == pytest.approx(bodies.angular_momentum, abs=1e-6 * MASS * 500)
 
 
 def test_a_crumb_does_not_whirl() -> None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,8 @@ class Contacts:
     Attributes:
         geoms: (k, 2) of the engine.    things: (k, 2) bodies by their numbers, then what stands in their way.
         point: (k, 3) m.    axes: (k, 3, 3), the first from the first thing to the second.
-        gap: (k,) m, below 0 of what is in one another.    levers: (2, k, 3) of the two things, r x n, m.
+        gap: (k,) m, below 0 of what is in one another.    arms: (2, k, 3) r from what the two things turn about, m.
+        levers: (2, k, 3) r x n, m.
     """
 
     geoms: Ints
@@ -26,13 +28,14 @@ class Contacts:
     point: Values
     axes: Values
     gap: Values
+    arms: Values
     levers: Values
 
     @classmethod
     def found(cls, geoms: Ints, things: Ints, point: Values, axes: Values, gap: Values, places: Values) -> Contacts:
         """With the places (things, 3) that things turn about, m."""
-        arms = (point - places[each] for each in things.T)
-        return cls(geoms, things, point, axes, gap, np.stack([np.cross(arm, axes[:, 0]) for arm in arms]))
+        arms = np.stack([point - places[each] for each in things.T])
+        return cls(geoms, things, point, axes, gap, arms, np.cross(arms, axes[:, 0]))
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -45,3 +48,12 @@ class Contacts:
             "ki,ki->k", spin[second], self.levers[1]
         )
         return np.asarray(along + turning)
+
+    def slipping(self, velocity: Values, spin: Values, chosen: Flags) -> Values:
+        """(k,) how fast things slip along one another in chosen (k,) contacts, m/s; 0 in all others."""
+        first, second = self.things[chosen].T
+        v = velocity[first] - velocity[second]
+        v += np.cross(spin[first], self.arms[0, chosen]) - np.cross(spin[second], self.arms[1, chosen])
+        slip = np.zeros(len(self))
+        slip[chosen] = np.linalg.norm(np.einsum("kij,kj->ki", self.axes[chosen, 1:], v), axis=1)
+        return slip
