@@ -22,9 +22,10 @@ from fracsim.rigid.analyses import Analyses, Strike, opened_by
 from fracsim.rigid.copies import Copies
 from fracsim.rigid.placing import Place, Poses
 from fracsim.run import run_study
+from fracsim.studies import folder
 from fracsim.study import Study
 from fracsim.study.check import check_study
-from fracsim.study.file import study_text
+from fracsim.study.file import load_study, study_text
 from support.rigid import breakable
 from support.solids import copies, lattice
 from support.vtu import frames
@@ -142,6 +143,18 @@ def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) ->
     assert_same(found, expected)
     drawn = [frames(folder)[-1] for folder in (tmp_path / "out", done)]
     assert np.allclose(drawn[0].points, drawn[1].points, atol=1e-6)
+
+
+def test_a_slab_is_shot_through_and_not_carried_along(tmp_path: Path) -> None:
+    """Twelve milliseconds later most of its mass is where it was, without the ball, which took a piece along."""
+    coarse = load_study(folder() / "rigid-slab.toml", ["mesh.h=0.018", "brittle.surfaces=30", "output.interval=0.012"])
+    run_study(MPI.COMM_SELF, coarse, tmp_path / "out")
+    pieces = rows(tmp_path / "out" / "pieces.csv")
+    last = pieces["time"] == pieces["time"].max()
+    mass, speed, z = (pieces[name][last] for name in ("mass", "velocity_z", "centre_z"))
+    assert mass.sum() == pytest.approx(2700 * 0.4 * 0.4 * 0.02, rel=1e-9) and len(mass) > 10
+    assert -(mass @ speed) < 0.3 * 60 * mass.sum(), "the ball has no end of momentum: whole it would have all of 60 m/s"
+    assert mass[z > 0.1].sum() > 0.6 * mass.sum() and speed.min() < -40
 
 
 def test_an_analysis_that_fails_ends_the_run_with_its_reason(tmp_path: Path) -> None:
