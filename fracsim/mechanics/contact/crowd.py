@@ -65,10 +65,13 @@ class Surface:
         made: the surface.    at: where its points are, new walls drawn back.    pairs: what may touch.
         gap: between the sides of a new crack, in distances of the barrier.
         close: pressure, in stiffnesses, of walls as good as closed.
+        at_once: whether candidates are looked for on the ways of all walls once some are drawn in: fewer looks, and
+            more candidates after.
     """
 
     gap: ClassVar[float] = GAP
     close: ClassVar[float] = NEAR
+    at_once: ClassVar[bool] = False
 
     def __init__(
         self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
@@ -175,9 +178,9 @@ class Surface:
         share[tight] = np.maximum(left * share[tight], np.minimum(LEAST, share[tight]))
         changed = not np.array_equal(share, self.at.share)
         if changed:
-            every = np.unique(self.made.elements[self._walls])
+            may = np.unique(self.made.elements[self._walls]) if self.at_once else tight
             end = (x := self.at(u)).copy()
-            end[every] = self.at.some(u, every, np.minimum(LEAST, self.at.share[every]))
+            end[may] = self.at.some(u, may, np.minimum(LEAST, self.at.share[may]))
             self.pairs.look_along(x, end)  # once for all the shares that follow
             self.at = self.at.drawn_in(share)
         return changed

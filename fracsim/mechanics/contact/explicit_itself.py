@@ -37,6 +37,7 @@ class Pushes(Surface):
 
     pairs: Pushing
     close: ClassVar[float] = 0.0  # what presses at all has no room
+    at_once: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
 
     def __init__(
         self,
