@@ -13,14 +13,17 @@ from dolfinx import fem
 from dolfinx.fem.petsc import LinearProblem
 from dolfinx.io import gmshio
 from mpi4py import MPI
+from scipy.optimize import brentq
 
 from fracsim.errors import InputError
 from fracsim.fracture.energy.around import Pairs
 from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
 from fracsim.fracture.energy.cutting import fork, leave
+from fracsim.fracture.energy.tips import DISC
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
+from fracsim.study.tearing import RADIUS
 from support.scenes import make_scene, make_study, march
 from support.squares import square
 from support.strip import run_of_a_strip
@@ -226,6 +229,27 @@ def test_a_step_that_sees_no_waves_makes_no_branches() -> None:
             pass
         assert scene.fracture.graph.split.sum() > 10
         assert np.any(scene.fracture.graph.pattern == 7) == branches
+
+
+def test_check_tells_when_tips_branch() -> None:
+    """And that none does in steps longer than R / c_R; c_R within 1 % of the root of Rayleigh's equation."""
+    assert DISC[2] == RADIUS
+    nu, h = 0.3, 0.05
+    ratio = (1 - 2 * nu) / (2 - 2 * nu)
+    root = brentq(lambda x: (2 - x**2) ** 2 - 4 * np.sqrt((1 - x**2) * (1 - ratio * x**2)), 0.5, 0.99)
+    wave = 5 * h / (root * np.sqrt(1 / (2 + 2 * nu)))
+    told = []
+    for step in (0.98 * wave, 1.02 * wave):
+        study = make_study(
+            mesh={"builder": "box", "size": [1.0, 1.0], "h": h},
+            material={"energy": "linear", "young": 1.0, "poisson": nu, "density": 1.0},
+            fracture={"strength": 1.0, "energy": 1.0, "branching": True},
+            time={"scheme": "newmark", "step": step, "end": 10.0},
+        )
+        lines = check_study(study)
+        assert any("tips branch to which 2 G_c flows" in line for line in lines)
+        told.append(any("none does" in line for line in lines))
+    assert told == [False, True]
 
 
 def test_cracks_in_space_do_not_branch() -> None:

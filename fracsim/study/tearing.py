@@ -8,6 +8,7 @@ from ..errors import InputError
 from . import Study
 from .body import Region
 
+RADIUS = 5.0  # h: of the disc of a tip (fracture.energy.tips, which is dear to import)
 PART = 5.0  # times that Irwin's length goes into the body, from which on a crack has room for its tip
 
 
@@ -29,12 +30,25 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
         yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa"
         yield f"{where}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
         yield from _unfit(length, strength, h, side)
+    if table.branching:
+        yield from _branching(study, h)
 
 
 def refuse_forks(study: Study, dim: int) -> None:
     """InputError where cracks in space are to branch."""
     if dim == 3 and study.fracture is not None and study.fracture.branching:
         raise InputError("fracture.branching: cracks branch in the plane only; remove it, or take a 2D mesh")
+
+
+def _branching(study: Study, h: float) -> Iterator[str]:
+    """When tips branch, and whether steps are short enough for it."""
+    yield "tips branch to which 2 G_c flows"
+    material, step = study.material, study.time.breaking_step or study.time.longest
+    shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
+    wave = RADIUS * h / (shear * (0.862 + 1.14 * material.poisson) / (1 + material.poisson))  # Viktorov (1967)
+    if step > wave:
+        yield f"note: in steps of {step:.2g} s none does: a Rayleigh wave leaves the disc of a tip in {wave:.2g} s;"
+        yield f"breaking_step = {wave / 2:.1g} s would do"
 
 
 def plane_modulus(study: Study, region: Region) -> float:
