@@ -19,16 +19,16 @@ from fracsim.errors import InputError
 from fracsim.fracture.energy.around import Pairs
 from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
 from fracsim.fracture.energy.cutting import fork, leave
-from fracsim.fracture.energy.tips import DISC
+from fracsim.fracture.energy.tips import DISC, CrackTips
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
 from fracsim.study.tearing import RADIUS
-from support.scenes import make_scene, make_study, march
+from support.scenes import each_step, make_scene, make_study, march
 from support.squares import square
 from support.strip import run_of_a_strip
 from support.tearing import RUNS
-from support.tips import seen, tips
+from support.tips import criterion_of, seen, tips
 
 Values = npt.NDArray[np.float64]
 
@@ -225,10 +225,26 @@ def test_a_step_that_sees_no_waves_makes_no_branches() -> None:
     tables = RUNS["forked"]
     for step, end, branches in ((5e-4, 8e-3, True), (7e-3, 14e-3, False)):
         scene, state = make_scene(**tables | {"time": tables["time"] | {"step": step, "end": end}})
-        for _ in march(scene, state):
-            pass
+        march(scene, state)
         assert scene.fracture.graph.split.sum() > 10
         assert np.any(scene.fracture.graph.pattern == 7) == branches
+
+
+def test_what_is_kept_of_tips_that_branch_is_what_is_found_anew() -> None:
+    """After each step, by a criterion that begins there; also of the upper branch, held, while the lower goes on."""
+    scene, state = make_scene(**RUNS["forked"])
+    criterion, graph, most = criterion_of(scene), scene.fracture.graph, 0
+    for _ in each_step(scene, state):
+        parts = scene.balance.stress, graph, criterion.strength, criterion.toughness, criterion.cut
+        kept, found = criterion.tips(), CrackTips(*parts, branching=True).tips()
+        most = max(most, len(kept))
+        for name in ("cell", "mature", "waits", "alone"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(found, name))
+        for name in ("behind", "course", "ahead", "parts"):
+            np.testing.assert_allclose(getattr(kept, name), getattr(found, name), atol=1e-12)
+        if most > 1:
+            criterion.toughness = np.where(criterion.sight.centres[:, 1] > 0.52, np.inf, 0.02)
+    assert most > 1
 
 
 def test_check_tells_when_tips_branch() -> None:
