@@ -25,7 +25,6 @@ class JoinedTips:
 
     def __init__(self, tips: CrackTips, graph: EdgeGraph, joining: Joining) -> None:
         self._tips, self._graph, self._joining = tips, graph, joining
-        self._pattern = graph.pattern.copy()  # of cells that are barred, as they were barred
 
     @property
     def cut(self) -> Values:
@@ -35,7 +34,7 @@ class JoinedTips:
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, none of them one that has to join (collective)."""
         graph, barred = self._graph, self._tips.barred
-        barred &= self._pattern == graph.pattern  # it is cut from another side: it may go on
+        barred[:] = False  # found again each time: a restart knows as much
         while True:
             edges, load = self._tips(stress, psi)
             spared = np.zeros(len(graph.broken), bool)
@@ -44,7 +43,7 @@ class JoinedTips:
             stuck = cells[spared[graph.cell_edges[cells]].any(axis=1)]
             if not total(graph.domain.comm, len(stuck))[0]:
                 return edges, load
-            barred[stuck], self._pattern[stuck] = True, graph.pattern[stuck]
+            barred[stuck] = True
             self._tips.cut[edges] = np.nan
 
     def moving(self, v: Values, a: Values, dt: float) -> None:
@@ -56,6 +55,5 @@ class JoinedTips:
         return self._tips.memory()
 
     def recall(self, memory: object) -> None:
-        """No more cuts than that; what is barred is found again."""
-        self._tips.barred[:] = False
+        """No more cuts than that."""
         self._tips.recall(memory)
