@@ -11,14 +11,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from ...mesh.small_matrices import polar_rotation
 from ..simplices import is_split, local_edges
 from .skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -53,6 +56,8 @@ class Follow:
     @cached_property
     def weights(self) -> csr_matrix:
         """(n, nodes) each row is 1 / (number of parents) at the parents."""
+        from scipy.sparse import csr_matrix  # a body that is whole is drawn without SciPy, 0.13 s of a start
+
         count = np.diff(self.start)
         return csr_matrix((np.repeat(1.0 / count, count), self.parents, self.start), shape=(len(count), self.nodes))
 
@@ -63,7 +68,12 @@ class Follow:
 
     def mean(self, nodal: Values) -> Values:
         """(n, ...) mean of nodal values (nodes, ...) over the parents."""
-        result: Values = self.weights @ nodal
+        return self._mean(nodal[self.parents])
+
+    def _mean(self, each: Values) -> Values:
+        """(n, ...) mean over the parents of values (parents, ...)."""
+        count = np.diff(self.start).reshape(-1, *np.ones(each.ndim - 1, int))
+        result: Values = np.add.reduceat(each, self.start[:-1], axis=0) / count
         return result
 
     def displacement(self, u: Values, rotation: Values) -> Values:
@@ -74,9 +84,7 @@ class Follow:
         arm = self.arm[entry]
         each = u[self.parents]
         each[entry] += np.einsum("nij,nj->ni", rotation[place[self.parents[entry]]], arm) - arm
-        count = np.diff(self.start)
-        result: Values = np.add.reduceat(each, self.start[:-1], axis=0) / count[:, None]
-        return result
+        return self._mean(each)
 
 
 class Rotations:
@@ -99,20 +107,26 @@ class Rotations:
         target = place[self._cells]
         cell, corner = np.nonzero(target >= 0)
         ones = np.ones(len(cell))
-        self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
-        volume = self._sum @ np.abs(np.linalg.det(span))
-        self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # none: the mean is 0 and F the identity
         self._identity = np.eye(d)
+        self._sum: csr_matrix | None = None
+        if len(nodes):
+            from scipy.sparse import csr_matrix
+
+            self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
+            volume = self._sum @ np.abs(np.linalg.det(span))
+            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # none: the mean is 0 and F the identity
 
     def __call__(self, u: Values) -> Values:
         """(nodes, d, d) from displacements (N, d) in m: F = 1 + mean of grad u."""
+        d = len(self._identity)
+        if self._sum is None:
+            return np.empty((0, d, d))
         moved = u[self._cells]
         moved = moved[:, 1:] - moved[:, :1]
         gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
-        d = len(self._identity)
         mean = (self._sum @ gradient.reshape(-1, d * d)) * self._per_volume[:, None]
         F = mean.reshape(-1, d, d) + self._identity
-        return (polar_rotation(F) if len(F) else F)[self._of]
+        return polar_rotation(F)[self._of]
 
 
 def _turning_with(skeleton: Skeleton, pattern: npt.NDArray[np.integer]) -> Ints:

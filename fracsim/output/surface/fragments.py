@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from ...mesh.split.moments import cones
 
@@ -41,26 +41,28 @@ class Fragments:
 
 def fragments(name: Ints, piece_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values) -> Fragments:
     """Figures of the pieces from nodal masses (N,) in kg, current places x (N, d) and velocities v (N, d)."""
-    size = len(piece_of_node)
-    total = csr_matrix((np.ones(size), (piece_of_node, np.arange(size))), shape=(len(name), size))
-    weight = total @ mass
-    centre, velocity = ((total @ (mass[:, None] * each)) / weight[:, None] for each in (x, v))
+
+    def total(values: Values) -> Values:
+        return sums(piece_of_node, values, len(name))
+
+    weight = total(mass)
+    centre, velocity = (total(mass[:, None] * each) / weight[:, None] for each in (x, v))
     spin = _spin(total, mass, x - centre[piece_of_node], v - velocity[piece_of_node])
     nodes = np.bincount(piece_of_node, minlength=len(name))
     return Fragments(name, nodes, weight, volume, centre, velocity, spin)
 
 
-def _spin(total: csr_matrix, mass: Values, r: Values, w: Values) -> Values:
-    """Spin of each piece from arms r and velocities w (N, d) about its centre of mass.
+def _spin(total: Callable[[Values], Values], mass: Values, r: Values, w: Values) -> Values:
+    """Spin of each piece from arms r and velocities w (N, d) about its centre of mass; `total` sums over its nodes.
 
     L = sum m r x w,   I = sum m (r.r 1 - r r^T)
     """
     if r.shape[1] == 2:
-        momentum = total @ (mass * (r[:, 0] * w[:, 1] - r[:, 1] * w[:, 0]))
-        inertia = total @ (mass * np.einsum("ni,ni->n", r, r))
+        momentum = total(mass * (r[:, 0] * w[:, 1] - r[:, 1] * w[:, 0]))
+        inertia = total(mass * np.einsum("ni,ni->n", r, r))
         return np.divide(momentum, inertia, out=np.zeros_like(momentum), where=inertia > 0)[:, None]
-    momentum = total @ (mass[:, None] * np.cross(r, w))
-    second = (total @ (mass[:, None] * np.einsum("ni,nj->nij", r, r).reshape(-1, 9))).reshape(-1, 3, 3)
+    momentum = total(mass[:, None] * np.cross(r, w))
+    second = total(mass[:, None] * np.einsum("ni,nj->nij", r, r).reshape(-1, 9)).reshape(-1, 3, 3)
     inertia = np.einsum("nii->n", second)[:, None, None] * np.eye(3) - second
     # an axis with less than 1e-9 of the largest moment has none: what is left there is round-off of the sums
     spin: Values = np.einsum("nij,nj->ni", np.linalg.pinv(inertia, rcond=1e-9, hermitian=True), momentum)
@@ -77,8 +79,10 @@ def volumes(points: Values, elements: Ints, piece: Ints, count: int) -> Values:
 
 
 def sums(group: Ints, values: Values, count: int) -> Values:
-    """(count,) sums of the values of each group."""
-    return np.asarray(np.bincount(group, values, minlength=count), float)
+    """(count,) or (count, k) sums of the values (n,) or (n, k) of each group. (A sparse matrix would, too, but
+    to import SciPy takes 0.13 s of a start.)"""
+    columns = [np.bincount(group, each, minlength=count) for each in values.reshape(len(group), -1).T]
+    return np.asarray(columns, float).T.reshape(count, *values.shape[1:])
 
 
 class PieceNames:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +12,14 @@ import numpy.typing as npt
 from ...errors import NotConverged
 from ...mesh.split.build import Split, split
 from ...mesh.split.follow import Rotations
-from ...mesh.split.places import Places, whole
 from ...mesh.split.skeleton import BODY, Skeleton
-from ...mesh.split.smooth import smooth_cuts
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
 from ..fields_file import Field
 from .fragments import Fragments, PieceNames, fragments, sums, volumes
+
+if TYPE_CHECKING:
+    from ...mesh.split.places import Places
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -95,6 +97,8 @@ class Surface:
 
     def _build(self, cut: Values | None) -> None:
         if self._smooth:
+            from ...mesh.split.smooth import smooth_cuts
+
             cut = smooth_cuts(self.skeleton, self.skeleton.broken_edges(self._pattern), cut)
         made = split(self.skeleton, self._pattern, cut)
         self.split = made
@@ -154,6 +158,8 @@ class Surface:
         if not apart:
             return made.follow.displacement(u, self._rotations(u))
         if self._linear is None:
+            from ...mesh.split.places import whole
+
             self._linear = whole(made, self.skeleton, self._pattern, made.points)
         at = self._linear
         for each in apart:
