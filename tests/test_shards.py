@@ -88,24 +88,19 @@ def test_piercing_is_seen() -> None:
         assert not pierced(np.concatenate([x[:3], x[3:] + shift]), two, np.array([0, 1]))
 
 
-@pytest.mark.slow
 def test_shards_do_not_pass_through_one_another_at_twenty_metres_a_second() -> None:
-    """Two glass balls that meet: at every frame no shard of one sticks in a shard of the other by more than the
-    thickness, nor one in its sibling by more than the hulls of neighbours may overlap from birth."""
+    """Two glass balls that meet: after every step no shard sticks in another, of its ball or not, by more than their
+    hulls leave out of them, 2 % of the length of each (test_clusters); in the end none does at all."""
     speed, step = 20.0, 1e-3
     scene = Scene.of([np.zeros(3), np.array([0.01, 0.02, 2.05 * RADIUS])], step, 20)
     stepper, state = scene.stepper, scene.stepper.start()
     meeting = np.array([[0.0, 0, speed / 2], [0, 0, -speed / 2]])
-    state, across, within = replace(state, bodies=replace(state.bodies, velocity=meeting)), 0.0, 0.0
-    for _ in range(12):
-        for _ in range(2):
-            state, _ = stepper.advance(state)
-        ball = stepper.shapes.names // stepper.copies.nodes
-        for a, b, depth in scene.piercings(state):
-            if ball[a] != ball[b]:
-                across = max(across, depth)
-            else:
-                within = max(within, depth)
-    assert len(state.bodies) > 20 and across < THICKNESS and within < 2 * THICKNESS
+    state, deepest = replace(state, bodies=replace(state.bodies, velocity=meeting)), 0.0
+    for _ in range(24):
+        state, _ = stepper.advance(state)
+        found = scene.piercings(state)
+        deepest = max(deepest, *(depth for *_, depth in found), 0.0)
+    longest = max(float(np.linalg.norm(np.ptp(each, axis=0))) for each in stepper.shapes.outer)
+    assert len(state.bodies) > 20 and not found and deepest < 2 * 0.02 * longest
     squeezed = replace(state, bodies=replace(state.bodies, place=0.5 * state.bodies.place))
-    assert len(scene.piercings(squeezed)) > 20, "it would be seen"
+    assert len(scene.piercings(squeezed)) > 10, "it would be seen"

@@ -62,6 +62,7 @@ class Engine:
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
         self._data = mujoco.MjData(self._model.made)
+        self._crowded = False  # whether contacts of this step were too many to be solved at once
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         planes = self._model.planes
         self._plane_contacts = [
@@ -83,10 +84,11 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [ROOM * self._reach(bodies, of) for of in (common, 0.0)]
+        self._crowded, rough = False, True
         for _ in range(ROUNDS):
-            moved, touches = self._moved(bodies, rates, common, reach)
-            farther = [self._reach(moved, of) for of in (common, 0.0)]
-            if not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
+            moved, touches, exact = self._moved(bodies, rates, common, reach, rough=rough)
+            rough, farther = False, [self._reach(moved, of) for of in (common, 0.0)]
+            if exact and not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
                 break
             reach = [np.maximum(now, then) for now, then in zip(farther, reach, strict=True)]
         if ways is not None:
@@ -100,9 +102,12 @@ class Engine:
         speed = np.linalg.norm(bodies.velocity - common, axis=1) + turning
         return np.asarray(self._rules.step * (speed + self._rules.fast))
 
-    def _moved(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> tuple[Bodies, Touches]:
+    def _moved(
+        self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values], *, rough: bool = False
+    ) -> tuple[Bodies, Touches, bool]:
         """The bodies a step later where none of their points comes farther than a reach (n,) beside what moves with a
-        common velocity (3,), and than another (n,) beside what stands, m and m/s."""
+        common velocity (3,), and than another (n,) beside what stands, m and m/s; whether contacts are as hard as they
+        are: of a crowd they may be soft where it is `rough`."""
         dt, n, g = self._rules.step, self._count, self._rules.gravity
         start = bodies
         contacts = self._find(bodies, rates, common, reach)
@@ -116,11 +121,11 @@ class Engine:
             falling = replace(bodies, velocity=bodies.velocity + fallen)
             meeting, parting = self._meeting(contacts, falling, rates)
         self._parting = parting
-        force, touches = self._pushed(contacts, meeting, bodies, rates)
+        force, touches, exact = self._pushed(contacts, meeting, bodies, rates, rough=rough)
         after = self._flown(self._driven_on(bodies, force), dt * (1 - share))
         alone = ~np.any(force, axis=1)
         after.place[alone] = start.place[alone] + dt * (start.velocity[alone] + dt * g / 2)
-        return after, touches
+        return after, touches, exact
 
     def _meeting(self, contacts: Contacts, bodies: Bodies, rates: Values) -> tuple[Meetings, Parting]:
         """How contacts act in the step, and how overlaps stand then."""
@@ -198,8 +203,11 @@ class Engine:
             made.dist[first:], made.pos[first:] = gaps, points
             made.geom[first:] = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
 
-    def _pushed(self, contacts: Contacts, meeting: Meetings, bodies: Bodies, rates: Values) -> tuple[Values, Touches]:
-        """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched.
+    def _pushed(
+        self, contacts: Contacts, meeting: Meetings, bodies: Bodies, rates: Values, *, rough: bool
+    ) -> tuple[Values, Touches, bool]:
+        """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched; and
+        whether they are of hard contacts.
 
         What does not come near enough to touch is left out, and looked at again with the velocities that come of it.
         The convex problem wants what slips at a speed s to part at mu s, which would throw up what spins: contacts may
@@ -207,41 +215,53 @@ class Engine:
         """
         data, n, kept, dt = self._data, self._count, meeting.near, self._rules.step
         if not np.any(kept):
-            return np.zeros((n, 6)), Touches.none()
-        rough = data.contact.friction[:, 0]
-        thrown = dt * rough * contacts.slipping(*self._motion(bodies, rates), kept)
-        for _ in range(ROUNDS):
+            return np.zeros((n, 6)), Touches.none(), True
+        lifts = dt * data.contact.friction[:, 0]
+        thrown = lifts * contacts.slipping(*self._motion(bodies, rates), kept)
+        settled = False
+        for number in range(ROUNDS):
             data.contact.dist[:], data.contact.exclude[:] = meeting.aim + thrown, ~kept
-            self._solve()
+            exact = self._solve(rough=rough or (not settled and number < ROUNDS - 1))
             force = data.qfrc_constraint.reshape(-1, 6)[:n].copy()
             motion = self._motion(self._driven_on(bodies, force), rates)
             missed = ~kept & (meeting.gap < dt * contacts.closing(*motion))
             kept, before = kept | missed, thrown
-            thrown = np.minimum(thrown, dt * rough * contacts.slipping(*motion, kept))
+            thrown = np.minimum(thrown, lifts * contacts.slipping(*motion, kept))
             pressed = data.efc_force[data.contact.efc_address] > 0
-            if not np.any(missed) and np.all((before - thrown)[pressed & kept] < CLOSE * self._rules.fast * dt):
+            slower = (before - thrown)[pressed & kept]
+            settled = not np.any(missed) and bool(np.all(slower < CLOSE * self._rules.fast * dt))
+            if settled and (exact or rough):
                 break
-        return force, self._touches(contacts, meeting.closing)
+        return force, self._touches(contacts, meeting.closing), exact
 
-    def _solve(self) -> None:
-        """Forces of the contacts that are not excluded, for MuJoCo's data.
+    def _solve(self, *, rough: bool = False) -> bool:
+        """Forces of the contacts that are not excluded, for MuJoCo's data; whether they are of hard ones: where it may
+        be `rough`, a crowd is left with the softest, which tell what comes near what.
 
         Which of a thousand hard contacts press Newton's method finds by trial: it flips some at every iteration, and
         is not there after 200. Soft ones, taken first, tell it in 30, and each harder set takes a dozen.
         """
+        mujoco.mj_makeM(self._model.made, self._data)
+        mujoco.mj_factorM(self._model.made, self._data)
+        if not self._crowded:
+            self._press(1.0, AT_ONCE)
+            if self._simple():
+                return True
+            self._crowded = True
+        for softer in SOFTER[:1] if rough else SOFTER:
+            self._press(softer, ITERATIONS)
+        return not rough
+
+    def _press(self, softer: float, most: int) -> None:
+        """Solve, in so many iterations from the last solution on, with contacts that give way by so many times more."""
         made, data = self._model.made, self._data
-        mujoco.mj_makeM(made, data)
-        mujoco.mj_factorM(made, data)
-        for softer, most in ((1.0, AT_ONCE), *((each, ITERATIONS) for each in SOFTER)):
-            made.opt.iterations = most
-            mujoco.mj_makeConstraint(made, data)
-            data.efc_R[:] *= softer
-            data.efc_D[:] /= softer
-            for stage in STAGES:
-                stage(made, data)
-            data.qacc_warmstart[:] = data.qacc
-            if most == AT_ONCE and self._simple():
-                return
+        made.opt.iterations = most
+        mujoco.mj_makeConstraint(made, data)
+        data.efc_R[:] *= softer
+        data.efc_D[:] /= softer
+        for stage in STAGES:
+            stage(made, data)
+        data.qacc_warmstart[:] = data.qacc
 
     def _simple(self) -> bool:
         """Whether what was solved at once has been solved; MuJoCo counts iterations of the first twenty islands."""
