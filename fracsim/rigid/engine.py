@@ -84,6 +84,7 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [ROOM * self._reach(bodies, of) for of in (common, 0.0)]
+        self._data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
         self._crowded, rough = False, True
         for _ in range(ROUNDS):
             moved, touches, exact = self._moved(bodies, rates, common, reach, rough=rough)
