@@ -72,7 +72,7 @@ ENTRIES = (
     one("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
     Entry(
         "bar-2d-stress", "Shear stress as it tears: fading energy, and strain projected on intact edges (M22 fig. 9).",
-        (("bar-chi", "bar-2d --set time.end=0.096"),
+        (("bar-chi", "bar-2d --set time.end=0.11"),
          ("bar-edge", "bar-2d --set time.end=0.096 --set material.energy=linear --set fracture.approach=edge")),
         "--field stress:xy --size 1100x600 --zoom 0.9",
     ),
@@ -105,7 +105,7 @@ ENTRIES = (
     one("rigid-wall", "A wall of adobe as rigid bodies.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor --zoom 1.3"),
     one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
     one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor --zoom 1.3"),
-    one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor --zoom 1.6"),
+    one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor --zoom 1.25"),
     one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor --zoom 1.2"),
     one("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.3"),
     one("rigid-boats", "Rowing boats dropped in a heap.", "--sheet 0,6,-1 --floor --view 0.9,-1.3,0.6 --zoom 1.2"),
