@@ -27,6 +27,7 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 LIMIT = 5.0  # of the strength, by what a cell feels itself
+DIGITS = 9  # of loads that are told apart: equal ones go by the numbers of the input, whatever the ranks
 ROUNDS = 2  # nodes beside a crack, then those that only what was spared for them holds
 
 
@@ -95,7 +96,8 @@ class Holding:
         """Of cells (n,) under their own loads (n,) those that keep a node: one for each that there is one for."""
         nodes = self._graph.cell_nodes[cells].astype(np.int64)
         across = (fails[:, None] & ~self._of_node).sum(axis=2)  # (n, d + 1): failing edges beside the node's own
-        key = np.where(endangered[nodes], across + 0.5 * (own / self._limit)[:, None], np.inf)
+        share = np.round(own / self._limit, DIGITS)  # in a uniform field cells are equal but for round-off
+        key = np.where(endangered[nodes], across + 0.5 * share[:, None], np.inf)
         at = np.isfinite(key) & (key == self._least(nodes, key)[nodes])
         first = np.where(at, self._graph.domain.cell_input[cells][:, None].astype(float), np.inf)  # of equals one
         return np.asarray(cells[(at & (first == self._least(nodes, first)[nodes])).any(axis=1)])
