@@ -188,9 +188,9 @@ class Surface:
     def _settle(self, u: Values, load: Values) -> None:
         """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
         so. Pairs are those of all elements."""
-        start, left = self.at.share, chain(repeat(IN, GENTLY), repeat(LEAST))
-        for each in left:
-            if not (self._shorten(u, self._pressed(u, load), each) or self._shorten(u, cut := self._cutting(u), each)):
+        start = self.at.share
+        for left in chain(repeat(IN, GENTLY), repeat(LEAST)):
+            if not (self._shorten(u, self._pressed(u, load), left) or self._shorten(u, cut := self._cutting(u), left)):
                 break
         crowded = np.union1d(self._pressed(u, np.maximum(load, self.close * self._how["stiffness"])), cut)
         self._leave_out(crowded)
