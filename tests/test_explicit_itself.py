@@ -122,7 +122,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
 
 def test_a_cracked_column_carries_its_upper_half() -> None:
     """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
-    reads nothing. So it is with contact between pieces alone."""
+    reads nothing. So it is with contact between pieces alone, whose flat walls are less apart."""
     carried = []
     for contact in ({"contact": {}}, {}, {"contact": {"itself": "pieces"}}):
         scene, state = make_scene(
@@ -141,7 +141,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     # 0.08 m less the gap of the crack over a column of 1 m: E A strain, about
     assert 0.3 * 1e4 * 0.5 * 0.08 < carried[0] < 1.2 * 1e4 * 0.5 * 0.08 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-2 * carried[0]
-    assert abs(carried[2] - carried[0]) < 0.02 * carried[0]
+    assert carried[0] < carried[2] < 1.2 * carried[0]
 
 
 def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:

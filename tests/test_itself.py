@@ -83,7 +83,7 @@ def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
 
 def test_a_cracked_column_carries_its_upper_half() -> None:
     """Cut through, then pressed: the base reads what the top is pressed with, through the crack; without contact it
-    reads nothing. So it is with contact between pieces alone."""
+    reads nothing. So it is with contact between pieces alone, whose flat walls are less apart."""
     carried = []
     for contact in ({"contact": {}}, {}, {"contact": {"itself": "pieces"}}):
         scene, state = make_scene(
@@ -101,7 +101,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
     # 0.05 m less the gap of the crack over a column of 1 m: E A strain, about
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
-    assert abs(carried[2] - carried[0]) < 1e-6 * carried[0]
+    assert carried[0] < carried[2] < 1.2 * carried[0]
 
 
 def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:

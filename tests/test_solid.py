@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fracsim.mesh.split.build import split
+from fracsim.mesh.split.laid import laid
 from fracsim.mesh.split.places import whole
 from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.mesh.split.solid import is_same_solid, split_of_pieces
@@ -15,7 +18,7 @@ from support.solids import assert_closed, cloud, components, enclosed, lattice, 
 
 @given(st.sampled_from([2, 3]), st.integers(0, 1000), st.sampled_from([0.01, 0.05, 0.2]))
 def test_it_encloses_what_the_nodes_with_a_whole_cell_own(dim: int, seed: int, share: float) -> None:
-    """Each such node owns 1 / (d + 1) of its cells, and its piece what its nodes own; nothing else is there."""
+    """A piece has of a cell what lies on its side of planes through the middles of edges; nothing else is there."""
     mesh = cloud(dim, seed)
     skeleton = Skeleton(mesh)
     broken = np.random.default_rng(seed).random(len(skeleton.edges)) < share
@@ -24,10 +27,12 @@ def test_it_encloses_what_the_nodes_with_a_whole_cell_own(dim: int, seed: int, s
     solid[mesh.cells[pattern == 0]] = True
     made = split_of_pieces(skeleton, pattern)
     assert_closed(made)
-    of_node = np.where(solid[mesh.cells], signed_measures(mesh.points, mesh.cells)[:, None] / (dim + 1), 0.0)
     inner = ~broken & solid[skeleton.edges].all(axis=1)
     count, piece = components(len(mesh.points), skeleton.edges[inner])
-    expected = np.bincount(piece[mesh.cells.ravel()], of_node.ravel(), minlength=count)
+    own = np.zeros((len(mesh.cells), count), int)
+    np.add.at(own, (np.arange(len(mesh.cells))[:, None], piece[mesh.cells]), solid[mesh.cells])
+    share = {2: np.array([0.0, 1 / 4, 3 / 4, 1.0]), 3: np.array([0.0, 1 / 8, 1 / 2, 7 / 8, 1.0])}[dim]
+    expected = signed_measures(mesh.points, mesh.cells) @ share[own]
     label = piece[made.follow.first_parent[made.elements[:, 0]]]
     found, slack = enclosed(made.points, made.elements, label, count)
     assert np.all(np.abs(found - expected) <= slack)
@@ -42,7 +47,26 @@ def test_a_crack_within_a_piece_is_not_there_and_one_between_pieces_is() -> None
     whole = torn(mesh, np.zeros(len(through), bool))
     assert np.array_equal(split_of_pieces(skeleton, patterns(skeleton, notch)).elements, whole.elements)
     parted, all_walls = split_of_pieces(skeleton, patterns(skeleton, through)), torn(mesh, through)
-    assert np.array_equal(parted.elements, all_walls.elements) and parted.pieces == 2
+    assert parted.pieces == 2 and len(parted.elements) < len(all_walls.elements)
+    cut = all_walls.points[np.unique(all_walls.elements)]  # without the middles of cells, which the flat cut has not
+    on_edges = ~(cut[:, None] == mesh.points[mesh.cells].mean(axis=1)).all(axis=2).any(axis=1)
+    here = parted.points[np.unique(parted.elements)]
+    assert np.array_equal(np.unique(here, axis=0), np.unique(cut[on_edges], axis=0))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_plane_that_says_where_edges_are_cut_is_the_wall(dim: int) -> None:
+    """What is above it and below it, to round-off; where it comes too near to a node it is not followed."""
+    mesh = lattice(*(4,) * dim)
+    skeleton = Skeleton(mesh)
+    y, ends = mesh.points[:, 1], mesh.points[skeleton.edges][:, :, 1]
+    for height, wall in ((1.7, 1.7), (1.95, 1.85)):
+        broken = separated(skeleton, (y > height).astype(int))
+        cut = np.where(broken, (height - ends[:, 0]) / np.where(broken, ends[:, 1] - ends[:, 0], 1.0), np.nan)
+        made = split_of_pieces(skeleton, patterns(skeleton, broken), cut)
+        label = (y > height).astype(int)[made.follow.first_parent[made.elements[:, 0]]]
+        found, slack = enclosed(made.points, made.elements, label, 2)
+        assert np.all(np.abs(found - np.array([wall, 4 - wall]) * 4 ** (dim - 1)) <= 10 * slack)
 
 
 @given(st.sampled_from([2, 3]), st.integers(0, 1000), st.sampled_from([0.02, 0.1]), st.integers(1, 20))
@@ -74,3 +98,29 @@ def test_a_crack_within_a_half_leaves_the_surface_of_the_halves() -> None:
     assert notch.any()
     halves, both = patterns(skeleton, through), patterns(skeleton, through | notch)
     assert is_same_solid(skeleton, both, halves) and not is_same_solid(skeleton, patterns(skeleton, notch), both)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_walls_are_drawn_where_they_are_cut_flat(dim: int) -> None:
+    """However nodes move, the surface of a piece inside a body that is drawn encloses what its flat one does, though it
+    has other points; with a crack in it at rest, where the sides of that lie on each other."""
+    mesh, rng = lattice(*(8,) * dim), np.random.default_rng(dim)
+    skeleton, x = Skeleton(mesh), mesh.points
+    inner = ((x >= 2) & (x <= 6)).all(axis=1).astype(int)
+    around = separated(skeleton, inner)
+    crack = separated(skeleton, x[:, 0] > 4) & ~around & (x[skeleton.edges].mean(axis=1)[:, 1] < 4)
+    for broken, share in ((around, 0.2), (around | crack, 0.0)):
+        pattern, u = patterns(skeleton, broken), share * rng.random(x.shape)
+        flat, drawn = split_of_pieces(skeleton, pattern), split(skeleton, pattern)
+        of_flat = whole(flat, skeleton, pattern, flat.points).drawn_in(rng.uniform(0.5, 1.0, len(flat.points)))
+        before = whole(drawn, skeleton, pattern, drawn.points)
+        after = laid(before, skeleton, pattern, of_flat)
+        each = [
+            enclosed(places(u), made.elements, inner[made.follow.first_parent[made.elements[:, 0]]], 2)[0][1]
+            for made, places in ((flat, of_flat), (drawn, after), (drawn, before))
+        ]
+        assert each[1] == pytest.approx(each[0], rel=1e-12) and abs(each[2] - each[0]) > 1e-2 * each[0]
+    sides = np.isin(drawn.edge, np.flatnonzero(crack & (inner[skeleton.edges] == 1).all(axis=1)))
+    _, number = np.unique(np.round(after.rest, 9), axis=0, return_inverse=True)
+    _, count = np.unique(np.sort(number.reshape(-1)[drawn.elements[sides]], axis=1), axis=0, return_counts=True)
+    assert len(count) and np.all(count == 2)

@@ -30,7 +30,7 @@ from .prescribed_motion import PrescribedMotion
 from .stiff import Stiff
 from .stress import Stress
 from .tangent import Assembly
-from .term import Form, Level, Term
+from .term import Cuts, Form, Level, Term
 from .vectors import Assembler
 
 if TYPE_CHECKING:
@@ -435,6 +435,11 @@ class Balance:
     def conservative(self) -> bool:
         """Whether r is the derivative of `potential` (collective)."""
         return all([term.potential() is not None for term in self.terms])
+
+    def cut_by(self, cuts: Cuts) -> None:
+        """Broken edges are cut where `cuts` says."""
+        for term in self.terms:
+            term.cut_by(cuts)
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 type Form = ufl.Form | int  # 0: none
+# nodes (n, 2) of all broken edges and where they are cut (n, 1) from the lower one, nan: in the middle; on rank 0
+type Cuts = Callable[[], tuple[npt.NDArray[np.int64], Values] | None]  # (collective)
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,9 @@ class Term:
 
     def arrive(self) -> None:
         """A solution of the step is found: be what it ends with, until a past is recalled (collective)."""
+
+    def cut_by(self, cuts: Cuts) -> None:
+        """Broken edges are cut where `cuts` says, which is asked after they broke; else in the middle."""
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""

@@ -19,7 +19,8 @@ from scipy.sparse import csr_matrix, kron
 from ...errors import InputError
 from ...mesh.split.build import split
 from ...mesh.split.identity import found_again, identity
-from ...mesh.split.places import whole
+from ...mesh.split.laid import laid
+from ...mesh.split.places import Places, whole
 from ...mesh.split.skeleton import Skeleton
 from ...mesh.split.solid import is_same_solid, split_of_pieces
 from ...meshes.words import format_point
@@ -74,11 +75,18 @@ class Surface:
     at_once: ClassVar[bool] = False
 
     def __init__(
-        self, skeleton: Skeleton, pattern: npt.NDArray[np.uint8], law: Law, u: Values, before: Surface | None
+        self,
+        skeleton: Skeleton,
+        pattern: npt.NDArray[np.uint8],
+        law: Law,
+        u: Values,
+        before: Surface | None,
+        cut: Values | None = None,
     ) -> None:
-        """`u`: (nodes, d) where the body is, m; `before`: the surface until now."""
+        """`u`: (nodes, d) where the body is, m; `before`: the surface until now. `cut`: (E,) where edges are cut, for
+        contact between pieces (split.build); all others are cut in the middle, which leaves both sides most room."""
         self._skeleton, self._pattern, self._of_pieces = skeleton, pattern, law.pieces
-        self.made = split_of_pieces(skeleton, pattern) if law.pieces else split(skeleton, pattern)
+        self.made = split_of_pieces(skeleton, pattern, cut) if law.pieces else split(skeleton, pattern)
         self._rest = receded(self.made, self.gap * law.distance)
         self.at = whole(self.made, skeleton, pattern, self._rest)
         self._how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
@@ -98,7 +106,13 @@ class Surface:
 
     def serves(self, pattern: npt.NDArray[np.uint8]) -> bool:
         """Whether it is the surface of these patterns (C,) too: most edges break within pieces."""
-        return self._of_pieces and is_same_solid(self._skeleton, pattern, self._pattern)
+        if same := self._of_pieces and is_same_solid(self._skeleton, pattern, self._pattern):
+            self._pattern = pattern
+        return same
+
+    def laid(self, at: Places) -> Places:
+        """All walls of the body, those between pieces where they are here."""
+        return laid(at, self._skeleton, self._pattern, self.at)
 
     def _check_apart(self) -> None:
         """InputError where a body at rest cuts or touches itself."""

@@ -46,13 +46,15 @@ class Pushes(Surface):
         law: Law,
         u: Values,
         before: Pushes | None,
+        cut: Values | None = None,
+        *,
         mass: Values,
         most: float,
     ) -> None:
         """`mass`: (nodes,) kg; `most`: 1/s^2 (pushing.rates); the others as for Surface."""
         self._law, self.mass, self._most, self._earlier = law, mass, most, before
         self._rates: Values | None = None
-        super().__init__(skeleton, pattern, law, u, before)
+        super().__init__(skeleton, pattern, law, u, before, cut)
         self._earlier = None
 
     def _pairs_of(self, elements: Ints) -> Pushing:
@@ -105,9 +107,9 @@ class ExplicitSelfContact(SelfContact):
         self._friction, self._lost = law.friction, 0.0
         super().__init__(domain, u, replace(law, friction=0.0))  # that of implicit steps
 
-    def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
+    def _made(self, pattern: npt.NDArray[np.uint8], u: Values, cut: Values | None) -> Surface:
         assert self._skeleton is not None and self._mass is not None
-        return Pushes(self._skeleton, pattern, self.law, u, self._surface, self._mass, self._most)
+        return Pushes(self._skeleton, pattern, self.law, u, self._surface, cut, mass=self._mass, most=self._most)
 
     def stiffen(self) -> float:
         """A penalty knows no gap that is all but closed."""

@@ -22,7 +22,7 @@ from ...mesh.split.places import Places
 from ...mesh.split.skeleton import Skeleton
 from ..coupling import Coupling
 from ..stiff import Stiff
-from ..term import Level, Term
+from ..term import Cuts, Level, Term
 from .crowd import Law, Surface
 from .slip import Friction
 from .stiffening import stiffening
@@ -40,6 +40,7 @@ class SelfContact(Term):
     keeps_apart = beside = True
     exact_at_end: ClassVar[bool] = True  # tangents where Newton's method is at its end
     _attempts = 0  # of the step
+    _cuts: Cuts | None = None
 
     def __init__(self, domain: Domain, u: fem.Function, law: Law) -> None:
         """InputError where the surface at rest cuts itself (collective)."""
@@ -59,10 +60,12 @@ class SelfContact(Term):
     def _rebuild(self) -> None:
         """The surface of the damage of now (collective)."""
         pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
+        cuts = None if self._cuts is None else self._cuts()
 
         def made() -> Surface:
-            assert pattern is not None and u is not None
-            return self._made(pattern, u)
+            assert pattern is not None and u is not None and self._skeleton is not None
+            cut = None if cuts is None else self._skeleton.of_edges(cuts[0], cuts[1][:, 0])
+            return self._made(pattern, u, cut)
 
         self._surface = on_root(self.comm, made)
         self._x: Values | None = None
@@ -73,12 +76,12 @@ class SelfContact(Term):
         self._rubbing: Friction | None = None
         self._moved = True
 
-    def _made(self, pattern: npt.NDArray[np.uint8], u: Values) -> Surface:
+    def _made(self, pattern: npt.NDArray[np.uint8], u: Values, cut: Values | None) -> Surface:
         """On rank 0."""
         assert self._skeleton is not None
         if self._surface is not None and self._surface.serves(pattern):
             return self._surface
-        return Surface(self._skeleton, pattern, self.law, u, self._surface)
+        return Surface(self._skeleton, pattern, self.law, u, self._surface, cut)
 
     def _gathered(self, u: Values) -> Values | None:
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
@@ -87,10 +90,15 @@ class SelfContact(Term):
     def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
         assert self._surface is not None
-        if self.law.pieces:  # other points: walls inside pieces and crumbs are drawn where they are
-            return at
         own = self._surface.at
+        if self.law.pieces:
+            return self._surface.laid(at)
         return own.drawn_in(np.minimum(own.share, at.share))
+
+    def cut_by(self, cuts: Cuts) -> None:
+        """Walls between pieces are where edges are cut."""
+        if self.law.pieces:
+            self._cuts = cuts
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """New walls may touch from here on, drawn in where they are crowded as they appear (collective)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from ...meshes.topology import facets_of
 from .follow import Follow
 from .points import SurfacePoints
 from .skeleton import CRACK, Skeleton
-from .table import Elements, table
+from .table import Elements, Table, table
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -49,25 +50,39 @@ class Split:
         return self.piece_of_node[self.follow.first_parent]
 
 
-def split(skeleton: Skeleton, pattern: npt.NDArray[np.integer], cut: Values | None = None) -> Split:
+def split(
+    skeleton: Skeleton,
+    pattern: npt.NDArray[np.integer],
+    cut: Values | None = None,
+    table: Callable[[int], Table] = table,
+) -> Split:
     """The surface of damage patterns (C,), as in EdgeGraph.pattern.
 
-    `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle.
+    `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle. `table`: what the
+    patterns mean, by dimension.
     """
-    return _Builder(skeleton, pattern, cut)()
+    return _Builder(skeleton, pattern, cut, table(skeleton.dim))()
+
+
+def points_of(
+    skeleton: Skeleton, pattern: npt.NDArray[np.integer], table: Callable[[int], Table] = table
+) -> SurfacePoints:
+    """The points of the same, cut in the middle."""
+    damaged = np.flatnonzero(pattern)
+    return SurfacePoints(skeleton, damaged, pattern[damaged].astype(np.int64), None, table(skeleton.dim))
 
 
 class _Builder:
     """Works on the damaged cells only; the boundary facets of all others stay as they are."""
 
-    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], cut: Values | None) -> None:
-        self.skeleton, self.table = skeleton, table(skeleton.dim)
+    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], cut: Values | None, table: Table) -> None:
+        self.skeleton, self.table = skeleton, table
         self.damaged = np.flatnonzero(pattern)
         self.pattern = pattern[self.damaged].astype(np.int64)
         self.place = np.full(len(pattern), -1)  # of a cell among the damaged ones
         self.place[self.damaged] = np.arange(len(self.damaged))
         self.broken = skeleton.broken_edges(pattern)
-        self.points = SurfacePoints(skeleton, self.damaged, self.pattern, cut)
+        self.points = SurfacePoints(skeleton, self.damaged, self.pattern, cut, table)
 
     def __call__(self) -> Split:
         parts = self._whole_facets(), self._torn_facets(), self._walls()

@@ -56,6 +56,15 @@ class Places:
         """The points with `share` (n,) of their arms."""
         return Places(self._mean, self._middle, self._arms, self._out, share)
 
+    def laid_on(self, points: Ints, mean: csr_matrix, other: Places) -> Places:
+        """With `points` (k,) at means, rows (k, m), of the points of `other` once their arms are whole."""
+        n = len(self.share)
+        to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
+        keep, out = diags(1.0 - np.bincount(points, minlength=n)), self._out.copy()
+        out[points] = mean @ other.rest - self._middle[points]
+        arms = keep @ self._arms + to @ (mean @ other.weights - self._mean[points])
+        return Places(self._mean, self._middle, arms.tocsr(), out, self.share)
+
     def __call__(self, u: Values) -> Values:
         """(n, d) x of nodal displacements (nodes, d), m."""
         return np.asarray(self.rest + self.weights @ u)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..simplices import local_edges
 from .follow import Follow
 from .skeleton import Skeleton
-from .table import CELL, EDGE, FACET, table
+from .table import CELL, EDGE, FACET, Table
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -22,11 +22,14 @@ class SurfacePoints:
     Attributes:
         positions: (n, d) reference coordinates, m.
         follow: the nodes that each point follows.
+        first: number of the first copy.
+        cell, kind, entity: (copies,) what is copied: of which cell, and of that which edge, facet or the whole.
+        group: (copies, d + 1) nodes of the cell that each follows.
     """
 
-    def __init__(self, skeleton: Skeleton, damaged: Ints, pattern: Ints, cut: Values | None) -> None:
+    def __init__(self, skeleton: Skeleton, damaged: Ints, pattern: Ints, cut: Values | None, table: Table) -> None:
         """`pattern`: of the damaged cells; `cut`: see build.split."""
-        self._skeleton, self._copies = skeleton, table(skeleton.dim).copies
+        self._skeleton, self._copies = skeleton, table.copies
         self._cut = cut if cut is not None and np.isfinite(cut).any() else None
         nodes = np.arange(len(skeleton.points)) if skeleton.dim == 2 else skeleton.boundary_nodes
         self._of_node = np.full(len(skeleton.points), -1)
@@ -36,7 +39,8 @@ class SurfacePoints:
         number, one = _numbered(self._keys(row, damaged[owner], owner))
         self._of_copy = np.append(number + len(nodes), -1)  # something to index where there is no copy
         row, cell = row[one], damaged[owner[one]]
-        group = self._copies.group[row]
+        self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
+        self.first, self.group = len(nodes), (group := self._copies.group[row])
         parents = np.concatenate([nodes, skeleton.cells[cell][group]])
         count = np.concatenate([np.ones(len(nodes), np.int64), group.sum(axis=1)])
         self.positions: Values = np.concatenate([skeleton.points[nodes], self._places(row, cell)])

@@ -91,7 +91,12 @@ class Table:
 @cache
 def table(dim: int) -> Table:
     """The table for triangles (8 patterns) or tetrahedra (64), worked out once."""
-    cells = [_Cell(dim, pattern) for pattern in range(1 << len(local_edges(dim)))]
+    return tabled(Cell, dim)
+
+
+def tabled(kind: type[Cell], dim: int) -> Table:
+    """What that kind of cell makes of every pattern."""
+    cells = [kind(dim, pattern) for pattern in range(1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
     return Table(
         _copies(cells, dim),
@@ -101,14 +106,14 @@ def table(dim: int) -> Table:
     )
 
 
-class _Cell:
+class Cell:
     """One cell with one pattern, in words."""
 
     def __init__(self, dim: int, pattern: int) -> None:
         self.dim, self.pattern = dim, pattern
         pairs: list[list[int]] = local_edges(dim).tolist()  # type: ignore[assignment]
         self.edge = {frozenset(pair): k for k, pair in enumerate(pairs)}
-        self.walls = [element for i, j, *rest in _turned(dim) for element in self._wall(i, j, rest)]
+        self.walls = self._walls()
         used = {corner for corners, _ in self.walls for corner in corners if isinstance(corner, Copy)}
         self.copies = sorted(used)
 
@@ -131,13 +136,16 @@ class _Cell:
     def T(self, i: int) -> Copy:
         return Copy(CELL, 0, self.group(range(self.dim + 1), i))
 
+    def _walls(self) -> list[Element]:
+        return [element for i, j, *rest in _turned(self.dim) for element in self._wall(i, j, rest)]
+
     def _wall(self, i: int, j: int, rest: list[int]) -> list[Element]:
         """The side of i of the wall towards j, positively ordered as seen from outside i's part."""
         if not self.broken(i, j):
             return []
         m, T, edge = self.m(i, j), self.T(i), self.edge[frozenset((i, j))]
         if self.dim == 2:  # the part of i lies to the left
-            return [((m, T) if _sign((i, j, *rest)) > 0 else (T, m), edge)]
+            return [((m, T) if sign((i, j, *rest)) > 0 else (T, m), edge)]
         k, last = rest
         return [((m, self.G(last, i), T), edge), ((m, T, self.G(k, i)), edge)]
 
@@ -168,15 +176,15 @@ class _Cell:
 
 def _turned(dim: int) -> list[tuple[int, ...]]:
     """Orderings (i, j, ...) of the nodes, one for each ordered pair: in 3D the even ones."""
-    return [order for order in permutations(range(dim + 1)) if dim == 2 or _sign(order) > 0]
+    return [order for order in permutations(range(dim + 1)) if dim == 2 or sign(order) > 0]
 
 
-def _sign(order: tuple[int, ...]) -> int:
+def sign(order: tuple[int, ...]) -> int:
     swaps = sum(order[a] > order[b] for a in range(len(order)) for b in range(a + 1, len(order)))
     return -1 if swaps % 2 else 1
 
 
-def _copies(cells: list[_Cell], dim: int) -> Copies:
+def _copies(cells: list[Cell], dim: int) -> Copies:
     rows = [copy for cell in cells for copy in cell.copies]
     group = np.zeros((len(rows), dim + 1), bool)
     for row, copy in zip(group, rows, strict=True):
@@ -185,7 +193,7 @@ def _copies(cells: list[_Cell], dim: int) -> Copies:
     return Copies(_starts([cell.copies for cell in cells]), kind, entity, group.argmax(axis=1), group)
 
 
-def _elements(lists: list[tuple[_Cell, list[Element]]], width: int) -> Elements:
+def _elements(lists: list[tuple[Cell, list[Element]]], width: int) -> Elements:
     corners, edges = [], []
     for cell, elements in lists:
         place = {copy: index for index, copy in enumerate(cell.copies)}
