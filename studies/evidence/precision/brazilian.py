@@ -15,7 +15,7 @@ import numpy as np
 from ..references import brazilian_peak, disk_stress, hondros
 from ..results import Values, history, last_frame
 from ..trial import Trial
-from .common import QUIET, Study, trial
+from .common import QUIET, Study, beside_akantu, trial
 from .orders import MIDDLES, order_claim, plane_stress
 from .page import Case, Order, Records, by_figures
 
@@ -89,6 +89,9 @@ def trials() -> list[Trial]:
               {"h": RADIUS / parts, "order": 2})
         for parts in SECOND
     ]  # fmt: skip
+    for order, all_parts in ((1, PARTS), (2, SECOND)):
+        for parts in all_parts:
+            found += beside_akantu("disk", RADIUS / parts, order)
     runs = [(parts, 0.0) for parts in PEAK_PARTS] + [(parts, RADIUS / 10) for parts in AVERAGED]
     found += [
         trial("disk-peak", f"parts-{parts}-radius-{radius:g}", split(parts, radius), "brazilian:measure_peak",
@@ -100,10 +103,15 @@ def trials() -> list[Trial]:
 
 def measure_centre(run: Path) -> dict[str, float]:
     """Relative errors: of sigma_xx, sigma_yy and both as means near the centre, and of the stress in L2."""
-    frame = last_frame(run)
+    return centre(last_frame(run))
+
+
+def centre(frame: dict[str, Any]) -> dict[str, float]:
+    """The same of a frame: points, cells, displacement, and the stress of linear cells."""
     corners = frame["points"][frame["cells"]][:, :3, :2]  # of 3 or 6 nodes
-    stress = frame["stress"][:, None, [0, 3, 1]]
-    if frame["cells"].shape[1] == 6:
+    if frame["cells"].shape[1] == 3:
+        stress = frame["stress"][:, None, [0, 3, 1]]
+    else:
         stress = plane_stress(frame, GRANITE["young"], GRANITE["poisson"], MIDDLES)  # type: ignore[arg-type]
     fourth, half = (_within(corners, stress, RADIUS * share) for share in (1 / 4, 1 / 2))
     (found, exact), (wide, wide_exact) = fourth[:2], half[:2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..peers.akantu import interpreter
 from ..trial import Setting, Trial
 
 GROUP = "precision"
@@ -24,3 +25,12 @@ def script(case: str, name: str, module: str, arguments: dict[str, Any], setting
     """A run of a script of this group that writes figures.json; `arguments` as --key value."""
     words = [str(word) for key, value in arguments.items() for word in (f"--{key}", value)]
     return Trial(GROUP, case, name, script=(f"{SCRIPTS}.{module}", *words), settings=settings, **more)
+
+
+def beside_akantu(case: str, h: float, order: int, full: bool = False) -> list[Trial]:
+    """The mesh of a static case solved by Akantu; nothing where it is not installed."""
+    if interpreter() is None:
+        return []
+    words = ("fracsim.studies.evidence.peers.akantu_static", "--case", case, "--h", str(h), "--order", str(order))
+    settings: Settings = {"h": h, "order": order, "elements": "Akantu"}
+    return [Trial(GROUP, case, f"akantu-order-{order}-h-{h:g}", script=words, settings=settings, full=full)]

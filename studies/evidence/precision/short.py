@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..peers.akantu import ABSENT, interpreter
 from ..section import Cell, Plot, Section, Series, Table, pareto_front
 from .page import LIMITS, Case, Records, Row, cheapest, counts, rows_of, setting
 
@@ -27,6 +28,8 @@ def summary(cases: list[Case], records: Records) -> list[Section]:
         tuple(_front(case, rows) for case, rows in found), "loglog", levels=LIMITS,
     )  # fmt: skip
     without = "" if peers else " No other program has run beside them here."
+    if "Akantu" not in peers and interpreter() is None:
+        without += f" {ABSENT}"
     text = f"What an error of 5 % and of 1 % costs.{without} What does not hold comes next, everything else below."
     return [Section("Error against run time", text, tables=(table,), plots=(plot,), first=True)]
 

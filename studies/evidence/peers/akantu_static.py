@@ -1,0 +1,75 @@
+"""Akantu on the meshes of the linear static cases, linear and quadratic cells: what it takes for how good an answer.
+
+    python -m fracsim.studies.evidence.peers.akantu_static --case cantilever --h 0.025 --order 1 -o figures.json
+
+Writes what the measurements of precision/statics.py and precision/brazilian.py write, and `seconds`: processor time of
+its one solve, stiffness and factors included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..precision import brazilian, statics
+from .akantu import Akantu, Values, problem_of
+
+CASES = ("cantilever", "plate", "disk")
+
+
+def study_of(case: str, h: float, order: int) -> dict[str, Any]:
+    if case == "disk":
+        return brazilian.pressed(round(brazilian.RADIUS / h), order)
+    return statics.STUDIES[case](h, order=order)
+
+
+def figures_of(case: str, problem: dict[str, Any], u: Values) -> dict[str, float]:
+    """Of the displacement (nodes, d), m, as precision/ measures them."""
+    if case == "disk":
+        frame = {"points": problem["points"], "cells": problem["cells"], "displacement": u}
+        return brazilian.centre(frame | {"stress": stress_of(problem, u)})
+    work = float((problem["force"] * u).sum())
+    end = statics.TRACTION * statics.DEPTH**2 if case == "cantilever" else statics.PULL * statics.SIDE
+    return {"deflection": work / end}
+
+
+def stress_of(problem: dict[str, Any], u: Values) -> Values:
+    """(cells, 4) stress xx, xy, yx, yy, Pa, in plane stress: of the corners, and so of linear cells."""
+    X, values = (each[problem["cells"][:, :3]] for each in (problem["points"], u))
+    gradient = np.linalg.solve(X[:, 1:] - X[:, :1], values[:, 1:] - values[:, :1]).swapaxes(1, 2)
+    strain = (gradient + gradient.swapaxes(1, 2)) / 2
+    young, poisson = problem["young"], problem["poisson"]
+    trace = poisson / (1 - poisson) * np.einsum("cii->c", strain)
+    stress = young / (1 + poisson) * (strain + trace[:, None, None] * np.eye(2))
+    return np.asarray(stress.reshape(-1, 4))
+
+
+def main() -> None:
+    from mpi4py import MPI
+
+    from ....scene import build_scene
+    from ....study.file import validate
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--case", choices=CASES, required=True)
+    parser.add_argument("--h", type=float, required=True, help="cell size, m")
+    parser.add_argument("--order", type=int, choices=(1, 2), default=1)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    study = study_of(given.case, given.h, given.order)
+    problem = problem_of(build_scene(MPI.COMM_WORLD, validate(study, given.case)), 0.0)
+    with tempfile.TemporaryDirectory() as folder:
+        theirs = Akantu(problem, Path(folder))
+        theirs.step(1.0)
+        u = theirs.end()
+    figures = figures_of(given.case, problem, u)
+    given.out.write_text(json.dumps(figures | {"seconds": theirs.cpu[0]}) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Steps of Akantu (Richart et al. 2024, JOSS 9, 5253), run by the Python that has it; nothing of fracsim is imported.
+
+    PYTHON -I akantu_worker.py problem.npz result.npz
+
+Reads shares of the load from stdin, one a line, and answers each with the seconds of the step that took the body there:
+{"wall": s, "cpu": s}. The stiffness of a linear body does not change: MUMPS factorises it in the first step, and Akantu
+keeps the factors by itself. Displacements go to result.npz at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import akantu
+import numpy as np
+
+KINDS = {(2, 3): "_triangle_3", (2, 6): "_triangle_6", (3, 4): "_tetrahedron_4", (3, 10): "_tetrahedron_10"}
+
+
+def main() -> None:
+    problem = dict(np.load(sys.argv[1]))
+    mesh = mesh_of(problem["points"], problem["cells"])
+    model = model_of(mesh, problem)
+    force, whole = model.getExternalForce(), problem["force"]
+    solver = "" if problem["step"] else "linear"  # "" is that of the analysis
+    for line in sys.stdin:
+        force[:] = float(line) * whole
+        wall, cpu = time.perf_counter(), time.process_time()
+        model.solveStep(solver)
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        print(json.dumps({"wall": wall, "cpu": cpu}), flush=True)
+    np.savez(sys.argv[2], displacement=np.array(model.getDisplacement()))
+
+
+def mesh_of(points: Any, cells: Any) -> Any:
+    kind = getattr(akantu, KINDS[points.shape[1], cells.shape[1]])
+    mesh = akantu.Mesh(points.shape[1])
+    into = akantu.MeshAccessor(mesh)
+    into.resizeNodes(len(points))
+    mesh.getNodes()[:] = points
+    mesh.addConnectivityType(kind)
+    into.resizeConnectivity(len(cells), kind)
+    mesh.getConnectivity(kind)[:] = cells
+    into.makeReady()
+    return mesh
+
+
+def model_of(mesh: Any, problem: dict[str, Any]) -> Any:
+    """Statics where the step is 0; else the trapezoidal rule with a consistent mass."""
+    young, poisson, density, step = (float(problem[key]) for key in ("young", "poisson", "density", "step"))
+    words = f"material elastic [\n name = body\n rho = {density!r}\n E = {young!r}\n nu = {poisson!r}\n"
+    words += " Plane_Stress = true\n]\n" if problem["plane_stress"] else "]\n"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "material.dat")
+        path.write_text(words)
+        akantu.parseInput(str(path))
+    model = akantu.SolidMechanicsModel(mesh)
+    model.initFull(_analysis_method=akantu._implicit_dynamic if step else akantu._static)
+    if step:
+        model.setTimeStep(step)
+    else:  # one solve, where by default Newton's method would look whether that was enough
+        model.getNewSolver("linear", akantu.TimeStepSolverType.static, akantu.NonLinearSolverType.linear)
+        model.setIntegrationScheme("linear", "displacement", akantu.IntegrationSchemeType.pseudo_time)
+    model.getBlockedDOFs()[:] = problem["held"]
+    return model
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""A step of a linear body by one solve with what is kept of the stiffness: this program's beside Akantu's.
+
+    python -m fracsim.studies.evidence.peers.linear_step --n 10 -o figures.json
+
+The block of `make bench`, of 24 n^3 tetrahedra, linear, drawn aside by a force on its end that grows. Both by the
+trapezoidal rule with consistent mass: the equations are the same, and so must the answer be. Steps in turn, so that the
+machine's moods hit both; the first ones, in which Akantu factorises and we set up multigrid, are told by themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from ..section import Claim, Section, Table
+from ..trial import Trial
+from .akantu import ABSENT, Akantu, interpreter, problem_of
+
+SIZES = (10, 20)  # 24k and 192k tetrahedra
+WARM, STEPS = 2, 28
+STEP, PULL = 5e-3, 1e3  # s, Pa
+LIMIT, SAME = 0.8, 1e-4  # of Akantu's step; of the displacement
+WAYS: dict[str, dict[str, Any]] = {
+    "newmark, consistent mass": {"scheme": "newmark", "mass": "consistent"},
+    "newmark": {"scheme": "newmark"},
+    "the defaults": {},
+}
+FIRST = next(iter(WAYS))  # the one with Akantu's equations
+
+
+def study(n: int, way: str) -> dict[str, Any]:
+    """With n cells along a metre."""
+    end = (WARM + STEPS) * STEP
+    return {
+        "title": f"a linear block of {24 * n**3} tetrahedra",
+        "mesh": {"builder": "box", "size": [1.0, 1.0, 4.0], "h": 1 / n},
+        "material": {"energy": "linear", "young": 1e7, "poisson": 0.35, "density": 1000.0},
+        "boundary": [
+            {"on": "bottom", "fix": "xyz"},
+            {"on": "top", "traction": {"time": [0.0, end], "value": [[0.0] * 3, [PULL, 0.0, 0.0]]}},
+        ],
+        "time": {"step": STEP, "end": end} | WAYS[way],
+        "output": {"every": 1_000_000, "fields": [], "picture": False},
+    }
+
+
+def trials() -> list[Trial]:
+    """Both sizes; none where Akantu is not there."""
+    if interpreter() is None:
+        return []
+    return [_trial(n) for n in SIZES]
+
+
+def _trial(n: int) -> Trial:
+    script = ("fracsim.studies.evidence.peers.linear_step", "--n", str(n))
+    return Trial("peers", "linear-step", f"n-{n}", script=script, settings={"n": n, "peer": "Akantu"}, limit=45.0 * n)
+
+
+def beside(n: int) -> dict[str, Any]:
+    """Seconds per step of Akantu and of each of our ways, and how far apart the displacements are at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        runs = {way: _started(n, way, Path(folder, str(place))) for place, way in enumerate(WAYS)}
+        theirs = Akantu(problem_of(runs[FIRST].scene, STEP), Path(folder))
+        times: dict[str, list[tuple[float, float]]] = {way: [] for way in WAYS}
+        for number in range(WARM + STEPS):
+            theirs.step((number + 1) / (WARM + STEPS))
+            for way, run in runs.items():
+                wall, cpu = time.perf_counter(), time.process_time()
+                run.step()
+                times[way].append((time.perf_counter() - wall, time.process_time() - cpu))
+        exact = theirs.end()
+    ours = runs[FIRST].state.u.reshape(exact.shape)
+    return {
+        "cells": runs[FIRST].scene.domain.cell_count,
+        "apart": float(np.abs(ours - exact).max() / np.abs(exact).max()),
+        "akantu": {"wall": median(theirs.wall[WARM:]), "cpu": median(theirs.cpu[WARM:]), "first": theirs.cpu[0]},
+        "ours": {way: _of(pairs) for way, pairs in times.items()},
+    }
+
+
+def _started(n: int, way: str, folder: Path) -> Any:
+    from mpi4py import MPI
+
+    from ....run import Run
+    from ....scene import build_scene
+    from ....study.file import validate
+
+    return Run(build_scene(MPI.COMM_WORLD, validate(study(n, way), way)), folder)
+
+
+def _of(pairs: list[tuple[float, float]]) -> dict[str, float]:
+    wall, cpu = zip(*pairs[WARM:], strict=True)
+    return {"wall": median(wall), "cpu": median(cpu), "first": pairs[0][1]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=SIZES[0])
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.write_text(json.dumps(beside(given.n), indent=1) + "\n")
+
+
+# --- the section ----------------------------------------------------------------------------------------------------
+
+TITLE = "A linear step beside Akantu's"
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """Table and claims; a sentence where Akantu is not there."""
+    found = [record for record in records if record["case"] == "linear-step"]
+    done = [record["figures"] for record in found if record["figures"]]
+    if not done:
+        return [Section(TITLE, found[0]["message"] if found else ABSENT)]
+    text = (
+        f"Block of 24 n^3 tetrahedra, {STEPS} steps of {STEP:g} s after the first {WARM}, in turn, one process and "
+        f"thread each; medians. '{FIRST}' solves Akantu's equations. Akantu keeps the factors of a direct solver, we "
+        "keep multigrid and begin CG from earlier solutions. First: the first step, with what is made in it."
+    )
+    columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
+    rows = tuple(row for figures in done for row in _rows(figures))
+    return [Section(TITLE, text, _claims(done), (Table("peers-linear-step", TITLE, columns, rows),))]
+
+
+def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
+    theirs = figures["akantu"]
+    programs = {"Akantu": theirs} | {f"fracsim, {way}": each for way, each in figures["ours"].items()}
+    return [
+        (figures["cells"], name, each["wall"], each["cpu"], each["cpu"] / theirs["cpu"], each["first"])
+        for name, each in programs.items()
+    ]
+
+
+def _claims(done: list[dict[str, Any]]) -> tuple[Claim, ...]:
+    ratios = {figures["cells"]: figures["ours"][FIRST]["cpu"] / figures["akantu"]["cpu"] for figures in done}
+    apart = {figures["cells"]: figures["apart"] for figures in done}
+    return (
+        Claim(
+            f"A linear step takes at most {LIMIT:g} of Akantu's core-seconds",
+            ", ".join(f"{ratio:.2f} at {cells:,} tetrahedra" for cells, ratio in ratios.items()),
+            all(ratio <= LIMIT for ratio in ratios.values()),
+        ),
+        Claim(
+            f"Both end at the same displacement, to {SAME:g} of the greatest",
+            ", ".join(f"{each:.1e} at {cells:,} tetrahedra" for cells, each in apart.items()),
+            all(each <= SAME for each in apart.values()),
+        ),
+    )
+
+
+if __name__ == "__main__":
+    main()

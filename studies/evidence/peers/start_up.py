@@ -1,0 +1,126 @@
+"""A small job from the command to its end: this program's processor time beside Akantu's.
+
+    python -m fracsim.studies.evidence.peers.start_up -o figures.json
+
+3,000 tetrahedra and ten steps, where next to nothing is computed: what it takes is imports, reading, building and
+writing. Akantu gets its mesh as arrays and writes one. Processor time of the whole process and its children, in turn;
+kernels and bytecode are compiled before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from ..section import Claim, Section, Table
+from ..trial import Trial
+from .akantu import ABSENT, WORKER, interpreter, problem_of
+from .linear_step import STEP, study
+
+RUNS, STEPS, LIMIT = 7, 10, 0.7  # LIMIT: s
+WAYS: dict[str, dict[str, Any]] = {
+    "linear": {},
+    "neo-hookean": {"material": {"energy": "neo-hookean", "young": 1e7, "poisson": 0.35, "density": 1000.0}},
+    "linear, and may break": {"fracture": {"strength": 1e8}},
+}
+
+
+def job(way: str) -> dict[str, Any]:
+    """Ten steps of the block with 3,000 tetrahedra."""
+    found = study(5, "newmark, consistent mass") | WAYS[way]
+    return found | {"time": found["time"] | {"end": STEPS * STEP}}
+
+
+def trials() -> list[Trial]:
+    """One, with Akantu where it is there."""
+    script = ("fracsim.studies.evidence.peers.start_up",)
+    return [Trial("peers", "start-up", "3k", script=script, settings={"peer": "Akantu" if interpreter() else "none"})]
+
+
+def measured() -> dict[str, float]:
+    """Median processor seconds of each way, and of Akantu where it is there."""
+    with tempfile.TemporaryDirectory() as folder:
+        commands = {way: _ours(way, Path(folder, f"way-{place}")) for place, way in enumerate(WAYS)}
+        if interpreter():
+            commands["Akantu"] = _theirs(Path(folder))
+        for command in commands.values():
+            command()  # compiles
+        seconds: dict[str, list[float]] = {name: [] for name in commands}
+        for _ in range(RUNS):
+            for name, command in commands.items():
+                seconds[name].append(_cost(command))
+    return {name: median(found) for name, found in seconds.items()}
+
+
+def _ours(way: str, folder: Path) -> Callable[[], None]:
+    import tomli_w
+
+    path = folder.with_suffix(".toml")
+    path.write_text(tomli_w.dumps(job(way)))
+    command = ["fracsim", "run", str(path), "-o", str(folder), "--overwrite"]
+    return lambda: _run(command)
+
+
+def _theirs(folder: Path) -> Callable[[], None]:
+    from mpi4py import MPI
+
+    from ....scene import build_scene
+    from ....study.file import validate
+
+    python, files = interpreter(), [str(folder / name) for name in ("problem.npz", "result.npz")]
+    assert python is not None
+    np.savez(files[0], **problem_of(build_scene(MPI.COMM_WORLD, validate(job("linear"), "linear")), STEP))
+    shares = "".join(f"{(number + 1) / STEPS}\n" for number in range(STEPS))
+    return lambda: _run([python, "-I", str(WORKER), *files], shares)
+
+
+def _run(command: list[str], given: str = "") -> None:
+    kept = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}  # modules are compiled once, whatever the machine says
+    subprocess.run(command, input=given, text=True, check=True, capture_output=True, timeout=120, env=kept)
+
+
+def _cost(command: Callable[[], None]) -> float:
+    began = os.times()
+    command()
+    ended = os.times()
+    return ended.children_user + ended.children_system - began.children_user - began.children_system
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.write_text(json.dumps(measured(), indent=1) + "\n")
+
+
+# --- the section ----------------------------------------------------------------------------------------------------
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """Table and claim."""
+    found = next((record for record in records if record["case"] == "start-up"), None)
+    if found is None or not found["figures"]:
+        return []
+    figures = found["figures"]
+    text = (
+        f"3,000 tetrahedra, {STEPS} steps, from the command to its end: processor seconds, medians of {RUNS} runs in "
+        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}"
+    )
+    worst = max(figures[way] for way in WAYS)
+    shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())
+    claim = Claim(f"A small job takes at most {LIMIT:g} s of processor time", shown, worst <= LIMIT)
+    table = Table("peers-start-up", "Start-up", ("job", "processor seconds"), tuple(figures.items()))
+    return [Section("Start-up", text, (claim,), (table,))]
+
+
+if __name__ == "__main__":
+    main()
