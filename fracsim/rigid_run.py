@@ -99,8 +99,10 @@ class RigidRun:
 
     def write_frame(self) -> None:
         """The bodies as they are now. Raises CannotWrite."""
-        state, (pattern, cut) = self.state, self.scene.stepper.copies.damage()
-        written(ALONE, self.folder / "surface.pvd", lambda: self.frames.write(state.t, state.bodies, pattern, cut))
+        state, copies = self.state, self.scene.stepper.copies
+        damage, dented = copies.damage(), {number: each.points for number, each in copies.shapes.items()}
+        path = self.folder / "surface.pvd"
+        written(ALONE, path, lambda: self.frames.write(state.t, state.bodies, *damage, dented))
         self._clock.wrote(state)  # type: ignore[arg-type]
 
     def checkpoint(self) -> Path:

@@ -195,6 +195,9 @@ SOFT = {"energy": "corotated", "young": 1.0, "poisson": 0.2, "density": 1.0}
 BALL = {"name": "ball", "shape": "sphere", "radius": 2.0, "at": [0.0, 0.0, 9.0]}
 ROCK = {"name": "rock", "shape": "mesh", "file": "rock.stl", "at": [0.0, 0.0, -1.0]}
 OPEN = "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\n"  # a tetrahedron without a side
+HARD = {"yield_stress": 1e6, "hardening": 1e9}
+SOFTENING: dict[str, Any] = {"fracture": None, "brittle": None, "plasticity": {"yield_stress": 1e6}}
+ORNAMENT = {"builder": "ornament", "h": 0.02}
 NEWMARK = {"scheme": "newmark", "step": 1e-3, "end": 0.1}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "two dimensions": (FLAT, "2 dimensions"),
@@ -215,6 +218,12 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "without itself": ({"contact": {"itself": False}}, "always meet"),
     "newton": ({"solver": {"snes_max_it": 5}}, "ksp_"),
     "density": ({"material": SOFT | {"energy": "linear", "density": 0.0}}, "density"),
+    "flow and break": ({"plasticity": HARD}, r"do not break: .* \[brittle\]"),
+    "no hardening": (SOFTENING, r"plasticity\.hardening = 0: .* greater than 0"),
+    "negative hardening": (SOFTENING | {"plasticity": {"yield_stress": 1e6, "hardening": -1e9}}, "greater than 0"),
+    "no yield stress": (SOFTENING | {"plasticity": {"hardening": 1e9}}, "yield_stress"),
+    "flow rate": (SOFTENING | {"plasticity": HARD | {"flow_rate": 2.0}}, "flow_rate is"),
+    "shell that flows": (SOFTENING | {"mesh": ORNAMENT, "plasticity": HARD}, "shells"),
     "spacing": ({"body": [{"copies": [2, 1, 1]}]}, "spacing"),
     "body elsewhere": ({"time": NEWMARK}, r"\[\[body\]\] is for"),
     "time elsewhere": ({"time": NEWMARK, "body": None, "contact": {"contact_time": 1.0}}, "contact_time is for"),
@@ -272,7 +281,7 @@ def test_a_blow_on_a_copy_opens_what_it_opens_on_the_body_itself() -> None:
     Analyses(alone)([Strike(0, points, force, np.zeros(3))])
     poses = Poses.of([Place(np.array([k, 5.0, -k]), np.array([0.3, k, -0.7]), *np.zeros((2, 3))) for k in range(4)])
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-    several, again = (Copies(lambda _: breakable(mesh, 2e4, rules), poses, sizes) for _ in range(2))
+    several, again = (Copies(lambda *_: breakable(mesh, 2e4, rules), poses, sizes) for _ in range(2))
     turn, place = poses.turn[2], poses.place[2]
     name = 2 * len(mesh.points)
     broken = Analyses(several)([Strike(name, points @ turn.T + place, force @ turn.T, np.zeros(3))])
@@ -297,7 +306,7 @@ def test_a_copy_breaks_as_it_would_alone() -> None:
     places = np.array([[0.0, 5.0 * k, 0.0] for k in range(4)])
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
     poses = Poses.of([Place(each, *np.zeros((3, 3))) for each in places])
-    several = Copies(lambda _: breakable(mesh, 2e4, rules), poses, sizes)
+    several = Copies(lambda *_: breakable(mesh, 2e4, rules), poses, sizes)
     analyses = Analyses(several)
     for together in ([2], [0, 3], [2, 1]):
         analyses([Strike(k * len(mesh.points), points + places[k], force, np.zeros(3)) for k in together])

@@ -63,7 +63,7 @@ class Scene:
         assert mesh.shell is not None
         poses = Poses.of([Place(at, *np.zeros((3, 3))) for at in places])
         sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-        made = Copies(lambda _: breakable(mesh, 1e6, SurfaceRules(surfaces)), poses, sizes)
+        made = Copies(lambda *_: breakable(mesh, 1e6, SurfaceRules(surfaces)), poses, sizes)
         rules = Rules(step, np.zeros(3), 0.3)
         stepper = RigidStepper(made, Geometry(mesh, poses), DENSITY, [], rules, Hertz(1e9, 0.2))
         middle, first = mesh.shell.middle + np.array(places)[:, None], len(mesh.points) * np.arange(len(places))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +56,16 @@ class RigidFrames:
         broken = self.surface.broken_edges(pattern)
         self.broken_at[broken & (self.broken_at == NEVER)] = t
 
-    def write(self, t: float, bodies: Bodies, pattern: npt.NDArray[np.uint8], cut: Values) -> None:
-        """A frame at time t (s), where there is none yet; `cut`: (E,) where edges are cut. Raises OSError."""
+    def write(
+        self, t: float, bodies: Bodies, pattern: npt.NDArray[np.uint8], cut: Values, dented: Mapping[int, Values]
+    ) -> None:
+        """A frame at time t (s), where there is none yet; `cut`: (E,) where edges are cut; `dented`: where nodes (N, 3)
+        of copies are at rest, m. Raises OSError."""
         if t in self.files.times:
             return
         surface = self.surface
         surface.update(pattern, cut)
+        surface.reshape(dented)
         made = surface.split
         of = made.piece_of_point
         points = bodies.to_space(made.points, of)

@@ -11,6 +11,7 @@ point_loads  forces at points of a surface, handed to the nodes of the cells beh
 patches      forces on circles of contact, with Hertz's pressure
 analyses     of several bodies at once, spread over ranks
 breakable    a struck piece breaks, and its pieces in turn
+denting      or it flows, and keeps a dent
 copies       each with damage of its own, all with one operator while they are whole
 placing      where copies are at the start
 

@@ -62,6 +62,17 @@ class Bodies:
         velocity = self.velocity_at(place, parent)
         return replace(parts, place=place, turn=self.turn[parent], velocity=velocity, spin=self.spin[parent])
 
+    def reshaped(self, of: Moments, which: Ints) -> Bodies:
+        """Some (k,) of them have other shapes: mass stays, and so do the place of the centre, momentum and angular
+        momentum."""
+        centre, inertia, spin = (np.array(each) for each in (self.centre, self.inertia, self.spin))
+        across = np.swapaxes(self.turn[which], 1, 2)
+        momentum = inertia[which] @ (across @ spin[which, :, None])
+        centre[which] = of.centre[which]
+        inertia[which] = (self.mass / of.volume)[which, None, None] * of.inertia[which]
+        spin[which] = (self.turn[which] @ np.linalg.solve(inertia[which], momentum))[:, :, 0]
+        return replace(self, centre=centre, inertia=inertia, spin=spin)
+
     # --- sums ---
 
     @property

@@ -7,7 +7,7 @@ that come of it are analysed in turn under what of the blow falls on them, until
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,9 @@ from ..mesh.topology import MeshTopology
 from ..stepping.petsc_options import Options
 from .patches import patches
 from .point_loads import PointLoads, point_loads
+
+if TYPE_CHECKING:
+    from .denting import Flow, Shape
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -66,7 +69,7 @@ class Within:
 @dataclass(frozen=True)
 class Opened:
     """What a strike on the body of a name opened: keys (n, 2) of edges and where they are cut, (n,), starts (k, 3) of
-    surfaces, m; analyses, and iterations of CG in them."""
+    surfaces, m; analyses, and iterations of CG in them; or the shape of its mesh now, where it flowed."""
 
     name: int
     keys: Ints
@@ -74,6 +77,7 @@ class Opened:
     starts: Values
     passes: int
     iterations: int
+    shape: Shape | None = None
 
 
 class Analysis(Protocol):
@@ -119,9 +123,12 @@ class Breakable:
         criterion: BrittleSurfaces | None,
         within: Within,
         options: Options | None = None,
+        flow: Flow | None = None,
     ) -> None:
-        """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's."""
+        """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's.
+        `flow`: of what does not break; None: nothing flows."""
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
+        self._flow = flow
         self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
         self._corners = np.ascontiguousarray(self._domain.cell_nodes.T)
         self._kept: dict[int, Analysis] = {}  # by the lowest node of the piece
@@ -165,14 +172,15 @@ class Breakable:
         return int(self.pieces.of_node[self._node[name]])
 
     def may_break(self, piece: int, force: float) -> bool:
-        """Whether forces of this sum (N) could break a piece: no beam of its length, an edge thick, has a higher
-        stress; and there are surfaces left to open."""
-        if self._criterion is None or not self._criterion.left:
+        """Whether forces of this sum (N) could break a piece, or have it flow: no beam of its length, an edge thick,
+        has a higher stress; and there are surfaces left to open."""
+        if not self.left:
             return False
         if self._length is None:
             self._length = self._lengths()
         h = self._stiffness.finest
-        return bool(2 * force * max(float(self._length[piece]), h) / h**3 >= self._criterion.strength.weakest)
+        weakest = self._flow.weakest if self._criterion is None else self._criterion.strength.weakest  # type: ignore[union-attr]
+        return bool(2 * force * max(float(self._length[piece]), h) / h**3 >= weakest)
 
     def _lengths(self) -> Values:
         """(pieces,) diagonals of the boxes around them, m."""
@@ -222,14 +230,15 @@ class Breakable:
 
     @property
     def left(self) -> int:
-        """Surfaces that may still open."""
-        return 0 if self._criterion is None else self._criterion.left
+        """Surfaces that may still open; 1 of what flows, for one blow after the other does."""
+        return int(self._flow is not None) if self._criterion is None else self._criterion.left
 
     def opened(self, name: int, loads: PointLoads, share: int) -> Opened:
-        """What a strike opens that may start `share` surfaces; whether they count is up to `take`. Raises
-        NotConverged."""
+        """What a strike opens that may start `share` surfaces, or what shape it leaves; whether they count is up to
+        `take`. Raises NotConverged."""
         criterion = self._criterion
-        assert criterion is not None
+        if criterion is None:
+            return self._dented(name, loads)
         before, starts, passes, iterations = self.graph.broken.copy(), criterion.starts, self.passes, self.iterations
         criterion.kept_back = criterion.left - share
         try:
@@ -240,6 +249,24 @@ class Breakable:
         done = self.passes - passes, self.iterations - iterations
         self.passes, self.iterations = passes, iterations
         return Opened(name, self.graph.edge_keys(edges), criterion.cut[edges], more, *done)
+
+    def _dented(self, name: int, loads: PointLoads) -> Opened:
+        """What shape a strike leaves. Raises NotConverged."""
+        assert self._flow is not None
+        piece, iterations, passes = self.piece_of(name), self.iterations, self.passes
+        body, stress = self._free(piece), self.stress(piece, loads)
+        shape = self._flow(body, stress)  # type: ignore[arg-type]
+        self.iterations += body.iterations if shape is not None else 0
+        done = self.passes - passes, self.iterations - iterations
+        self.passes, self.iterations = passes, iterations
+        return Opened(name, np.empty((0, 2), np.int64), np.empty(0), np.empty((0, 3)), *done, shape)
+
+    def destroy(self, *, alone: bool) -> None:
+        """Give back the memory of its analyses; `alone`: no other copy has this mesh."""
+        for node in [*self._kept]:
+            self._forget(node)
+        if alone:
+            self._stiffness.whole(self._options).destroy()
 
     def take(self, every: list[Opened]) -> None:
         """Have all of that open, whichever rank found it."""

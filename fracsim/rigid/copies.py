@@ -1,20 +1,23 @@
 """Copies of one mesh as they break: a blow on one of them costs what that one costs.
 
 All share the mesh as it was built, its stress and the operator of the whole body, in the axes of the mesh; each knows
-its own damage, from the first blow on that may break it.
+its own damage, from the first blow on that may break it. One that is dented is a mesh of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .breakable import Breakable, Opened
 from .placing import Poses
+
+if TYPE_CHECKING:
+    from .denting import Shape
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -26,12 +29,17 @@ class Copies:
 
     Attributes:
         poses: where they are at rest.    nodes: of a copy; those of copy k follow k times as many.
+        shapes: of the copies that have flowed, by their numbers.
         passes, iterations: analyses, and iterations of CG in them, that were taken.
     """
 
-    def __init__(self, make: Callable[[int], Breakable], poses: Poses, sizes: tuple[int, int, int]) -> None:
-        """`make`: the copy of a number, whole; `sizes`: nodes, cells and edges of the mesh."""
+    def __init__(
+        self, make: Callable[[int, Shape | None], Breakable], poses: Poses, sizes: tuple[int, int, int]
+    ) -> None:
+        """`make`: the copy of a number, whole, of a shape (None: as the mesh is); `sizes`: nodes, cells and edges of
+        the mesh."""
         self._make, self.poses = make, poses
+        self.shapes: dict[int, Shape] = {}
         self.nodes, self._cells, self._edges = sizes
         self._made: dict[int, Breakable] = {}
         self.passes = self.iterations = 0
@@ -41,7 +49,7 @@ class Copies:
         """One, where the mesh has it."""
         graph = body.graph
         sizes = len(graph.domain.nodes), graph.domain.cell_count, len(graph.broken)
-        return cls(lambda _: body, Poses.at_rest(1), sizes)
+        return cls(lambda *_: body, Poses.at_rest(1), sizes)
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -49,7 +57,7 @@ class Copies:
     def copy(self, number: int) -> Breakable:
         """One of them."""
         if number not in self._made:
-            self._made[number] = self._make(number)
+            self._made[number] = self._make(number, self.shapes.get(number))
         return self._made[number]
 
     @property
@@ -98,13 +106,30 @@ class Copies:
         of = [each.name // self.nodes for each in every]
         for number in dict.fromkeys(of):
             self.copy(number).take([each for each, mine in zip(every, of, strict=True) if mine == number])
+        for number, each in zip(of, every, strict=True):
+            if each.shape is not None:
+                self._reshape(number, each.shape)
         self.passes += sum(each.passes for each in every)
         self.iterations += sum(each.iterations for each in every)
+
+    def _reshape(self, number: int, shape: Shape) -> None:
+        """A copy is of another shape from here on."""
+        if (made := self._made.pop(number, None)) is not None:
+            made.destroy(alone=number in self.shapes)
+        self.shapes[number] = shape
 
     # --- a checkpoint ---
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """What a checkpoint keeps: keys (n, 2) of broken edges and their cuts; where surfaces started, and in which."""
+        """What a checkpoint keeps: keys (n, 2) of broken edges and their cuts; where surfaces started, and in which;
+        shapes of those that flowed."""
+        if self.shapes:  # nothing breaks where something flows
+            every = self.shapes.values()
+            return {
+                "shape_of": np.array([*self.shapes]),
+                "shape_points": np.stack([each.points for each in every]),
+                "shape_yields": np.stack([each.yields for each in every]),
+            }
         parts = {number: each.saved() for number, each in sorted(self._made.items())}
         parts = {number: each for number, each in parts.items() if each}
         if not parts:
@@ -118,6 +143,11 @@ class Copies:
 
     def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
         """Be as `saved` said."""
+        if "shape_of" in saved:
+            from .denting import Shape
+
+            for number, *shape in zip(*(saved[f"shape_{key}"] for key in ("of", "points", "yields")), strict=True):
+                self._reshape(int(number), Shape(*shape))
         if "broken" not in saved:
             return
         of = saved["broken"][:, 0] // self.nodes

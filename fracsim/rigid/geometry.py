@@ -43,8 +43,9 @@ class Shapes:
 
 @dataclass(frozen=True)
 class _Copy:
-    """A copy as it was last broken, in the axes of the mesh, its nodes counted from 0."""
+    """A copy as it was last broken or dented, in the axes of the mesh, its nodes, at `points`, counted from 0."""
 
+    points: Values
     pattern: Patterns
     names: Ints
     of: Moments
@@ -68,16 +69,23 @@ class Geometry:
         # of each copy, by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as
         # these break
         self._hulls: dict[int, dict[int, _Kept]] = {}
-        self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0)
+        self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0, mesh.points)
         self._placed = [self._at(number, self._whole) for number in range(len(self.poses))]
         self._known: dict[int, _Copy] = {}
 
-    def shapes(self, damage: Mapping[int, tuple[Patterns, Values | None]]) -> Shapes:
-        """Of copies by their numbers: patterns (C,) of broken edges, cut where (E,); all others are whole."""
-        for number, (pattern, cut) in damage.items():
+    def shapes(
+        self, damage: Mapping[int, tuple[Patterns, Values | None]], points: Mapping[int, Values] | None = None
+    ) -> Shapes:
+        """Of copies by their numbers: patterns (C,) of broken edges, cut where (E,), and `points` (N, 3) where nodes
+        are, m; all others are whole, and as the mesh is."""
+        points, whole = points or {}, (self._whole.pattern, None)
+        for number in sorted({*damage, *points}):
+            (pattern, cut), at = damage.get(number, whole), points.get(number, self._whole.points)
             known = self._known.get(number, self._whole)
-            if not np.array_equal(known.pattern, pattern):
-                self._known[number] = known = self._copy(pattern.copy(), cut, number)
+            if at is not known.points:
+                self._hulls.pop(number, None)
+            if at is not known.points or not np.array_equal(known.pattern, pattern):
+                self._known[number] = known = self._copy(pattern.copy(), cut, number, at)
                 self._placed[number] = self._at(number, known)
         pieces = np.cumsum([0, *(len(each.names) for each in self._placed)])
         of = Moments(*(np.concatenate([getattr(each.moments, name) for each in self._placed])
@@ -88,9 +96,9 @@ class Geometry:
         names, turn = (np.concatenate([getattr(each, name) for each in self._placed]) for name in ("names", "turn"))
         return Shapes(names, of, np.concatenate(piece), parts, turn, outer)
 
-    def _copy(self, pattern: Patterns, cut: Values | None, number: int) -> _Copy:
-        """A copy with patterns (C,)."""
-        made = split(self.skeleton, pattern, cut)
+    def _copy(self, pattern: Patterns, cut: Values | None, number: int, at: Values) -> _Copy:
+        """A copy with patterns (C,), and nodes at places (N, 3)."""
+        made = split(self.skeleton.moved(at), pattern, cut)
         piece = made.piece_of_point[made.elements[:, 0]]
         of = moments(made.points, made.elements, piece, made.pieces)
         names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
@@ -106,7 +114,7 @@ class Geometry:
         found = [kept for kept in same if kept is not None]
         self._hulls[number] = dict(zip(map(int, names), found, strict=True))
         parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
-        return _Copy(pattern, names, of, made.piece_of_node, parts, outer)
+        return _Copy(at, pattern, names, of, made.piece_of_node, parts, outer)
 
     def _parts(self, made: Split, piece: Ints, chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""

@@ -108,7 +108,8 @@ class RigidStepper:
     def look_again(self) -> None:
         """Copies have broken: shapes are those of their pieces."""
         damage = {number: each.damage() for number, each in self.copies.damaged.items()}
-        self.shapes, self._engine = self._geometry.shapes(damage), None
+        points = {number: each.points for number, each in self.copies.shapes.items()}
+        self.shapes, self._engine = self._geometry.shapes(damage, points), None
 
     def start(self) -> RigidState:
         """The bodies where the mesh has them, at rest."""
@@ -143,7 +144,7 @@ class RigidStepper:
         Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
         """
         began = clock = time.perf_counter()
-        iterations, bodies = self.copies.iterations, state.bodies
+        iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.shapes.names)
         clock = self.phases.add("motion", clock)
@@ -156,6 +157,8 @@ class RigidStepper:
             moved, touches = self._moved(state, bodies)
             self.phases.add("motion", clock)
         self.blows.keep(touches, bodies, self.shapes.names)
+        if dented := [number for number, each in self.copies.shapes.items() if each is not shapes.get(number)]:
+            moved = self._reshaped(moved, dented)
         pushed, worked = self._given_by(touches, state.t)
         gained = float(moved.mass @ ((moved.place - bodies.place) @ self._rules.gravity))
         work = state.work + gained + float(worked.sum())
@@ -219,6 +222,13 @@ class RigidStepper:
             values[whole] = getattr(bodies, key)[parent[whole]]
         self.overlaps = self.overlaps.divided(after.names, before.names[parent])
         return replace(parts, **kept)
+
+    def _reshaped(self, bodies: Bodies, copies: list[int]) -> Bodies:
+        """The bodies, those of some copies as they are dented now. The step stays as it was: what is struck and dented
+        has been struck all the same."""
+        self.look_again()
+        mine = np.isin(self.shapes.names // self.copies.nodes, copies)
+        return bodies.reshaped(self.shapes.moments, np.flatnonzero(mine))
 
     # --- how long a blow lasts, and what it presses on ---
 

@@ -31,7 +31,7 @@ from ..study.check import checked_mesh
 from ..study.conditions import volume_loads
 from .breaking import average_of, strength_of, surface_rules
 from .contact import obstacle_entries
-from .material import material_of
+from .material import material_of, per_cell
 
 try:
     from ..rigid.model import Rules
@@ -43,6 +43,7 @@ except ImportError:
 
 if TYPE_CHECKING:
     from ..fracture.criterion import Average
+    from ..rigid.denting import Shape
 
 Values = npt.NDArray[np.float64]
 
@@ -116,19 +117,43 @@ def _places(study: Study) -> list[Place]:
 
 def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:
     """Of the mesh, in its own axes."""
-    domain = distribute(MPI.COMM_SELF, mesh)
-    stress = Stress(Assembler(domain), fem.Function(domain.space), material_of(study, domain), Weakening("chi"))
-    stiffness: Operator
-    density = float(study.material.density)
-    if mesh.shell is None:
-        stiffness = Stiffness(stress, np.full(domain.cell_count, density))
-    else:
-        from ..rigid.shell_body import ShellStiffness
-
-        stiffness = ShellStiffness(stress, mesh.shell, study.material.young, study.material.poisson, density)
-    average = average_of(study, domain)
+    stiffness = _operator(study, mesh)
+    average = average_of(study, stiffness.stress.domain)
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-    return Copies(lambda number: _breakable(study, stiffness, average, number), Poses.of(places), sizes)
+
+    def made(number: int, shape: Shape | None) -> Breakable:
+        if study.plasticity is None:
+            return _breakable(study, stiffness, average, number)
+        own = stiffness if shape is None else _operator(study, replace(mesh, points=shape.points))
+        return _flowing(study, own, shape)  # type: ignore[arg-type]
+
+    return Copies(made, Poses.of(places), sizes)
+
+
+def _operator(study: Study, mesh: MeshData) -> Operator:
+    """Of all cells of a mesh."""
+    domain, density = distribute(MPI.COMM_SELF, mesh), float(study.material.density)
+    elastic = material_of(study.model_copy(update={"plasticity": None}), domain)
+    stress = Stress(Assembler(domain), fem.Function(domain.space), elastic, Weakening("chi"))
+    if mesh.shell is None:
+        return Stiffness(stress, np.full(domain.cell_count, density))
+    from ..rigid.shell_body import ShellStiffness
+
+    return ShellStiffness(stress, mesh.shell, study.material.young, study.material.poisson, density)
+
+
+def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None) -> Breakable:
+    """A copy of the mesh that blows dent."""
+    from ..rigid.denting import Flow
+
+    table, domain = study.plasticity, stiffness.stress.domain
+    assert table is not None
+    if shape is None:
+        yields = np.broadcast_to(per_cell(study, domain, table, "yield_stress"), domain.cell_count)
+    else:
+        yields = shape.yields[domain.cell_input]
+    flow, within = Flow(stiffness, yields, table.hardening), Within(None, domain.cell_count)
+    return Breakable(stiffness, EdgeGraph(domain), None, within, study.solver, flow)
 
 
 def _breakable(study: Study, stiffness: Operator, average: Average | None, number: int) -> Breakable:
@@ -150,6 +175,8 @@ def _check_shell(study: Study, mesh: MeshData) -> None:
         return
     if study.brittle is not None and study.brittle.shape == "curved":
         raise InputError('brittle.shape = "curved" is not for shells: take "planar"')
+    if study.plasticity is not None:
+        raise InputError("[plasticity] is not for shells, which do not bend for good: remove it, or take a solid mesh")
     if study.material.regions:
         raise InputError("a shell is of one material: remove the regions of [material]")
 

@@ -87,7 +87,10 @@ class Crack(Table):
 
 
 class Plasticity(Table):
-    """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1."""
+    """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1.
+
+    Rigid bodies have yield_stress and hardening alone, see rigid.denting.
+    """
 
     yield_stress: Strength  # Pa, of the Cauchy stress
     measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too

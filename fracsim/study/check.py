@@ -279,6 +279,10 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     if study.brittle is not None and study.fracture is not None:
         yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
         yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
+    elif study.plasticity is not None:
+        table = study.plasticity
+        much = f"{table.yield_stress:g} Pa, hardening {table.hardening:g} Pa"
+        yield f"plasticity  what is struck keeps a dent where von Mises stress exceeds {much}"
     else:
         yield "fracture    off: nothing is analysed"
     yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle) or 'none'}"

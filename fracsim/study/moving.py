@@ -47,8 +47,8 @@ def check_rigid(study: Study) -> None:
         if own:
             raise ValueError(f'{own[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
         return
-    tables = {"plasticity": study.plasticity, "damping": study.damping, "boundary": study.boundary,
-              "probe": study.probe, "initial": study.initial, "crack": study.crack}  # fmt: skip
+    tables = {"damping": study.damping, "boundary": study.boundary, "probe": study.probe, "initial": study.initial,
+              "crack": study.crack}  # fmt: skip
     hints = {"boundary": "hold or drive bodies by obstacles", "initial": "give velocity and spin in [[body]]"}
     for name, table in tables.items():
         if table:
@@ -62,6 +62,7 @@ def check_rigid(study: Study) -> None:
         raise ValueError('with time.scheme = "rigid" a body has one density: remove density from regions of [material]')
     if study.fracture is not None and study.brittle is None:
         raise ValueError('[fracture] with time.scheme = "rigid" needs [brittle]: stiff bodies break along surfaces')
+    _check_denting(study)
     if study.load is not None and study.load.body_force is not None:
         raise ValueError('load.body_force is not for time.scheme = "rigid": give gravity')
     if contact is not None:
@@ -86,3 +87,21 @@ def check_rigid(study: Study) -> None:
             f'obstacle {loose[0]} has a mass: with time.scheme = "rigid" what moves freely is a body, and an obstacle '
             "is held or driven"
         )
+
+
+def _check_denting(study: Study) -> None:
+    """ValueError where [plasticity] asks for what rigid bodies do not do."""
+    table = study.plasticity
+    if table is None:
+        return
+    if study.brittle is not None:
+        raise ValueError('[plasticity] with time.scheme = "rigid" is for bodies that do not break: remove [brittle]')
+    if table.hardening <= 0:
+        raise ValueError(
+            f'plasticity.hardening = {table.hardening:g}: with time.scheme = "rigid" it must be greater than 0 Pa; a '
+            "blow is a force, under which what does not harden flows without end"
+        )
+    plain = type(table)(yield_stress=table.yield_stress, hardening=table.hardening)
+    beyond = [key for key in ("measure", "flow_rate", "update") if getattr(table, key) != getattr(plain, key)]
+    if beyond:
+        raise ValueError(f'plasticity.{beyond[0]} is not for time.scheme = "rigid": give yield_stress and hardening')

@@ -102,6 +102,8 @@ class Study(Table):
         table, material = self.plasticity, self.material
         if table is None:
             return self
+        if self.time.scheme == "rigid":  # see check_rigid
+            return self
         if material.energy == "linear":
             raise ValueError(
                 "[plasticity] splits the deformation gradient, which the energy linear does not tell from small "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +35,14 @@ class Skeleton(MeshTopology):
         self.cell_facets: Ints = inverse.reshape(len(mesh.cells), -1)
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
+
+    def moved(self, points: Values) -> Skeleton:
+        """The same with nodes at other places (N, d), m."""
+        if points is self.points:
+            return self
+        result = copy(self)
+        result.points = points
+        return result
 
     @cached_property
     def boundary_nodes(self) -> Ints:

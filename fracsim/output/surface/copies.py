@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,17 @@ class SurfaceOfCopies(Surface):
         self._pattern: Patterns = np.zeros(count * len(mesh.cells), np.uint8)
         self._parts = count * [split(self.skeleton, self._pattern[: len(mesh.cells)])]
         self._of = self._pattern.reshape(count, -1).copy()  # of the parts
+        self._dented: dict[int, Values] = {}
         self._build(None)
+
+    def reshape(self, points: Mapping[int, Values]) -> None:
+        """Nodes of copies, by their numbers, are at places (N, 3) at rest, m; of all others where the mesh has them."""
+        new = [number for number, each in points.items() if each is not self._dented.get(number)]
+        for number in new:
+            self._dented[number] = points[number]
+            self._parts[number] = split(self.skeleton.moved(points[number]), self._of[number])
+        if new:
+            self._join()
 
     @property
     def edge_count(self) -> int:
@@ -67,6 +77,9 @@ class SurfaceOfCopies(Surface):
         for number in np.flatnonzero((pattern != self._of).any(axis=1)):
             self._parts[number] = split(self.skeleton, pattern[number], None if cuts is None else cuts[number])
             self._of[number] = pattern[number]
+        self._join()
+
+    def _join(self) -> None:
         self.split = made = joined(self._parts, self.skeleton, self._poses)
         self.names = self._names.update(made.pieces, made.piece_of_node, self.mass)
         piece = made.piece_of_point
