@@ -46,7 +46,7 @@ class RigidRun:
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
-        names += [f"work_{each.name}" for each in scene.obstacles]
+        names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.others.columns()
         if step is not None:
             read_rows(folder / "history.csv", history_columns(names), step)
         interrupt.writing = True
@@ -92,8 +92,9 @@ class RigidRun:
         lost = self._start + state.work - report.kinetic
         self.history.append_row([
             state.step, state.t, self.scene.study.time.longest, report.kinetic, 0.0, lost, state.work, self.broken,
-            split, len(state.bodies), report.blows + report.loads, report.krylov, report.seconds,
+            split, stepper.count, report.blows + report.loads, report.krylov, report.seconds,
             *map(float, report.pushed.flat), *map(float, report.worked),
+            *map(float, stepper.others.readings(state.bodies)),
         ])  # fmt: skip
         return report
 
@@ -101,8 +102,8 @@ class RigidRun:
         """The bodies as they are now. Raises CannotWrite."""
         state, copies = self.state, self.scene.stepper.copies
         damage, dented = copies.damage(), {number: each.points for number, each in copies.shapes.items()}
-        path = self.folder / "surface.pvd"
-        written(ALONE, path, lambda: self.frames.write(state.t, state.bodies, *damage, dented))
+        path, placed = self.folder / "surface.pvd", self.scene.stepper.others.placed(state.t, state.bodies)
+        written(ALONE, path, lambda: self.frames.write(state.t, state.bodies, *damage, dented, placed))
         self._clock.wrote(state)  # type: ignore[arg-type]
 
     def checkpoint(self) -> Path:
@@ -162,7 +163,7 @@ class RigidRun:
         summary = {
             "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
-            "split_cells": scene.stepper.copies.split_cells, "pieces": len(state.bodies),
+            "split_cells": scene.stepper.copies.split_cells, "pieces": scene.stepper.count,
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
             "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.copies.passes,
             "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},

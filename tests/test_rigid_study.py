@@ -193,6 +193,7 @@ def test_a_study_survives_being_written() -> None:
 FLAT = {"mesh": {"builder": "box", "size": [0.6, 0.2], "h": 0.1}, "obstacle": None, "load": None}
 SOFT = {"energy": "corotated", "young": 1.0, "poisson": 0.2, "density": 1.0}
 BALL = {"name": "ball", "shape": "sphere", "radius": 2.0, "at": [0.0, 0.0, 9.0]}
+HINGE = {"point": [0.0, 0.0, 12.0], "axis": [0.0, 1.0, 0.0]}
 ROCK = {"name": "rock", "shape": "mesh", "file": "rock.stl", "at": [0.0, 0.0, -1.0]}
 OPEN = "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\n"  # a tetrahedron without a side
 HARD = {"yield_stress": 1e6, "hardening": 1e9}
@@ -209,8 +210,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "energy": ({"material": SOFT}, 'energy = "linear"'),
     "boundary": ({"boundary": [{"on": "left", "fix": "x"}]}, "by obstacles"),
     "initial": ({"initial": {"velocity": [0.0, 0.0, 1.0]}}, r"in \[\[body\]\]"),
-    "free obstacle": ({"obstacle": [BALL | {"mass": 1.0}]}, "has a mass"),
-    "obstacle from a file": ({"obstacle": [ROCK]}, "rock is a mesh, .* build it of other shapes"),
+    "hinge": ({"obstacle": [BALL | {"mass": 1.0, "hinge": HINGE}]}, "ball has a hinge, which .* or drive it"),
+    "guide": ({"obstacle": [BALL | {"mass": 1.0, "guide": "z"}]}, "ball has a guide"),
+    "free in the way": ({"obstacle": [BALL | {"mass": 1.0, "at": [0.3, 0.1, 2.1]}]}, "body 0 .* in obstacle ball"),
+    "file that turns": ({"obstacle": [ROCK | {"spin": [0.0, 0.0, 1.0]}]}, "rock is turned by spin"),
+    "no file": ({"obstacle": [ROCK]}, r"rock\.stl.*no such file"),
     "flat obstacle": ({"obstacle": [FLOOR | {"at": [0.0, 0.0], "normal": [0.0, 1.0]}]}, "needs 3 numbers"),
     "open mesh": ({"mesh": {"surface": "OPEN", "h": 0.1}}, "is open"),
     "hollow": ({"obstacle": [BALL | {"hollow": True}]}, "hollow"),

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..mechanics.contact.drawing import Drawings
 from ..mechanics.contact.obstacle import Obstacle
+from ..mechanics.contact.placed import Placed
 from ..meshes.data import MeshData
 from ..rigid.bodies import Bodies
 from ..rigid.placing import Poses
@@ -43,7 +44,7 @@ class RigidFrames:
         self.files = SurfaceFiles(folder, 3, resume_at, turning=True)
         self.surface = SurfaceOfCopies(mesh, poses, density)
         self.broken_at: Values = np.full(self.surface.edge_count, NEVER)
-        self._obstacles, points = obstacles, self.surface.split.points
+        points = self.surface.split.points
         self._drawings = Drawings(obstacles, points.min(axis=0), points.max(axis=0))
 
     def resume(self, broken_at: Values) -> None:
@@ -57,17 +58,23 @@ class RigidFrames:
         self.broken_at[broken & (self.broken_at == NEVER)] = t
 
     def write(
-        self, t: float, bodies: Bodies, pattern: npt.NDArray[np.uint8], cut: Values, dented: Mapping[int, Values]
+        self,
+        t: float,
+        bodies: Bodies,
+        pattern: npt.NDArray[np.uint8],
+        cut: Values,
+        dented: Mapping[int, Values],
+        obstacles: Sequence[Placed],
     ) -> None:
-        """A frame at time t (s), where there is none yet; `cut`: (E,) where edges are cut; `dented`: where nodes (N, 3)
-        of copies are at rest, m. Raises OSError."""
+        """A frame at time t (s), where there is none yet, of bodies that are pieces first; `cut`: (E,) where edges are
+        cut; `dented`: where nodes (N, 3) of copies are at rest, m; `obstacles`: where they are. Raises OSError."""
         if t in self.files.times:
             return
         surface = self.surface
         surface.update(pattern, cut)
         surface.reshape(dented)
         made = surface.split
-        of = made.piece_of_point
+        of, bodies = made.piece_of_point, bodies.part(slice(made.pieces))
         points = bodies.to_space(made.points, of)
         velocity = bodies.velocity_at(points, of)
         nodes = np.bincount(made.piece_of_node, minlength=made.pieces)
@@ -78,4 +85,4 @@ class RigidFrames:
         )  # fmt: skip
         age = np.where(self.broken_at == NEVER, np.nan, self.broken_at)
         frame = surface.placed(t, points, velocity, pieces, age)
-        self.files.write(frame, self._drawings([each.placed(t) for each in self._obstacles]))
+        self.files.write(frame, self._drawings(obstacles))

@@ -22,6 +22,7 @@ geometry     what pieces weigh and which shapes they have, from the split surfac
 hulls        unions of convex parts
 clusters     of pieces of shells, all at once
 primitives   shapes of obstacles
+obstacles    those that stand, and those that move freely, as bodies do
 model        the scene as MuJoCo has it; this and the engine alone import it
 engine       MuJoCo: finds contacts, and solves for what they give
 contacts     where they are, and how fast things come together there

@@ -69,9 +69,19 @@ class Bodies:
         across = np.swapaxes(self.turn[which], 1, 2)
         momentum = inertia[which] @ (across @ spin[which, :, None])
         centre[which] = of.centre[which]
-        inertia[which] = (self.mass / of.volume)[which, None, None] * of.inertia[which]
+        inertia[which] = (self.mass[which] / of.volume[which])[:, None, None] * of.inertia[which]
         spin[which] = (self.turn[which] @ np.linalg.solve(inertia[which], momentum))[:, :, 0]
         return replace(self, centre=centre, inertia=inertia, spin=spin)
+
+    def part(self, which: slice) -> Bodies:
+        """Some of them."""
+        return Bodies(*(each[which] for each in vars(self).values()))
+
+    def with_more(self, others: Bodies) -> Bodies:
+        """And others after them."""
+        if not len(others):
+            return self
+        return Bodies(*(np.concatenate(both) for both in zip(vars(self).values(), vars(others).values(), strict=True)))
 
     # --- sums ---
 
@@ -90,6 +100,12 @@ class Bodies:
         """(3,) sum m x x v + I w about the origin, N m s."""
         own = np.einsum("nij,nj->i", self.inertia_in_space, self.spin)
         return np.asarray((self.mass[:, None] * np.cross(self.place, self.velocity)).sum(axis=0) + own)
+
+    @property
+    def kinetics(self) -> Values:
+        """(n,) of each, J."""
+        turning = np.einsum("ni,nij,nj->n", self.spin, self.inertia_in_space, self.spin)
+        return np.asarray(self.mass * np.einsum("ni,ni->n", self.velocity, self.velocity) + turning) / 2
 
     @property
     def kinetic(self) -> float:

@@ -107,13 +107,13 @@ def model_of(
         body, stand = _free(spec, heavy, heavy * np.eye(3), weightless=True), stands[number]
         shape, at = _movable(stand.shape, SLAB * _spread(bodies, parts))
         flat = stand.shape.kind == "plane"
-        things += [count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at, flat=flat)
+        things += [count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at, flat=flat, meshes=meshes)
     if driven:
         spec.option.tolerance /= HELD  # of what is not driven
     for number in fixed:
         stand = stands[number]
         flat = stand.shape.kind == "plane"
-        _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat)
+        _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat, meshes=meshes)
     first = len(fixed) + np.searchsorted(things, np.arange(count))
     thing = [count + number for number in fixed] + things
     extent = _extents(parts if outer is None else [[*each, more] for each, more in zip(parts, outer, strict=True)])
@@ -178,7 +178,7 @@ def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
 
 def _extents(parts: Sequence[Sequence[Part]]) -> Values:
     """(n,) how far bodies reach from their centres, m."""
-    shapes = [(number, np.atleast_2d(each.size if isinstance(each, Primitive) else each))
+    shapes = [(number, each.span if isinstance(each, Primitive) else each)
               for number, part in enumerate(parts) for each in part]  # fmt: skip
     reach = np.zeros(len(parts))
     if shapes:
@@ -232,14 +232,17 @@ def _add_parts(
         geom.friction, geom.priority = [friction, 0.0, 0.0], priority
         if at is not None:
             geom.pos = at
-        if isinstance(part, Primitive):
+        if isinstance(part, Primitive) and part.friction is not None:
+            geom.friction, geom.priority = [part.friction, 0.0, 0.0], 1
+        if isinstance(part, Primitive) and part.corners is None:
             geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
             geom.size = part.size
             geom.quat = Rotation.from_matrix(part.turn).as_quat(scalar_first=True)
             geom.contype = geom.conaffinity = FLAT if flat else FLAT | OTHER
         else:
-            assert meshes is not None
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, part)
+            corners = part if not isinstance(part, Primitive) else part.corners
+            assert meshes is not None and corners is not None
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, corners)
             geom.contype = geom.conaffinity = OTHER
             if quat is not None:
                 geom.quat = quat

@@ -1,4 +1,5 @@
-"""The shapes of obstacles as the engine knows them; rounded edges are sharp there."""
+"""The shapes of obstacles as the engine knows them; rounded edges are sharp there, and what a file has is a union of
+convex parts."""
 
 from __future__ import annotations
 
@@ -19,15 +20,40 @@ class Primitive:
     """About its reference point.
 
     Attributes:
-        kind: plane, sphere, capsule, cylinder or box.    size: (3,) half sizes and radii as MuJoCo has them, m.
+        kind: plane, sphere, capsule, cylinder, box or hull.    size: (3,) half sizes and radii as MuJoCo has them, m.
         turn: (3, 3) from the axes of the kind, whose own axis or normal is z.
-        extent: half the size of the thing, m; infinite of a plane.
+        extent: half the size of the thing, m; infinite of a plane.    corners: (n, 3) of a hull, m.
+        friction: Coulomb's coefficient, of what moves freely; None: that of what it is a part of.
     """
 
     kind: str
     size: tuple[float, float, float]
     turn: Values
     extent: float
+    corners: Values | None = None
+    friction: float | None = None
+
+    @property
+    def span(self) -> Values:
+        """(k, 3) points the farthest of which is as far as it reaches, m."""
+        if self.corners is not None:
+            return self.corners
+        x, y, z = self.size
+        return np.array([[x + y, 0.0, 0.0] if self.kind == "capsule" else [x, y, z]])
+
+
+def primitives(shape: Shape, name: str) -> list[Primitive]:
+    """The parts of an obstacle of that name. InputError for one that the engine does not have."""
+    from ..mechanics.contact.solids.solid import Solid
+
+    if not isinstance(shape, Solid):
+        return [primitive(shape, name)]
+    from .hulls import Solid as Enclosed
+    from .hulls import convex_parts
+
+    extent = float(np.ptp(shape.points, axis=0).min()) / 2
+    parts = convex_parts(Enclosed.of(shape.points, shape.triangles).filled)
+    return [Primitive("hull", (0.0, 0.0, 0.0), np.eye(3), extent, corners) for corners in parts]
 
 
 def primitive(shape: Shape, name: str) -> Primitive:

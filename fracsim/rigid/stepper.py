@@ -18,8 +18,8 @@ from .copies import Copies
 from .engine import Engine
 from .geometry import Geometry, Shapes
 from .hertz import Hertz, reduced
-from .model import Rules, Stand
-from .primitives import primitive
+from .model import Part, Rules
+from .obstacles import Others
 from .siblings import Overlaps
 from .touches import Touches
 
@@ -30,7 +30,8 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class RigidState:
-    """Bodies at time t (s); `step` of the run, and what gravity and drivers have done since its start, J."""
+    """Bodies at time t (s), pieces first, then obstacles that are free; `step` of the run, and what gravity and drivers
+    have done since its start, J."""
 
     t: float
     step: int
@@ -44,7 +45,8 @@ class RigidReport:
 
     Attributes:
         broken: edges that broke.    blows, loads: analyses that were due.    kinetic: J, of the bodies.
-        pushed: (obstacles, 3) mean force of the bodies on each, N.    worked: (obstacles,) what each did on them, J.
+        pushed: (obstacles, 3) mean force of the pieces on each, N.    worked: (obstacles,) what each did, J; a free
+        one: what it lost.
         krylov: iterations of CG in all analyses.    seconds: it took.
     """
 
@@ -75,7 +77,7 @@ class RigidStepper:
     """Copies of one mesh, on one rank; the bodies of a state are their pieces as they are broken now.
 
     Attributes:
-        shapes: of the pieces.    copies: of the mesh.    phases: seconds so far.
+        shapes: of the pieces.    copies: of the mesh.    others: obstacles.    phases: seconds so far.
     """
 
     shapes: Shapes
@@ -94,9 +96,7 @@ class RigidStepper:
         """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh."""
         self.analyses = analyses or Analyses(copies)
         self.copies, self._geometry, self._density = copies, geometry, density
-        self._obstacles, self._rules, self._hertz, self._given = obstacles, rules, hertz, contact_time
-        self._shapes = [primitive(each.shape, f"obstacle {each.name}") for each in obstacles]
-        self._driven = any(each.moved is not None for each in obstacles)
+        self.others, self._rules, self._hertz, self._given = Others(obstacles), rules, hertz, contact_time
         self.blows, self.phases, self.overlaps = (
             Blows(rules.step, rules.fast, self._time, self._spread),
             Phases(),
@@ -113,10 +113,22 @@ class RigidStepper:
 
     def start(self) -> RigidState:
         """The bodies where the mesh has them, at rest."""
-        return RigidState(0.0, 0, Bodies.at_rest(self._densities(), self.shapes.moments))
+        pieces = Bodies.at_rest(self._densities(), self.shapes.moments)
+        return RigidState(0.0, 0, pieces.with_more(self.others.bodies()))
 
     def _densities(self) -> Values:
-        return np.full(len(self.shapes.names), self._density)
+        return np.full(self.count, self._density)
+
+    @property
+    def count(self) -> int:
+        """Of pieces."""
+        return len(self.shapes.names)
+
+    @property
+    def names(self) -> Ints:
+        """(n,) of all bodies: of pieces their lowest node, of free obstacles more than any has."""
+        more = len(self.shapes.piece_of_node) + np.arange(len(self.others.free))
+        return np.concatenate([self.shapes.names, more])
 
     # --- a checkpoint ---
 
@@ -146,7 +158,7 @@ class RigidStepper:
         began = clock = time.perf_counter()
         iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
         moved, touches = self._moved(state, bodies)
-        due = self.blows.look(touches, bodies, self.shapes.names)
+        due = self.blows.look(touches, bodies, self.names)
         clock = self.phases.add("motion", clock)
         struck = self.analyses(self._strikes(due))
         clock = self.phases.add("analysis", clock)
@@ -156,12 +168,13 @@ class RigidStepper:
             clock = self.phases.add("pieces", clock)
             moved, touches = self._moved(state, bodies)
             self.phases.add("motion", clock)
-        self.blows.keep(touches, bodies, self.shapes.names)
+        self.blows.keep(touches, bodies, self.names)
         if dented := [number for number, each in self.copies.shapes.items() if each is not shapes.get(number)]:
             moved = self._reshaped(moved, dented)
         pushed, worked = self._given_by(touches, state.t)
-        gained = float(moved.mass @ ((moved.place - bodies.place) @ self._rules.gravity))
-        work = state.work + gained + float(worked.sum())
+        fallen = moved.mass * ((moved.place - bodies.place) @ self._rules.gravity)
+        work = state.work + float(fallen.sum()) + float(worked.sum())
+        worked[self.others.free] = (fallen + bodies.kinetics - moved.kinetics)[self.count :]
         after = RigidState(state.t + self._rules.step, state.step + 1, moved, work)
         blows = sum(each.speed > 0 for each in due)
         krylov, seconds = self.copies.iterations - iterations, time.perf_counter() - began
@@ -170,39 +183,38 @@ class RigidStepper:
     def _moved(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, Touches]:
         """The bodies of a state, or the pieces that they are now, a step later, and what touched."""
         engine, end = self._engine or self._made(state.t, bodies), state.t + self._rules.step
-        ways = np.array([self._way(each, end) for each in self._obstacles]) if self._driven else None
-        moved, touches = engine.advance(bodies, ways)
+        moved, touches = engine.advance(bodies, self.others.ways(end))
         self.overlaps = engine.overlaps
         return moved, touches
 
     def _made(self, t: float, bodies: Bodies) -> Engine:
         """The engine for the bodies as they are now."""
-        at = [self._way(each, t) for each in self._obstacles]
-        stands = [Stand(shape, where, each.friction, each.moved is not None)
-                  for shape, where, each in zip(self._shapes, at, self._obstacles, strict=True)]  # fmt: skip
-        of = self.shapes
-        self._engine = Engine(bodies, of.parts, stands, self._rules, self.overlaps, of.names, of.outer, of.turn)
+        of, others = self.shapes, self.others
+        parts: list[Sequence[Part]] = [*of.parts, *others.parts]
+        outer, turn = [*of.outer, *others.outer], of.turn
+        if others.free:
+            turn = np.concatenate([turn, np.tile(np.eye(3), (len(others.free), 1, 1))])
+        stands = others.stands(t)
+        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.names, outer, turn)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
         """(thing, thing, depth in m) of what is in one another."""
         return (self._engine or self._made(state.t, state.bodies)).depth(state.bodies)
 
-    def _way(self, obstacle: Obstacle, t: float) -> Values:
-        return np.asarray(obstacle.at + obstacle.displacement(t), float)
-
     def _given_by(self, touches: Touches, t: float) -> tuple[Values, Values]:
-        """Mean force of the bodies on each obstacle (m, 3) in N, and what each did on the bodies (m,) in J."""
-        count, dt = len(self.shapes.names), self._rules.step
-        pushed = np.zeros((len(self._obstacles), 3))
-        for things, sign in ((touches.first, -1.0), (touches.second, 1.0)):
-            mine = things >= count
-            np.add.at(pushed, things[mine] - count, sign * touches.impulse[mine] / dt)
-        moved = [self._way(each, t + dt) - self._way(each, t) for each in self._obstacles]
-        return pushed, -np.einsum("mi,mi->m", pushed, np.array(moved).reshape(-1, 3))
+        """Mean force of the pieces on each obstacle (m, 3) in N, and what drivers did (m,) in J."""
+        count, dt, others = self.count, self._rules.step, self.others
+        pushed, more = np.zeros((2, len(others.every), 3))
+        for things, partner, sign in ((touches.first, touches.second, -1.0), (touches.second, touches.first, 1.0)):
+            for chosen, sums in ((partner < count, pushed), (partner >= count, more)):
+                mine = (things >= count) & chosen
+                np.add.at(sums, others.owner[things[mine] - count], sign * touches.impulse[mine] / dt)
+        return pushed, -np.einsum("mi,mi->m", pushed + more, others.moved(t, dt))
 
     def _strikes(self, due: list[Strain]) -> list[Strike]:
         """Those that might break a body."""
+        due = [each for each in due if each.body < self.count]
         every = [Strike(int(self.shapes.names[each.body]), each.points, each.force, each.radius) for each in due]
         sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
         may = [self.copies.may_break(each.name, much) for each, much in zip(every, sums, strict=True)]
@@ -210,7 +222,8 @@ class RigidStepper:
 
     def _divided(self, bodies: Bodies, names: set[int]) -> Bodies:
         """The pieces that bodies of these names broke into, among those that did not."""
-        before = self.shapes
+        before, free = self.shapes, bodies.part(slice(self.count, None))
+        bodies = bodies.part(slice(self.count))
         self.look_again()
         after = self.shapes
         parent = np.searchsorted(before.names, before.names[before.piece_of_node[after.names]])
@@ -221,7 +234,7 @@ class RigidStepper:
         for key, values in kept.items():
             values[whole] = getattr(bodies, key)[parent[whole]]
         self.overlaps = self.overlaps.divided(after.names, before.names[parent])
-        return replace(parts, **kept)
+        return replace(parts, **kept).with_more(free)
 
     def _reshaped(self, bodies: Bodies, copies: list[int]) -> Bodies:
         """The bodies, those of some copies as they are dented now. The step stays as it was: what is struck and dented
@@ -247,13 +260,14 @@ class RigidStepper:
 
     def _both_give(self, first: Ints, second: Ints) -> Flags:
         """(k,) whether both are bodies: what stands does not give way."""
-        return np.asarray(np.maximum(first, second) < len(self.shapes.names))
+        return np.asarray(np.maximum(first, second) < self.count)
 
     def _weights(self) -> tuple[Values, Values]:
         """Masses of all things in kg and half their sizes in m: half the side of a cube as large."""
-        volume = self.shapes.moments.volume
-        stands = np.array([each.extent for each in self._shapes])
+        volume, others = self.shapes.moments.volume, self.others
+        free = others.bodies().mass
+        stands = np.full(len(others.extent) - len(free), np.inf)
         return (
-            np.concatenate([self._density * volume, np.full(len(stands), np.inf)]),
-            np.concatenate([np.cbrt(volume) / 2, stands]),
+            np.concatenate([self._density * volume, free, stands]),
+            np.concatenate([np.cbrt(volume) / 2, others.extent]),
         )

@@ -191,6 +191,12 @@ def obstacle_entries(study: Study, dim: int) -> list[Obstacle]:
     return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
 
 
+def every_obstacle(study: Study) -> list[Obstacle]:
+    """Of a body in space on one rank, in the order of the study, those from files too."""
+    every = enumerate(obstacles(study, 3))
+    return [_solid(MPI.COMM_SELF, each, k) if each.shape == "mesh" else _obstacle(each, k) for k, each in every]
+
+
 def _obstacle(entry: Placing, number: int) -> Obstacle:
     try:
         shape = SHAPES[entry.shape](**entry.geometry)

@@ -30,7 +30,7 @@ from ..study import Contact, Study
 from ..study.check import checked_mesh
 from ..study.conditions import volume_loads
 from .breaking import average_of, strength_of, surface_rules
-from .contact import obstacle_entries
+from .contact import every_obstacle
 from .material import material_of, per_cell
 
 try:
@@ -79,7 +79,7 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     copies, poses, density = _copies(study, single, places), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
-    contact, obstacles = study.contact or Contact(), obstacle_entries(study, 3)
+    contact, obstacles = study.contact or Contact(), every_obstacle(study)
     rules = Rules(study.time.longest, gravity, contact.friction, contact.restitution or 0.0)
     hertz = Hertz(study.material.young, study.material.poisson)
     analyses = Analyses(copies, comm, (study, single, places))
@@ -87,9 +87,9 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     stepper = RigidStepper(copies, geometry, density, obstacles, rules, hertz, contact.contact_time, analyses)
     first = stepper.start()
     _check_masses(first)
-    at_rest = first.bodies
+    at_rest, free = first.bodies.part(slice(stepper.count)), first.bodies.part(slice(stepper.count, None))
     velocity, spin = motion(stepper.shapes.names, len(single.points), at_rest.centre, at_rest.mass, places)
-    first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin))
+    first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin).with_more(free))
     _check_room(stepper, first, obstacles, geometry.mean_edge)
     return RigidScene(study, placed(single, places), stepper, obstacles, first, (single, poses))
 
@@ -196,8 +196,8 @@ def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[Obstac
         return
     first, second, depth = max(found, key=lambda each: each[2])
     what, other = (
-        f"body {thing} around {format_point(state.bodies.place[thing])}" if thing < len(state.bodies)
-        else f"obstacle {obstacles[thing - len(state.bodies)].name}" for thing in (first, second)
+        f"body {thing} around {format_point(state.bodies.place[thing])}" if thing < stepper.count
+        else f"obstacle {obstacles[stepper.others.owner[thing - stepper.count]].name}" for thing in (first, second)
     )  # fmt: skip
     more = f" (one of {len(found)} such pairs)" if len(found) > 1 else ""
     raise InputError(

@@ -76,17 +76,18 @@ def check_rigid(study: Study) -> None:
         raise ValueError(
             f'solver.{beyond[0]} is not for time.scheme = "rigid": give options of ksp_, pc_ and mg_ alone'
         )
-    solids = [each.name for each in study.obstacle if each.shape == "mesh"]
-    if solids:
-        raise ValueError(
-            f'obstacle {solids[0]} is a mesh, which time.scheme = "rigid" does not have: build it of other shapes'
-        )
-    loose = [each.name for each in study.obstacle if each.free]
-    if loose:
-        raise ValueError(
-            f'obstacle {loose[0]} has a mass: with time.scheme = "rigid" what moves freely is a body, and an obstacle '
-            "is held or driven"
-        )
+    for each in study.obstacle:
+        held = [key for key in ("hinge", "guide") if getattr(each, key) is not None]
+        if held:
+            raise ValueError(
+                f'obstacle {each.name} has a {held[0]}, which time.scheme = "rigid" does not have: let it move freely, '
+                "or drive it"
+            )
+        if each.spin is not None and not each.free:
+            raise ValueError(
+                f'obstacle {each.name} is turned by spin, which time.scheme = "rigid" does not do: give it a mass, or '
+                "drive it without"
+            )
 
 
 def _check_denting(study: Study) -> None:

@@ -99,14 +99,14 @@ class Flights(Obstacles):
 
 def columns_of(free: Iterable[Flying], comm: MPI.Intracomm) -> dict[str, Callable[[], Values]]:
     """Columns of history.csv that tell how obstacles fly, each with a function that gives this rank's share, (1,)."""
-    return {name: partial(_reading, each, k, comm) for each in free for k, name in enumerate(_columns(each.body))}
+    return {name: partial(_reading, each, k, comm) for each in free for k, name in enumerate(columns(each.body))}
 
 
 def _reading(each: Flying, place: int, comm: MPI.Intracomm) -> Values:
     return np.zeros(1) if comm.rank else each.body.told(each.flight)[place : place + 1]
 
 
-def _columns(body: FreeObstacle) -> list[str]:
+def columns(body: FreeObstacle) -> list[str]:
     """Names of what `told` gives."""
     d = len(body.at)
     axes, turns = AXES[:d], AXES[2:] if d == 2 else AXES
