@@ -216,6 +216,7 @@ class Run:
         began = time.perf_counter()
         notes, domain, breaks = Notes(self._text, self.monitors.saved()), self.scene.domain, self.breaks
         balance = self.scene.balance
+        breaks.remember()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
         self._saved_at = self.state.t
         self._meter.output += time.perf_counter() - began

@@ -32,12 +32,21 @@ class EdgeRecord:
         if cut is not None:
             self.cut[new] = cut[new]
 
+    def remember(self, cut: Values) -> None:
+        """Edges that are weakened and not broken are cut at `cut` (edges,)."""
+        held = (self.graph.integrity < 1) & ~self.graph.broken
+        self.cut[held] = cut[held]
+
     def gathered(self) -> tuple[Ints, Values] | None:
         """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
         return self.graph.gather_broken(np.column_stack([self.at, self.cut]))
 
+    def saved(self) -> tuple[Ints, Values] | None:
+        """The same of all edges that are not whole (collective)."""
+        return self.graph.gather_weakened(np.column_stack([self.at, self.cut]))
+
     def restore(self, keys: Ints, values: Values) -> None:
-        """Take up what `gathered` gave, (n, 2) keys and (n, 2) values, on every rank."""
+        """Take up what `saved` gave, (n, 2) keys and (n, 2) values, on every rank."""
         local, place = self.graph.find_keys(keys)
         self.at[local], self.cut[local] = values[place].T
 

@@ -163,10 +163,12 @@ class EdgeGraph:
         """
         return self._gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
 
-    def gather_weakened(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        """(n, 2) sorted keys of all edges that are not whole on rank 0, and their (n, 1) integrity; None on the other
-        ranks (collective)."""
-        return self._gather(self.integrity < 1, self.integrity[:, None])
+    def gather_weakened(
+        self, values: npt.NDArray[np.float64] | None = None
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
+        """(n, 2) sorted keys of all edges that are not whole on rank 0, and of (edges, m) values of local ones their
+        rows, or their (n, 1) integrity; None on the other ranks (collective)."""
+        return self._gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
 
     def restore(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
         """Be as `gather_weakened` said, given on every rank."""

@@ -61,6 +61,11 @@ class Breaks:
             self.record.note(t, self._cuts() if self._by_forces else None)
         self.count()
 
+    def remember(self) -> None:
+        """A checkpoint is written: edges that cracks have cut and that hold on are cut there."""
+        if self.record is not None and self._cut_by is not None:
+            self.record.remember(self._cut_by)
+
     def restored(self) -> None:
         """The record was read from a checkpoint: so were the places of cuts (collective)."""
         if self.record is not None and self._cut_by is not None:

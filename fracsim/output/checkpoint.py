@@ -88,7 +88,7 @@ def write_checkpoint(
         arrays["plastic"] = domain.gather_cells(_by_cells(plastic.memory(), plastic.points))
     if record is not None:
         arrays["weakened"], arrays["integrity"] = record.graph.gather_weakened() or (None, None)
-        arrays["broken"], arrays["breaks"] = record.gathered() or (None, None)
+        arrays["broken"], arrays["breaks"] = record.saved() or (None, None)
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)

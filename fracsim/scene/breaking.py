@@ -74,6 +74,8 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
 
     assert study.fracture is not None and study.fracture.energy is not None
     refuse_forks(study, balance.domain.dim)
+    if study.fracture.law == "cohesive":
+        return _cohesive(study, balance, graph, passes, opened)
     stress, strength = balance.stress, strength_of(study, balance.domain, graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     tips = CrackTips(stress, graph, strength, toughness, opened, branching=study.fracture.branching)
@@ -87,6 +89,22 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
 
         criterion = JoinedTips(tips, graph, joining)
     return Breaking(stress, graph, criterion, passes=passes, opened=opened, degradation=splitting, pace=pace)
+
+
+def _cohesive(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+    """What breaks where cracks hold on while they open."""
+    from ..fracture.cohesive.breaking import CohesiveBreaking
+    from ..fracture.cohesive.softening import Softening
+    from ..fracture.cohesive.tips import CohesiveTips
+    from ..mesh.edges import EdgeGraph
+
+    assert study.fracture is not None
+    stress, cuts = balance.stress, EdgeGraph(balance.domain)
+    strength = strength_of(study, balance.domain, cuts)
+    toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
+    tips = CohesiveTips(stress, cuts, strength, toughness, opened)
+    softening = Softening(stress, cuts, strength, toughness, tips.cut)
+    return CohesiveBreaking(stress, graph, cuts, tips, softening, passes=passes, opened=opened)
 
 
 def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:

@@ -35,6 +35,8 @@ class Fracture(Table):
 
     strength: Strength
     energy: Positive | None = None  # G_c, J/m^2: cracks advance where they release it; None: edges break one by one
+    # with energy: a tip goes by the energy that it releases; or cracks hold on while they open (l_ch >= 8 h: concrete)
+    law: Literal["griffith", "cohesive"] = "griffith"
     branching: Flag = False  # with energy, in the plane and with inertia: a tip to which 2 G_c flows goes on as two
     approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local

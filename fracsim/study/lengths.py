@@ -26,7 +26,7 @@ def fits(study: Study, least: float) -> Iterator[str]:
     if table.energy is None:
         yield from _spent(study, plane_modulus(study, Region()), table.radius or h)
         return
-    if h is not None and least < 2 * DISC * h:
+    if table.law == "griffith" and h is not None and least < 2 * DISC * h:
         most = least / 2 / DISC
         yield f"note: tips need {DISC:g} h on every side, the body is {least / h:.3g} h across: h below {most:.2g} m"
 

@@ -9,6 +9,7 @@ from . import Study
 from .body import Region
 
 RADIUS = 5.0  # h: of the disc of a tip (fracture.energy.tips, which is dear to import)
+RESOLVED = 8.0  # h that Irwin's length has where cells follow a crack as it opens
 PART = 5.0  # times that Irwin's length goes into the body, from which on a crack has room for its tip
 
 
@@ -27,9 +28,14 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
         assert energy is not None
         length = plane_modulus(study, region) * energy / strength**2
         where = f"in {name}: " if name else ""
-        yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa"
+        yield f"{where}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa; law {table.law}"
         yield f"{where}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
+        if table.law == "cohesive":
+            yield from _too_coarse(length, h)
+            continue
         yield from _unfit(length, strength, h, side)
+        if length >= RESOLVED * h and study.time.scheme == "quasi-static":
+            yield 'cells resolve that: with law = "cohesive" cracks hold on while they open, as concrete does'
     if table.branching:
         yield from _branching(study, h)
 
@@ -56,6 +62,13 @@ def plane_modulus(study: Study, region: Region) -> float:
     material = study.material
     young, poisson = region.young or material.young, material.poisson if region.poisson is None else region.poisson
     return young / (1 - poisson**2 if material.plane == "strain" else 1.0)
+
+
+def _too_coarse(length: float, h: float) -> Iterator[str]:
+    """Whether cells follow a crack as it opens."""
+    if length < RESOLVED * h:
+        yield f'note: that is less than {RESOLVED:g} h: cells are too coarse for law = "cohesive";'
+        yield f'h = {length / RESOLVED:.2g} m would do, or law = "griffith"'
 
 
 def _unfit(length: float, strength: float, h: float, side: float) -> Iterator[str]:

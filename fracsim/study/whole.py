@@ -151,6 +151,8 @@ class Study(Table):
                     "fracture.branching needs inertia: a slow crack is given no more than it takes; remove it, or "
                     'choose time.scheme = "explicit" or "newmark"'
                 )
+        if table is not None and table.law == "cohesive":
+            self._cohesive_stands_alone(table)
         if table is None or table.energy is None:
             return self
         others = {
@@ -166,6 +168,22 @@ class Study(Table):
             if given:
                 raise ValueError(f"fracture.energy does not go with {key}: {why}")
         return self
+
+    def _cohesive_stands_alone(self, table: Fracture) -> None:
+        if table.energy is None:
+            raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
+        others = {
+            f'time.scheme = "{self.time.scheme}"': (
+                self.time.scheme != "quasi-static", 'cohesive cracks are slow ones: choose "quasi-static"'
+            ),
+            "fracture.unilateral": (
+                table.unilateral, "cells that are cut and pressed keep what stiffness they have left: remove it"
+            ),
+            "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
+        }  # fmt: skip
+        for key, (given, why) in others.items():
+            if given:
+                raise ValueError(f'fracture.law = "cohesive" does not go with {key}: {why}')
 
     @model_validator(mode="after")
     def _cracks_need_fracture(self) -> Study:

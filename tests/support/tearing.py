@@ -51,6 +51,17 @@ RUNS: dict[str, dict[str, Any]] = {
         "time": {"scheme": "newmark", "step": 5e-4, "end": 0.008},
     },
 }  # fmt: skip
+RUNS["cohesive"] = {
+    "mesh": _PLATE | {"size": [0.6, 0.3], "h": 1 / 14}, "material": _SOFT | {"energy": "linear"},
+    "fracture": {"strength": 100.0, "energy": 0.6, "law": "cohesive"},
+    "crack": [{"segment": [[0.0, 0.16], [0.15, 0.16]]}],
+    "boundary": [
+        {"on": "bottom", "fix": "xy"},
+        {"on": {"box": [[-0.1, 0.29], [0.3, 0.31]]},
+         "displacement": {"time": [0, 1], "value": [[0, 0], [0.003, 0.04]]}},
+    ],
+    "time": {"scheme": "quasi-static", "step": 0.05, "end": 1.0},
+}  # fmt: skip
 # many cracks at once, which with crumbs cut eight nodes off
 RUNS["shivered"] = RUNS["begun"] | {
     "mesh": _PLATE | {"size": [2.0, 0.8], "h": 1 / 10},
