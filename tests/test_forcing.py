@@ -1,4 +1,4 @@
-"""How exactly Newton's linear systems are solved while contact acts, and when the body's tangent is kept."""
+"""How exactly Newton's linear systems are solved, with contact and without, and when the tangent is kept."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fracsim.mechanics.balance as balance_module
-from fracsim.stepping.forcing import LOOSE, Forcing
+from fracsim.stepping.forcing import LOOSE, LOOSEST, ROUGHEST, SHARE, SMALL, Forcing, Sparing
 from support.scenes import make_scene, march, positions
 from test_itself import SOFT, two_blocks
 
@@ -35,14 +35,71 @@ def test_iterations_are_those_of_an_exact_solve() -> None:
     assert forcing.iterations(2) == 5
 
 
-def test_a_collision_ends_as_with_exact_solves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two blocks thrown at each other: the same motion by rough solves and kept tangents, which are fewer."""
-    file = two_blocks(tmp_path, 2, 0.05)
+def test_without_contact_a_solve_leaves_a_share_of_what_the_tangent_leaves() -> None:
+    """q^2 where it is new, 2 q where it is kept, and a share of little at least; the first q is that of the last
+    attempt."""
+    sparing = Sparing(RTOL)
+    assert not sparing.reach(1.0, 1e-5)
+    assert sparing.tolerance(1e-5, kept=False) == RTOL  # nothing is known of the first
+    assert not sparing.reach(0.05, 1e-5)
+    assert sparing.tolerance(1e-5, kept=False) == pytest.approx(SHARE * 0.05**2)
+    assert sparing.reach(1e-4, 1e-5)  # which leaves 4e-7 of r, less than LEFT of little
+    assert sparing.tolerance(1e-5, kept=True) == pytest.approx(SMALL * 1e-5 / 1e-4)
+    sparing.begin()
+    sparing.reach(1.0, 1e-5)
+    assert sparing.tolerance(1e-5, kept=False) == pytest.approx(SHARE * 0.05)
+
+
+def test_no_correction_is_rougher_than_may_be() -> None:
+    sparing = Sparing(RTOL)
+    sparing.reach(1.0, 1e-6)
+    assert not sparing.reach(0.9, 1e-6)  # a tangent that leaves nearly all of r
+    assert sparing.tolerance(1e-6, kept=False) == ROUGHEST
+    sparing.reach(1e-9, 1e-6)
+    assert sparing.tolerance(1e-6, kept=True) == LOOSEST  # far below what is little
+    sparing.reach(0.0, 0.0)
+    assert sparing.tolerance(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
+    assert sparing.iterations(2) == 0  # too few to tell
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A number for each tangent that is assembled."""
     made: list[int] = []
     assemble = balance_module.Balance._assemble_body
     monkeypatch.setattr(
         balance_module.Balance, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given)
     )
+    return made
+
+
+def test_a_swinging_bar_moves_as_with_exact_solves(made: list[int]) -> None:
+    """A soft cantilever let go, far from its rest: the same motion to the tolerance of the solver, with fewer tangents
+    and iterations of CG."""
+
+    def let_go(**solver: float) -> tuple[np.ndarray, int, int]:
+        made.clear()
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [4.0, 1.0, 1.0], "h": 0.25}, solver=solver,
+            material={"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1e3},
+            boundary=[{"on": "left", "fix": "xyz"}], load={"gravity": [0.0, 0.0, -100.0]},
+            time={"scheme": "backward-euler", "step": 0.005, "end": 0.12},
+        )  # fmt: skip
+        krylov = sum(report.solve.krylov for report in march(scene, state))
+        return state.u.copy(), krylov, len(made)
+
+    u, krylov, tangents = let_go()
+    exact, more_krylov, more_tangents = let_go(ksp_rtol=RTOL)
+    assert np.abs(exact).max() > 0.5
+    assert u == pytest.approx(exact, abs=1e-6 * np.abs(exact).max())
+    assert krylov < more_krylov and tangents < 0.8 * more_tangents
+
+
+def test_a_collision_ends_as_with_exact_solves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: list[int]
+) -> None:
+    """Two blocks thrown at each other: the same motion by rough solves and kept tangents, which are fewer."""
+    file = two_blocks(tmp_path, 2, 0.05)
 
     def thrown(**solver: float) -> tuple[np.ndarray, int, int]:
         made.clear()

@@ -1,12 +1,18 @@
-"""How exactly the linear systems of Newton's method are solved while contact acts.
+"""How exactly the linear systems of Newton's method are solved, and with which tangent.
+
+While contact acts:
 
     eta_k = min(LOOSE, max(rtol, 0.9 (|r_k| / |r_k-1|)^2, little / (10 |r_k|)))
 
 (the second choice of Eisenstat and Walker, SIAM J. Sci. Comput. 17, 1996). While Newton's method finds out what
 touches, a pair an iteration, and while the barrier bends more than its tangent knows, digits of a correction are worth
 nothing; there are many such iterations, and CG takes four times as many in each as for the body alone. Any iterate of
-CG goes down the potential, which is what the line search goes by. Without contact two exact corrections do, and are
-cheaper than three rough ones.
+CG goes down the potential, which is what the line search goes by.
+
+Without contact (`Sparing`) two exact corrections often do, and three rough ones would be dearer. But the last of them
+goes on for digits that nobody asks for, and what the first leaves is nonlinear, whatever the digits of its solution. So
+what CG leaves is a share of what the tangent leaves anyhow, q_k = |r_k+1| / |r_k|, or little against a solution; and
+the tangent is kept where with it, too, r comes to be little: it leaves 2 q of r then, the new one q^2.
 """
 
 from __future__ import annotations
@@ -43,3 +49,56 @@ class Forcing:
     def iterations(self, its: int) -> int:
         """How many a solve to the exact tolerance would have taken, which took `its` (at a constant rate)."""
         return round(its * math.log(self._rtol) / math.log(self._used))
+
+
+SHARE = 0.1  # of what the tangent leaves, which CG may leave
+# of the residual of a solution: what CG may leave, on which ranks differ, and what a tangent that is kept may
+SMALL, LEFT = 1e-2, 0.3
+ROUGHEST, LOOSEST = 1e-2, 0.1  # no correction is rougher, and no last one: of a slender body it might not go down
+ENOUGH = 3  # iterations that tell how quickly CG converges
+
+
+class Sparing:
+    """The same of a body that touches nothing.
+
+    Attributes:
+        rtol: of solves that are exact enough for anything.
+    """
+
+    def __init__(self, rtol: float) -> None:
+        self.rtol = self._used = rtol
+        self._first_left = 0.0  # share of r that the first iteration of the last attempt has left
+        self.begin()
+
+    def begin(self) -> None:
+        """An attempt begins: no residual is known."""
+        self._norms: list[float] = []
+
+    def reach(self, norm: float, little: float) -> bool:
+        """An iterate has a residual of `norm`, N, where `little` N is a solution; whether the tangent of the last one
+        does for it."""
+        self._norms.append(norm)
+        if len(self._norms) == 2:
+            self._first_left = self._left
+        return len(self._norms) > 1 and 2 * self._left * norm <= LEFT * little
+
+    def tolerance(self, little: float, *, kept: bool) -> float:
+        """That of the solve from there; `kept`: with the tangent of the last iterate."""
+        first, enough = len(self._norms) == 1, SMALL * little / self._norms[-1] if self._norms[-1] else 1.0
+        left = self._first_left if first else (2 * self._left if kept else self._left**2)
+        self._used = max(self.rtol, min(ROUGHEST, SHARE * left), min(enough, LOOSEST))
+        return self._used
+
+    def exact(self) -> float:
+        """The tolerance of a solve by itself."""
+        self._used = self.rtol
+        return self._used
+
+    @property
+    def _left(self) -> float:
+        """Share of r that the last iteration has left."""
+        return self._norms[-1] / self._norms[-2] if self._norms[-2] else 1.0
+
+    def iterations(self, its: int) -> int:
+        """How many a solve to the exact tolerance would have taken, which took `its`; 0: too few to tell."""
+        return round(its * math.log(self.rtol) / math.log(self._used)) if its >= ENOUGH else 0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .factors import FACTORISED, SOONER_THAN_GMRES, Factors
-from .forcing import Forcing
+from .forcing import Forcing, Sparing
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
@@ -101,8 +102,8 @@ class Solver:
         self._asked = float(given.get("ksp_rtol", 0.0))
         self._linearly = is_linear(balance, given, snes.ksp.getType())
         self._ending = Ending(snes.comm, int(snes.ksp.max_it)) if self._linearly and self._iterative else None
-        rough = balance.limits_steps and balance.conservative and not self._asked
-        self._forcing = Forcing(float(chosen["ksp_rtol"])) if rough else None
+        self._forcing = None if self._asked else _forcing(balance, chosen)
+        self._small: float | None = None  # of the last tangent (Balance.assemble_tangent)
         self._first = self._last_little = 0.0
         self._factors = Factors(self._preconditioner)
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
@@ -173,10 +174,13 @@ class Solver:
         result = self._attempt(guess)
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
         if self._misled(result):
-            # Smoothers of an older tangent need not be positive for this one: set up anew at every tangent.
-            self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
-            result = self._attempt_positively(start) if self.balance.conservative else self._attempt(start)
-            self._preconditioner.keep = self._iterative
+            # Smoothers of an older tangent need not be positive for this one.
+            self._preconditioner.due = Due.REBUILD
+            if self.balance.conservative:
+                result = self._attempt_positively(start)
+            else:
+                with self._set_up_anew():
+                    result = self._attempt(start)
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self._may_factorise()
         stalled = stalled or self._may_factorise(SOONER_THAN_GMRES[self.balance.domain.dim])
         if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
@@ -193,13 +197,21 @@ class Solver:
         from .downhill import POSITIVE
 
         down = self._downhill = self._downhill or self._another_downhill()
-        for how in POSITIVE:
+        for kept, how in zip((True, False), POSITIVE, strict=True):
             down.made_positive(how)
-            result = self._attempt(guess, (down.snes, down))
+            with nullcontext() if kept else self._set_up_anew():
+                result = self._attempt(guess, (down.snes, down))
             if not self._misled(result):
                 break
         down.made_positive(None)
         return result
+
+    @contextmanager
+    def _set_up_anew(self) -> Iterator[None]:
+        """With a preconditioner that is made anew at every tangent."""
+        self._preconditioner.due, self._preconditioner.keep = Due.REBUILD, False
+        yield
+        self._preconditioner.keep = self._iterative
 
     def _another_downhill(self) -> Downhill:
         """A second SNES, with the linear solver of the first."""
@@ -352,8 +364,12 @@ class Solver:
         return bool(ksp.reason > 0)
 
     def _assemble(self, tangent: PETSc.Mat) -> None:
-        small = None if self._down is None else self._down.small
-        self.balance.assemble_tangent(tangent, small=small)
+        self._small = self._smallness
+        self.balance.assemble_tangent(tangent, small=self._small)
+
+    @property
+    def _smallness(self) -> float | None:
+        return None if self._down is None else self._down.small
 
     def _linearise(self, tangent: PETSc.Mat) -> None:
         """K at an iterate of Newton's method, and how exactly it is solved with."""
@@ -362,8 +378,14 @@ class Solver:
             self._assemble_tangent(tangent)
             return
         self._preconditioner.its = forcing.iterations(ksp.its)
-        self._assemble_tangent(tangent)
         norm, little = self.snes.getFunctionNorm(), self._last_little
+        if isinstance(forcing, Sparing):
+            kept = forcing.reach(norm, little) and self._small == self._smallness
+            if not kept:
+                self._assemble_tangent(tangent)
+            ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
+            return
+        self._assemble_tangent(tangent)
         ksp.setTolerances(rtol=forcing.rough(norm, little) if self.balance.couples else forcing.exact())
 
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
@@ -461,6 +483,15 @@ def _chosen(balance: Balance, given: Options) -> Options:
     if not balance.symmetric:
         chosen |= {"ksp_type": "gmres"}
     return chosen | given
+
+
+def _forcing(balance: Balance, chosen: Options) -> Forcing | Sparing | None:
+    """How exactly Newton's method solves; None: always as exactly. (Without inertia a piece hangs by next to nothing: a
+    residual that is small leaves its place open.)"""
+    rtol = float(chosen["ksp_rtol"])
+    if balance.limits_steps:
+        return Forcing(rtol) if balance.conservative else None
+    return Sparing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
 
 
 def _may_change(balance: Balance, given: Options) -> bool:
