@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 
 from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
 from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
-from fracsim.fracture.energy.mixed import NORMAL, SHEAR, gain, kink, phase
+from fracsim.fracture.energy.mixed import Around, gain, kink, shares
 from fracsim.fracture.energy.seen import Seen
 from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
@@ -171,8 +171,7 @@ def test_the_force_of_a_known_field(kind: str) -> None:
 
 def test_where_a_crack_turns_in_closed_form() -> None:
     """The greatest hoop stress over all angles, by looking at them (Erdogan and Sih 1963): 70.5 degrees in pure
-    sliding, where its K^2 is 4/3, and where the sides press on each other, too; c_1 and c_2 are means over angles of
-    the fields around a tip."""
+    sliding, where its K^2 is 4/3, and where the sides press on each other, too."""
     psi, t = np.linspace(-2, 2, 41), np.linspace(-np.pi, np.pi, 200_001)
     for each in psi:
         hoop = np.cos(t / 2) * (max(np.cos(each), 0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(each) * np.sin(t))
@@ -182,18 +181,89 @@ def test_where_a_crack_turns_in_closed_form() -> None:
         assert gain(np.array([each]))[0] == pytest.approx(hoop[best] ** 2, rel=1e-6)
     assert np.degrees(kink(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
     assert gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
-    c, s = np.cos(t / 2), np.sin(t / 2) * np.sin(1.5 * t)
-    assert np.mean(c * (1 + s)) == pytest.approx(NORMAL, rel=1e-4)
-    assert np.mean(c * (1 - s)) == pytest.approx(SHEAR, rel=1e-4)
-    turned = np.array([[np.cos(0.3), np.sin(0.3)]])
-    Q = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-    stress = Q @ np.array([[0.4, 0.5 * SHEAR], [0.5 * SHEAR, NORMAL]]) @ Q.T
-    assert phase(stress[None], turned)[0] == pytest.approx(np.arctan2(0.5, 1.0))
+
+
+def test_intensities_in_closed_form() -> None:
+    """K_I and K_II put around a tip, by quadrature over the disc: whatever else is there that the tip has no part in,
+    a stress along its sides, and a body that is accelerated across them, u_y = rho a y^2 / 2 (lambda + 2 mu)."""
+    radius, step = 0.3, 1e-6
+    r = radius * (np.arange(200) + 0.5) / 200
+    t = np.pi * ((np.arange(400) + 0.5) / 200 - 1)
+    apart = (r[:, None, None] * np.column_stack([np.cos(t), np.sin(t)])).reshape(-1, 2)
+    area = np.repeat(r, len(t)) * radius / 200 * np.pi / 200
+    mu, kappa = YOUNG / 2 / (1 + POISSON), 3 - 4 * POISSON
+    lmbda, load, along = 2 * mu * POISSON / (1 - 2 * POISSON), 7.0, 0.4 / YOUNG
+
+    def u(places: Values) -> Values:
+        x, y = places.T
+        side = np.column_stack([along * (1 - POISSON**2) * x, load / 2 / (lmbda + 2 * mu) * y**2])
+        return np.asarray(near_tip(places, 0.8, 0.5) + side - [[0, 1]] * (along * POISSON * (1 + POISSON) * y)[:, None])
+
+    H = np.stack([(u(apart + e) - u(apart - e)) / (2 * step) for e in step * np.eye(2)], axis=2)
+    strain = (H + H.transpose(0, 2, 1)) / 2
+    stress = 2 * mu * strain + lmbda * np.einsum("pii->p", H)[:, None, None] * np.eye(2)
+    many = np.ones(len(area))
+    c, s = np.cos(0.7), np.sin(0.7)
+    Q = np.array([[c, -s], [s, c]])
+    discs = [radius * many, np.repeat([[c, s]], len(many), axis=0), np.repeat([Q @ [0, load]], len(many), axis=0)]
+    slope = area[:, None] * plateau_gradient(apart, discs[0]) @ Q.T
+    inside = area * plateau(np.linalg.norm(apart, axis=1), discs[0])
+    push = discs[2]
+    around = Around(apart @ Q.T, discs[1], slope, inside, Q @ stress @ Q.T, Q @ H @ Q.T, push, mu * many, kappa * many)
+    np.testing.assert_allclose(shares(around).sum(axis=0), [0.8, 0.5], atol=2e-3)
+    still = shares(replace(around, push=0 * push)).sum(axis=0)
+    assert abs(still[1] - 0.5) > 0.1  # it is the acceleration's part that makes it so
+
+
+def tilted(points: Values, first: float, second: float, half: float) -> Values:
+    """(n, 2) displacement around a crack from - half to half on y = 0 in a wide body, pulled one way, that has these
+    tractions in Pa across it (Westergaard)."""
+    z, y = points[:, 0] + 1j * points[:, 1], points[:, 1]
+    mu, kappa = YOUNG / 2 / (1 + POISSON), 3 - 4 * POISSON
+    whole = np.sqrt(z - half) * np.sqrt(z + half)
+    Z = z / whole
+    opening = np.column_stack([(kappa - 1) / 2 * whole.real - y * Z.imag, (kappa + 1) / 2 * whole.imag - y * Z.real])
+    sliding = np.column_stack([(kappa + 1) / 2 * whole.imag + y * Z.real, (1 - kappa) / 2 * whole.real - y * Z.imag])
+    along = second**2 / first - first
+    side = along * np.column_stack([(1 - POISSON) * points[:, 0], -POISSON * y])
+    return np.asarray((first * opening + second * sliding + side) / (2 * mu))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_both_tips_of_a_tilted_crack_are_told(kind: str) -> None:
+    """A crack of 12 h, whose discs have a radius of 5 h and all of the stress along it, under tension at 30 to 90
+    degrees: K_II / K_I = cot, to 2.5 degrees, as near as a field is that no mesh made; the mean is 4 to 7 off."""
+    scene = scene_on(
+        distribute(MPI.COMM_SELF, square(kind, 40)),
+        make_study(**plate_tables(), crack=[{"segment": [[0.35, 0.507], [0.65, 0.507]]}]),
+    )
+    ends = tips(scene)
+    half = np.ptp(ends[:, 0]) / 2 + 0.5 / 40
+    for angle in np.radians([30, 45, 60, 90]):
+        first, second = np.sin(angle) ** 2, np.sin(angle) * np.cos(angle)
+        scene.balance.displace(tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half).ravel())
+        off = np.degrees(seen(scene).phases() - (np.pi / 2 - angle))
+        assert np.abs(off).max() < 2.5
+
+
+def test_who_turns_with_a_tip_sees_no_turn() -> None:
+    """A neo-Hookean body spun by 70 degrees, its crack under K_I and K_II: the phase of before, to round-off."""
+    study = make_study(**plate_tables() | {"material": plate_tables()["material"] | {"energy": "neo-hookean"}},
+                       crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])  # fmt: skip
+    scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", 20)), study)
+    nodes, tip = scene.domain.nodes, tips(scene)[0]
+    u, phases = near_tip(nodes - [tip[0] + 0.5 / 20, 0.507], 1e6, 0.5e6), []
+    c, s = np.cos(1.2), np.sin(1.2)
+    for Q in (np.eye(2), np.array([[c, -s], [s, c]])):
+        scene.balance.displace(((nodes + u) @ Q.T - nodes).ravel())
+        phases.append(seen(scene).phases()[0])
+    assert phases[0] == pytest.approx(np.arctan2(0.5, 1), abs=0.03)
+    assert phases[1] == pytest.approx(phases[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
-    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 5 degrees, and what the crack
+    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 3 degrees, and what the crack
     that turns releases to a tenth, as near as a field is that no mesh made; the first principal stress of the mean is
     30 degrees off."""
     study = make_study(**plate_tables(), crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
@@ -203,10 +273,10 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.displace(u.ravel())
         now = seen(scene)
-        released, ahead = criterion._turned(now.means(np.array([0]), whole=True), now.tips, now.forces())
+        released, ahead = criterion._turned(now.phases(), now.tips, now.forces())
         psi = np.arctan2([second], [first])
         angle = np.arctan2(ahead[0, 1], ahead[0, 0])
-        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=5)
+        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=3)
         expected = (first**2 + second**2) * gain(psi)[0]
         assert released[0] * STIFF == pytest.approx(expected, rel=0.1)
 

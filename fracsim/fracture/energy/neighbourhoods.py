@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from ...mesh.edges import EdgeGraph
 from ..brittle.principal import largest
-from . import branching
+from . import branching, mixed
 from .around import Around, Pairs, pairs_within
 from .crack import Crack
 from .force import plateau, plateau_gradient
@@ -76,7 +76,6 @@ class _Sum(IntEnum):
     INSIDE = 0  # V q
     MEAN = 1  # V (1 - r / radius of the average)
     ALIKE = 2  # V
-    WHOLE = 3  # V (1 - r / R)
 
 
 class Neighbourhoods:
@@ -129,13 +128,35 @@ class Neighbourhoods:
             force -= self._matrix(axis) @ sigma[:, :, axis]
         return np.asarray(force)
 
-    def means(self, rows: Ints, stress: Values, *, whole: bool = False) -> Values:
+    def means(self, rows: Ints, stress: Values) -> Values:
         """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, d, d) which have not come apart,
-        weighted by 1 - r over the radius of the average, or over that of the `whole` disc."""
+        weighted by 1 - r over the radius of the average."""
         d = stress.shape[1]
-        weights = self._matrix(d + (_Sum.WHOLE if whole else _Sum.MEAN))[rows]
+        weights = self._matrix(d + _Sum.MEAN)[rows]
         sums = np.asarray(weights @ stress.reshape(-1, d * d)).reshape(-1, d, d)
         return over(sums, np.asarray(weights.sum(axis=1)).reshape(-1, 1, 1))
+
+    def intensities(
+        self, fields: tuple[Values, Values, Values], elastic: tuple[Values, Values], *, turns: bool
+    ) -> Values:
+        """(n, 2) K_I and K_II in Pa sqrt(m) of tips in the plane, along the crack behind them (mixed).
+
+        `fields`: stress (asked, 2, 2) in Pa, grad u (asked, 2, 2), rho a (asked, 2) in N/m^3, of cells that have not
+        come apart. `elastic`: (n,) mu in Pa and kappa. `turns`: as seen by somebody who turns with what is in the disc.
+        """
+        rows, tips, count = np.flatnonzero(~self._split[self._cell]), self.tips, len(self.tips)
+        place, index, inside = self._place[rows], self._index[rows], self._weights[rows, 2 + _Sum.INSIDE]
+        stress, H, push = (each[index] for each in fields)
+        if turns:
+            F = H + np.eye(2)
+            sines, cosines = (np.bincount(place, inside * each, count)
+                              for each in (F[:, 1, 0] - F[:, 0, 1], F[:, 0, 0] + F[:, 1, 1]))  # fmt: skip
+            stress, H, push = mixed.turned_back(np.arctan2(sines, cosines)[place], stress, F, push)
+        apart = self._around.centres[self._cell[rows]] - tips.point[place]
+        tangent = branching.unit(tips.point - tips.behind)[place]
+        mu, kappa = (each[place] for each in elastic)
+        around = mixed.Around(apart, tangent, self._weights[rows, :2], inside, stress, H, push, mu, kappa)
+        return np.column_stack([np.bincount(place, each, count) for each in mixed.shares(around).T])
 
     def squares(self, rows: Ints, stress: Values) -> Values:
         """(m,) mean square of the positive first principal stress around tips, all cells alike, Pa^2."""
@@ -193,7 +214,7 @@ class Neighbourhoods:
         volume, r, R = self._around.volumes[pairs.other], pairs.distance, disc[pairs.place]
         slope = volume[:, None] * plateau_gradient(pairs.apart, R)
         share = 1 - r / average[pairs.place]
-        columns = [plateau(r, R), np.maximum(share, 0.0), share > 0, 1 - r / R]
+        columns = [plateau(r, R), np.maximum(share, 0.0), share > 0]
         weights = np.column_stack([slope, *(volume * each for each in columns)])
         return pairs.place, pairs.other, weights, pairs.sum(slope)
 

@@ -36,6 +36,8 @@ class Seen:
         stress: (asked, d, d) Cauchy stress of the undamaged material, Pa.
         sigma: (asked, d, d) Eshelby's stress of the body as it is, Pa.
         inertia: (asked, d) rho (H^T a - (grad v)^T v), N/m^3; 0 where nothing has a mass.
+        H, push: (asked, 2, 2) grad u and (asked, 2) rho a in N/m^3; of nothing in space.
+        elastic: (tips,) mu in Pa and (lambda + 3 mu) / (lambda + mu).    turns: whether turning strains nothing.
     """
 
     around: Neighbourhoods
@@ -43,6 +45,10 @@ class Seen:
     stress: Values
     sigma: Values
     inertia: Values
+    H: Values
+    push: Values
+    elastic: tuple[Values, Values]
+    turns: bool
 
     @property
     def tips(self) -> Tips:
@@ -65,9 +71,15 @@ class Seen:
         share = np.divide(along, length**3, out=np.zeros(len(along)), where=length > LEAST * self.disc)
         return np.asarray(share[:, None] * ahead)
 
-    def means(self, rows: Ints, *, whole: bool = False) -> Values:
-        """(m, d, d) mean stress around tips `rows` (m,), Pa: over the radius of the average, or the `whole` disc."""
-        return self.around.means(rows, self.stress, whole=whole)
+    def means(self, rows: Ints) -> Values:
+        """(m, d, d) mean stress around tips `rows` (m,), Pa."""
+        return self.around.means(rows, self.stress)
+
+    def phases(self) -> Values:
+        """(tips,) atan2(K_II, K_I) of tips in the plane (mixed)."""
+        fields = self.stress, self.H, self.push
+        K = self.around.intensities(fields, self.elastic, turns=self.turns)
+        return np.asarray(np.arctan2(K[:, 1], K[:, 0]))
 
     def squares(self, rows: Ints) -> Values:
         """(m,) mean square of the positive first principal stress around tips `rows`, Pa^2."""
@@ -95,6 +107,9 @@ class Sight:
         self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks)
         # of the coordinates of cells, NaN until somebody looks there
         self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
+        mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
+        every = (domain.cell_count,)
+        self._elastic = np.broadcast_to(mu, every), np.broadcast_to((lmbda + 3 * mu) / (lmbda + mu), every)
         self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))
 
     def follow(self, cut: Values) -> Tips:
@@ -105,9 +120,11 @@ class Sight:
 
     def look(self, stress: Values, psi: Values) -> Seen:
         """What is around the tips (collective)."""
-        d, cells = self._domain.dim, self.around.asked.own
-        rows, parts = np.zeros((len(cells), 2 * d * d + d)), [d * d, 2 * d * d]
-        tensor, sigma, inertia = np.split(rows, parts, axis=1)  # views
+        d, cells, tips = self._domain.dim, self.around.asked.own, self.around.tips
+        flat = d == 2
+        parts = np.cumsum([d * d, d * d, d, flat * d * d])
+        rows = np.zeros((len(cells), parts[-1] + flat * d))
+        tensor, sigma, inertia, slopes, push = np.split(rows, parts, axis=1)  # views
         tensor[:] = tensors(stress[cells], d).reshape(-1, d * d)
         assert self._stress.chi is not None
         felt = np.flatnonzero(self._stress.closes | (self._stress.chi.x.array[cells] > 0))
@@ -115,11 +132,21 @@ class Sight:
         H = self.gradients(cells, self._stress.u.x.array)
         sigma[felt] = self._eshelby(cells, tensors(stress[cells], d), psi[cells], H).reshape(-1, d * d)
         if self.motion is not None:
-            kinetic, inertia[felt] = self._moved(cells, H, *map(self._domain.with_ghosts, self.motion))
+            v, a = map(self._domain.with_ghosts, self.motion)
+            pushed = self._density[cells, None] * self._in_the_middle(cells, a)
+            kinetic, inertia[felt] = self._moved(cells, H, v, pushed)
             sigma[felt] += kinetic[:, None] * np.eye(d).ravel()
-        tensor, sigma, inertia = np.split(self.around.asked(rows), parts, axis=1)
-        disc = self._reach.disc[self.around.tips.cell]
-        return Seen(self.around, disc, tensor.reshape(-1, d, d), sigma.reshape(-1, d, d), inertia)
+        if flat:
+            slopes[felt] = H.reshape(-1, d * d)
+            if self.motion is not None:
+                push[felt] = pushed
+        tensor, sigma, inertia, slopes, push = np.split(self.around.asked(rows), parts, axis=1)
+        square, (mu, kappa) = (-1, d, d), self._elastic
+        return Seen(
+            self.around, self._reach.disc[tips.cell], tensor.reshape(square), sigma.reshape(square), inertia,
+            slopes.reshape(square) if flat else slopes, push, (mu[tips.cell], kappa[tips.cell]),
+            not self._stress.energy.linear,
+        )  # fmt: skip
 
     def means_at(self, cells: Ints, stress: Values) -> Values:
         """(n, d, d) mean stress around the centres of cells (n,) of this rank that are far from cracks, Pa, of all
@@ -152,13 +179,18 @@ class Sight:
         modulus = (share * stiff)[:, None] * ~graph.intact(cells)
         return springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
 
-    def _moved(self, cells: Ints, H: Values, v: Values, a: Values) -> tuple[Values, Values]:
-        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) in N/m^3, in the middles of cells."""
-        density, corners = self._density[cells], self._domain.cell_nodes[cells].T
-        speed, push = (sum(field.reshape(-1, self._domain.dim)[nodes] for nodes in corners) / len(corners)
-                       for field in (v, a))  # fmt: skip
-        carried = np.einsum("nik,ni->nk", H, push) - np.einsum("nik,ni->nk", self.gradients(cells, v), speed)
-        return density * np.einsum("ni,ni->n", speed, speed) / 2, density[:, None] * carried
+    def _moved(self, cells: Ints, H: Values, v: Values, push: Values) -> tuple[Values, Values]:
+        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) in N/m^3, of push = rho a (n, d), in the
+        middles of cells."""
+        speed = self._in_the_middle(cells, v)
+        momentum = self._density[cells, None] * speed
+        carried = np.einsum("nik,ni->nk", H, push) - np.einsum("nik,ni->nk", self.gradients(cells, v), momentum)
+        return np.einsum("ni,ni->n", speed, momentum) / 2, carried
+
+    def _in_the_middle(self, cells: Ints, field: Values) -> Values:
+        """(n, d) of a field of nodes (nodes * d,) in the middles of cells."""
+        corners = self._domain.cell_nodes[cells].T
+        return np.asarray(sum(field.reshape(-1, self._domain.dim)[nodes] for nodes in corners) / len(corners))
 
     def gradients(self, cells: Ints, field: Values) -> Values:
         """(n, d, d) gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""

@@ -26,7 +26,7 @@ from ..strength import Strength, hashed
 from .around import local_size
 from .branching import TIPS, each, rotated, unit
 from .cutting import Cuts, cleave, fork, through_centre
-from .mixed import gain, kink, phase
+from .mixed import gain, kink
 from .neighbourhoods import Reach, Tips
 from .seen import Seen, Sight
 
@@ -174,7 +174,7 @@ class CrackTips:
         size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
         ahead, apart = np.where(mature[:, None], force, tips.point - tips.behind), APART[d] * h
         if d == 2:
-            size, turned = self._turned(seen.means(np.arange(len(tips)), whole=True), tips, force)
+            size, turned = self._turned(seen.phases(), tips, force)
             mature &= size > 0  # a force back is that of other tips in the disc
             turns, abreast = mature & np.any(turned, axis=1), np.any(tips.parts, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
@@ -196,13 +196,14 @@ class CrackTips:
         return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows], branches[rows])
 
     @staticmethod
-    def _turned(stress: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
-        """(n,) what cracks that turn release, J/m^2, and (n, 2) whither; 0 where nothing lies behind.
+    def _turned(psi: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
+        """(n,) what cracks under K_I and K_II of phase `psi` (n,) release as they turn, J/m^2, and (n, 2) whither; 0
+        where nothing lies behind.
 
         Of the force that along the crack: the stress along its sides, and the wave in it, push across it besides.
         """
         tangent, abreast = unit(tips.point - tips.behind), np.any(tips.parts, axis=1)
-        psi = np.where(abreast, 0.0, phase(stress, tangent))
+        psi = np.where(abreast, 0.0, psi)
         straight = each(force, tips.ahead, tangent) * gain(psi)
         turned = np.where(abreast[:, None], tips.parts, rotated(tangent, kink(psi)))
         return np.where(np.any(tangent, axis=1), straight, np.linalg.norm(force, axis=1)), turned
