@@ -29,6 +29,7 @@ class _Builders(Mapping[str, type[Builder]]):
         "cylinder": "cylinder.Cylinder",
         "disk": "cylinder.Disk",
         "figure": "figure.Figure",
+        "l-panel": "l_panel.LPanel",
         "loaf": "loaf.Loaf",
         "notched-bar": "notched_bar.NotchedBar",
         "notched-plate": "notched_plate.NotchedPlate",

@@ -416,8 +416,18 @@ def test_section_of_experiments() -> None:
         records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
     records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
     (section,) = experiments.sections(records)
-    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 5]
+    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 6]
     every, spreads = section.tables
     assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
     assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))
     assert [series.style for series in section.plots[0].series] == ["line", "line", "line", "reference"]
+
+
+def test_a_measured_curve_lies_beside_the_runs() -> None:
+    """Its greatest load is the reference's, and three panels 5 % above it are within a tenth."""
+    panel, (way, load) = experiments.BY_CASE["l-panel"], published.MEASURED["l-panel"]
+    assert max(load) == pytest.approx(panel.peak, rel=1e-3) and sorted(way) == list(way)
+    figures = {"peak": 1.05 * panel.peak, "curve": [[0.0, 1e-3], [0.0, panel.peak]]}
+    records = [record("l-panel", f"{h}", 1, figures=figures, settings={"h": h}) for h in panel.sizes[1]]
+    (section,) = experiments.sections(records)
+    assert section.claims[-1].holds and section.plots[0].series[-1].y == load

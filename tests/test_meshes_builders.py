@@ -38,6 +38,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("notched-bar", {"thickness": 0.0}),
     ("notched-bar", {"thickness": 0.0, "notch": "U", "span": 0.0}),
     ("notched-bar", {"thickness": 0.0, "notch": "slit", "refined": 0.004}),
+    ("l-panel", {}),
+    ("l-panel", {"thickness": 0.1, "h": 0.05, "h_corner": 0.03}),
     ("notched-plate", {}),
     ("notched-plate", {"thickness": 0.004, "h": 0.003, "h_tip": 0.001}),
     ("plate-hole", {}),
@@ -256,6 +258,15 @@ def test_slit_area(name: str) -> None:
     assert facet_measures(mesh.points, mesh.facet_groups["notch"]).sum() == pytest.approx(length, rel=1e-9)
 
 
+def test_an_l_is_three_quarters_of_a_square() -> None:
+    """And its inner corner and the seat are nodes."""
+    mesh = BUILDERS["l-panel"](seat=0.04).build()
+    assert volume(mesh) == pytest.approx(0.75 * 0.25, rel=1e-12)
+    assert facet_measures(mesh.points, mesh.facet_groups["corner"]).sum() == pytest.approx(0.5, rel=1e-9)
+    for wanted in ([0.25, 0.25], [0.46, 0.25]):
+        assert np.linalg.norm(mesh.points - wanted, axis=1).min() < 1e-12
+
+
 def test_cells_are_fine_ahead_of_the_tip_only() -> None:
     mesh = BUILDERS["notched-plate"](h=0.002, h_tip=0.0005, refined=0.02).build()
     middles = mesh.points[mesh.cells].mean(axis=1)
@@ -464,6 +475,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("notched-bar", {"notch": "W"}, "notch = 'W' is not one of V, U, slit"),
     ("notched-plate", {"notch_length": 0.2}, "notch_length = 0.2 must be less than length = 0.1"),
     ("notched-plate", {"notch_position": 0.04}, "does not lie within height = 0.04"),
+    ("l-panel", {"seat": 0.3}, "seat = 0.3 must be less than half of size = 0.5"),
     ("notched-plate", {"notch_width": 0.0}, "notch_width = 0.0 must be a positive number"),
     ("notched-plate", {"thickness": -1.0}, "thickness = -1.0 must be zero or a positive number"),
     ("disk", {"arc": 180.0}, "arc = 180.0 must be at least 0 and less than 180 degrees"),

@@ -38,6 +38,7 @@ COARSE = {
     "izod": ["mesh.h=0.002", "mesh.h_notch=0.0006"],
     "jelly-figure": ["mesh.h=0.015"],
     "kalthoff": ["mesh.h=0.005"],
+    "l-panel": ["mesh.h=0.1", "mesh.h_corner=0.05"],
     "loaf": ["mesh.h=0.02"],
     "notched-bar": ["mesh.h=0.002", "mesh.h_notch=0.0003"],
     "notched-shear": ["mesh.h=0.0001"],
