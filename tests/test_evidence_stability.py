@@ -379,6 +379,14 @@ def test_the_second_peak_is_the_top_of_the_longest_rise_after_the_first() -> Non
     assert (found["peak"], found["at"], found["second"], found["last"], found["travel"]) == (10.0, 1.0, 7.0, 1.0, 8.0)
     assert found["plateau"] == 6.5  # of the ways 5 to 9: 3, 7, 6.5, 6.9, 1
     assert max(found["curve"][1]) == 10.0 and len(found["curve"][0]) == 10
+    held = experiments.figures(
+        rows | {"reaction_striker_y": load, "motion_striker_y": np.arange(1.0, 11.0)}, "striker", "y"
+    )
+    assert (held["at"], held["travel"], held["curve"][0][0]) == (
+        3.0,
+        10.0,
+        1.0,
+    )  # a grip that has moved in the first row
 
 
 def test_angle_of_kalthoffs_crack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

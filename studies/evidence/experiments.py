@@ -225,10 +225,7 @@ def _of_bar(run: Path) -> Record:
 def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
     """Peak and way there; `second`: the load that the body comes up to after the first peak, which is inertia where it
     is struck; `plateau`: the median over the second half of the way; what is left; what has been absorbed."""
-    held = f"reaction_{pushed}_{axis}"
-    load = np.abs(rows[held if held in rows else f"contact_{pushed}_{axis}"])
-    way = np.abs(rows[f"motion_{pushed}_{axis}"])
-    touched = float(way[np.flatnonzero(load)[0]]) if load.any() else 0.0
+    load, way, touched = course(rows, pushed, axis)
     return {
         "peak": float(load.max()),
         "at": float(way[load.argmax()]) - touched,
@@ -238,8 +235,18 @@ def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
         "absorbed": float(rows[f"work_{pushed}" if f"work_{pushed}" in rows else "external_work"][-1]),
         "travel": float(way[-1]) - touched,
         "pieces": float(rows["pieces"][-1]),
-        "curve": [[float(value) for value in each] for each in thinned(way - way[0], load)],
+        "curve": [[float(value) for value in each] for each in thinned(way, load)],
     }
+
+
+def course(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, Values, float]:
+    """Load, N, and way of what is pushed, m, and its way when it touches: of a grip 0, of an obstacle as far as it is
+    from where it was at first."""
+    held, way = f"reaction_{pushed}_{axis}", np.abs(rows[f"motion_{pushed}_{axis}"])
+    if held in rows:
+        return np.abs(rows[held]), way, 0.0
+    load, way = np.abs(rows[f"contact_{pushed}_{axis}"]), way - way[0]
+    return load, way, float(way[np.flatnonzero(load)[0]]) if load.any() else 0.0
 
 
 def second_peak(load: Values) -> float:
