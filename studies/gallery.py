@@ -104,6 +104,7 @@ ENTRIES = (
     one("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9 --zoom 1.6"),
     one("rigid-wall", "A wall of adobe as rigid bodies.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor --zoom 1.3"),
     one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
+    one("rigid-rods", "Rods of steel, bent and dented.", "--sheet 0,2,-1 --floor --view 0.25,-1.3,0.45 --zoom 1.9"),
     one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor --zoom 1.3"),
     one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor --zoom 1.25"),
     one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor --zoom 1.2"),

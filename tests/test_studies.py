@@ -49,6 +49,7 @@ COARSE = {
     "rigid-boats": ["mesh.h=0.5", "body.0.copies=[1,1,2]"],
     "rigid-ornament": ["mesh.h=0.01"],
     "rigid-ornaments": ["mesh.h=0.012", "body.0.copies=[1,2,1]"],
+    "rigid-rods": ["mesh.h=0.01"],
     "rigid-slab": ["mesh.h=0.025"],
     "rigid-vase": ["mesh.h=0.015"],
     "rigid-wall": ["mesh.h=0.15"],

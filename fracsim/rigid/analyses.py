@@ -24,14 +24,15 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Strike:
-    """On the body of a name: forces (k, 3) on circles of radii (k,) about points (k, 3) at rest, N and m; at most
-    `share` surfaces may open."""
+    """On the body of a name: forces (k, 3) on circles of radii (k,) about points (k, 3) at rest, N and m, that have an
+    `energy` to spend, J; at most `share` surfaces may open."""
 
     name: int
     points: Values
     force: Values
     radius: Values
     share: int = 0
+    energy: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -129,4 +130,4 @@ def _gathered(comm: MPI.Comm, bodies: Copies, strikes: list[Strike]) -> list[Any
 
 def opened_by(bodies: Copies, strike: Strike) -> Opened:
     """What a strike opens. Raises NotConverged."""
-    return bodies.opened(strike.name, strike.points, strike.force, strike.radius, strike.share)
+    return bodies.opened(strike.name, strike.points, strike.force, strike.radius, strike.share, strike.energy)

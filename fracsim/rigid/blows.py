@@ -52,6 +52,14 @@ class Strain:
     speed: float = 0.0
     time: float = 0.0
 
+    def energy(self, met: float) -> float:
+        """J that it may spend: what came in where the body met something; of a blow that was passed on that of its
+        greatest impulse at its speed; of a load no end."""
+        if not self.speed:
+            return float("inf")
+        greatest = self.time * float(np.linalg.norm(self.force, axis=1).max())
+        return met or greatest * self.speed / 2
+
 
 @dataclass
 class _Known:

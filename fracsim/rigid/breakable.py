@@ -193,6 +193,7 @@ class Breakable:
     def loads(self, piece: int, points: Values, force: Values, radius: Values | None = None) -> PointLoads:
         """Forces (k, d) at points (k, d) of a piece at rest, on circles of radii (k,), m; None: at points."""
         if radius is not None:
+            radius = radius if self._flow is None else np.maximum(radius, self._flow.pressed(force))
             points, force = patches(points, force, radius, self._domain.mean_edge)
         cells = self._domain.cell_nodes[self.shares(piece) > 0].astype(np.int64)
         return point_loads(self._domain.nodes, cells, points, force)
@@ -233,12 +234,12 @@ class Breakable:
         """Surfaces that may still open; 1 of what flows, for one blow after the other does."""
         return int(self._flow is not None) if self._criterion is None else self._criterion.left
 
-    def opened(self, name: int, loads: PointLoads, share: int) -> Opened:
-        """What a strike opens that may start `share` surfaces, or what shape it leaves; whether they count is up to
-        `take`. Raises NotConverged."""
+    def opened(self, name: int, loads: PointLoads, share: int, energy: float = np.inf) -> Opened:
+        """What a strike opens that may start `share` surfaces, or what shape it leaves with an energy to spend, J;
+        whether they count is up to `take`. Raises NotConverged."""
         criterion = self._criterion
         if criterion is None:
-            return self._dented(name, loads)
+            return self._dented(name, loads, energy)
         before, starts, passes, iterations = self.graph.broken.copy(), criterion.starts, self.passes, self.iterations
         criterion.kept_back = criterion.left - share
         try:
@@ -250,12 +251,12 @@ class Breakable:
         self.passes, self.iterations = passes, iterations
         return Opened(name, self.graph.edge_keys(edges), criterion.cut[edges], more, *done)
 
-    def _dented(self, name: int, loads: PointLoads) -> Opened:
+    def _dented(self, name: int, loads: PointLoads, energy: float) -> Opened:
         """What shape a strike leaves. Raises NotConverged."""
         assert self._flow is not None
         piece, iterations, passes = self.piece_of(name), self.iterations, self.passes
         body, stress = self._free(piece), self.stress(piece, loads)
-        shape = self._flow(body, stress)  # type: ignore[arg-type]
+        shape = self._flow(body, stress, energy)  # type: ignore[arg-type]
         self.iterations += body.iterations if shape is not None else 0
         done = self.passes - passes, self.iterations - iterations
         self.passes, self.iterations = passes, iterations

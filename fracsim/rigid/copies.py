@@ -92,13 +92,16 @@ class Copies:
         each = self.copy(number)
         return each.may_break(each.piece_of(node), force)
 
-    def opened(self, name: int, points: Values, force: Values, radius: Values, share: int) -> Opened:
-        """What forces (k, 3) on circles of radii (k,) about points (k, 3) of a body at rest open, N and m; at most
-        `share` surfaces. Whether they count is up to `take`. Raises NotConverged."""
+    def opened(
+        self, name: int, points: Values, force: Values, radius: Values, share: int, energy: float = np.inf
+    ) -> Opened:
+        """What forces (k, 3) on circles of radii (k,) about points (k, 3) of a body at rest open, N and m, at most
+        `share` surfaces, or the shape that they leave for an energy, J. Whether they count is up to `take`. Raises
+        NotConverged."""
         number, node = divmod(name, self.nodes)
         each, turn = self.copy(number), self.poses.turn[number]
         inside = (points - self.poses.place[number]) @ turn
-        found = each.opened(node, each.loads(each.piece_of(node), inside, force @ turn, radius), share)
+        found = each.opened(node, each.loads(each.piece_of(node), inside, force @ turn, radius), share, energy)
         return replace(found, name=name)
 
     def take(self, every: list[Opened]) -> None:

@@ -160,7 +160,7 @@ class RigidStepper:
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.names)
         clock = self.phases.add("motion", clock)
-        struck = self.analyses(self._strikes(due))
+        struck = self.analyses(self._strikes(due, touches))
         clock = self.phases.add("analysis", clock)
         broken = sum(struck.values())
         if broken:
@@ -212,10 +212,14 @@ class RigidStepper:
                 np.add.at(sums, others.owner[things[mine] - count], sign * touches.impulse[mine] / dt)
         return pushed, -np.einsum("mi,mi->m", pushed + more, others.moved(t, dt))
 
-    def _strikes(self, due: list[Strain]) -> list[Strike]:
+    def _strikes(self, due: list[Strain], touches: Touches) -> list[Strike]:
         """Those that might break a body."""
         due = [each for each in due if each.body < self.count]
-        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force, each.radius) for each in due]
+        if not due:
+            return []
+        energy = touches.energies(self.count, self._rules.restitution)
+        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force, each.radius,
+                        energy=each.energy(float(energy[each.body]))) for each in due]  # fmt: skip
         sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
         may = [self.copies.may_break(each.name, much) for each, much in zip(every, sums, strict=True)]
         return [each for each, yes in zip(every, may, strict=True) if yes]

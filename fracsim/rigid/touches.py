@@ -38,6 +38,14 @@ class Touches:
     def __len__(self) -> int:
         return len(self.first)
 
+    def energies(self, count: int, restitution: float) -> Values:
+        """(count,) J that go into the first `count` things as they meet others, J_n c / (2 + 2 e): m c^2 / 2 of two of
+        the reduced mass m. Where both are among these each has half of it; 0 of what meets nothing."""
+        both = np.stack([self.first, self.second])
+        each = np.einsum("ki,ki->k", self.impulse, self.normal) * self.closing / (2 + 2 * restitution)
+        share = each / np.maximum((both < count).sum(axis=0), 1)
+        return np.bincount(np.minimum(both, count).ravel(), np.tile(share, 2), count + 1)[:count].astype(float)
+
     def on(self, thing: int) -> tuple[Values, Values]:
         """(m, 3) points and (m, 3) impulses that one thing received."""
         first, second = self.first == thing, self.second == thing
