@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
@@ -98,3 +99,12 @@ def cut(scene: Scene, planes: list[Any]) -> None:
     assert scene.balance.stress.chi is not None and scene.solver is not None
     scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
     scene.solver.damage_changed()
+
+
+def test_a_rank_on_which_nothing_hangs_has_a_share_of_the_motions() -> None:
+    """Its rows of Z are empty."""
+    tangent = PETSc.Mat().createAIJ((6, 6))
+    tangent.setUp()
+    nodes, none = np.empty(0, np.int64), np.empty((0, 3, 6))
+    Z = loose_parts._matrix(tangent, nodes, np.empty((0, 6), np.int64), none, 6)
+    assert Z.getSize() == (6, 6) and Z.getInfo()["nz_used"] == 0

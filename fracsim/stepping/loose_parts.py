@@ -154,11 +154,11 @@ def _rigid(r: Values) -> Values:
 
 def _matrix(tangent: PETSc.Mat, nodes: Ints, columns: Ints, values: Values, width: int) -> PETSc.Mat:
     """Z (owned dofs, width) (collective)."""
-    n, d, _ = values.shape
+    d = values.shape[1]
     rows = tangent.getLocalSize()[0]
     there = np.broadcast_to((columns >= 0)[:, None], values.shape)
     lengths = np.zeros(rows, PETSc.IntType)
-    lengths[(d * nodes[:, None] + np.arange(d)).reshape(-1)] = there.reshape(n * d, -1).sum(axis=1)
+    lengths[(d * nodes[:, None] + np.arange(d)).reshape(-1)] = there.sum(axis=2).reshape(-1)
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(PETSc.IntType)
     where = np.broadcast_to(columns[:, None], values.shape)[there].astype(PETSc.IntType)
     size = ((rows, None), (None, width))
