@@ -11,7 +11,8 @@ from petsc4py import PETSc
 
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import loose_parts
+from fracsim.stepping import blocks, loose_parts
+from fracsim.stepping.newton import Solver
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 
@@ -108,3 +109,25 @@ def test_a_rank_on_which_nothing_hangs_has_a_share_of_the_motions() -> None:
     nodes, none = np.empty(0, np.int64), np.empty((0, 3, 6))
     Z = loose_parts._matrix(tangent, nodes, np.empty((0, 6), np.int64), none, 6)
     assert Z.getSize() == (6, 6) and Z.getInfo()["nz_used"] == 0
+
+
+def test_products_in_blocks_are_those_of_single_entries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar in pieces, whose matrices are made anew on the way and have entries between pieces beside those of cells:
+    CG and the finest level of multigrid multiply with blocks, to the last digits as with the tangent."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    scene, _ = shattered(0.04, 10, {}, 6)
+    solver = scene.solver
+    assert isinstance(solver, Solver) and solver._blocks is not None
+    pc = solver.snes.ksp.pc
+    assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
+    tangent = scene.balance.tangent
+    x, alone = tangent.createVecs()
+    x.setRandom()
+    by_blocks = alone.duplicate()
+    for factor in (1.0, 3.0):
+        tangent.scale(factor)
+        solver._blocks.follow()
+        tangent.mult(x, alone)
+        solver._blocks.mult(tangent, x, by_blocks)
+        by_blocks.axpy(-1.0, alone)
+        assert by_blocks.norm() < 1e-13 * alone.norm()

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
+from .blocks import Blocks, worth_it
 from .factors import FACTORISED, SOONER_THAN_GMRES, Factors
 from .forcing import Forcing, Sparing
 from .one_solve import Ending, is_linear
@@ -73,6 +74,8 @@ class Solver:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance = balance
         self.linear_failures = 0
+        self._blocks: Blocks | None = None  # of the tangent
+        self._products: PETSc.Mat | None = None  # a matrix of them
         self._down: Downhill | None = None  # what the SNES of the last attempt goes by
         chosen = _chosen(balance, given)
         self._options = OptionSet(chosen)
@@ -81,6 +84,7 @@ class Solver:
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(lambda _, x, b: balance.free_residual(x, b), balance.vector)
         self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
+        self._by_blocks = chosen["pc_type"] == "gamg"
         self._take_tangent()
         self._x, self._correction = balance.vector.duplicate(), balance.vector.duplicate()
         self._configure(given)
@@ -116,15 +120,25 @@ class Solver:
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
         tangent = self._operator = self.balance.tangent
+        self._use_blocks()
         if self.balance.is_incomplete:
             from .condensed import Condensed
 
             parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
-            self._operator = Condensed(tangent, parts, springs).matrix()
+            self._operator = Condensed(self._operator, parts, springs).matrix()
         for snes in self._made:
             snes.setJacobian(lambda _, x, A, P: self._linearise(P), self._operator, tangent)
         if self._near_null is not None:
             tangent.setNearNullSpace(self._near_null)
+
+    def _use_blocks(self) -> None:
+        """Multiply with a copy of the tangent in blocks, where that is quicker."""
+        if self._blocks is not None:
+            self._blocks.forget()
+            self._blocks = self._products = None
+        if self._by_blocks and worth_it(self.balance.tangent):
+            self._blocks = Blocks(self.balance.tangent)
+            self._operator = self._products = self._blocks.matrix()
 
     def _shrink(self) -> None:
         """Where the body was damaged, see whether a smaller tangent does (collective)."""
@@ -320,7 +334,8 @@ class Solver:
         if self._asked:
             little = min(little, self._asked * self.balance.vector.norm())
         self._assemble_tangent(tangent)
-        solved = ending.solve(tangent, preconditioner.serving, self.balance.vector, self._correction, little)
+        products = self._products or tangent
+        solved = ending.solve(products, tangent, preconditioner.serving, self.balance.vector, self._correction, little)
         preconditioner.its = ending.to_share(float(self.snes.ksp.rtol))
         return (ending.left, ending.its) if solved else None
 
@@ -391,11 +406,13 @@ class Solver:
     def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
         """K and what its preconditioner is due."""
         self._assemble(tangent)
+        if self._blocks is not None:
+            self._blocks.follow()
         if (self.balance.low_rank or self.balance.springs) and self.snes.ksp.getType() == "preonly":
             self.snes.ksp.setType("gmres")  # factors are of the rest
         if self.balance.pattern_changed:
             self._preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
-        self._preconditioner.refresh(tangent)
+        self._preconditioner.refresh(tangent, self._products)
         self._hold()
 
     def _hold(self) -> None:
@@ -469,6 +486,8 @@ class Solver:
             self._downhill.destroy()
         if self._ending is not None:
             self._ending.destroy()
+        if self._blocks is not None:
+            self._blocks.forget()
         if self._near_null is not None:
             self._near_null.destroy()
 

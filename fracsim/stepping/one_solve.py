@@ -48,12 +48,12 @@ class Ending:
         self._most = most
         self.its, self.left = 0, 0.0
 
-    def solve(self, K: PETSc.Mat, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec, little: float) -> bool:
-        """K x = b down to |r| = `little`, N; whether it is solved (collective)."""
+    def solve(self, A: PETSc.Mat, K: PETSc.Mat, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec, little: float) -> bool:
+        """K x = b down to |r| = `little`, N, `A` being K for products; whether it is solved (collective)."""
         ksp = self._ksp
         pc.setReusePreconditioner(True)
         ksp.setPC(pc)
-        ksp.setOperators(K)
+        ksp.setOperators(A, K)
         ksp.setTolerances(rtol=0.0, atol=little, max_it=self._most)
         ksp.solve(b, x)
         self.its, self.left = ksp.its, ksp.norm

@@ -90,8 +90,9 @@ class Preconditioner:
         if self._broke > MANY * self._nodes:
             self.due = max(self.due, Due.REFRESH)
 
-    def refresh(self, tangent: PETSc.Mat) -> None:
-        """Set up what is due for a tangent that is solved with next. Done here, since SNES knows a fixed lag only."""
+    def refresh(self, tangent: PETSc.Mat, products: PETSc.Mat | None = None) -> None:
+        """Set up what is due for a tangent that is solved with next; `products`: what it is multiplied with, if that is
+        another matrix. Done here, since SNES knows a fixed lag only."""
         self.look()
         self._count()
         ksp = self._ksp
@@ -103,7 +104,8 @@ class Preconditioner:
             self._fresh_its = 0
         ksp.setPC(self.pc)
         self.pc.setReusePreconditioner(False)
-        ksp.setOperators(tangent)
+        self.pc.setUseAmat(products is not None)
+        ksp.setOperators(products or tangent, tangent)
         ksp.setUp()
         self.due, self._broke, self._extra = Due.NOTHING, 0, 0
         if self._sees_to_parts:

@@ -22,6 +22,7 @@ from fracsim.mesh.parts import parts_of_nodes
 from fracsim.mesh.pieces import find_pieces
 from fracsim.mesh.ranks import total
 from fracsim.scene import Scene, build_scene
+from fracsim.stepping import blocks
 from fracsim.stepping.loose_parts import loose_parts
 from fracsim.stepping.state import State
 
@@ -418,6 +419,14 @@ def by_rows() -> Found:
     return {"broken-by-rows": found["block-broken"], "u-by-rows": found["block-u"]}
 
 
+def in_blocks() -> Found:
+    """Edges that the block breaks where its tangent is multiplied with in blocks."""
+    small, blocks.SMALL = blocks.SMALL, 0
+    found = run("block")
+    blocks.SMALL = small
+    return {"broken-in-blocks": found["block-broken"], "u-in-blocks": found["block-u"]}
+
+
 def compared(folder: Path) -> Found:
     """All checks, with the files of surfaces in a folder."""
     found: Found = {}
@@ -432,4 +441,4 @@ def compared(folder: Path) -> Found:
         found |= run(name, folder if name in SURFACES else None)
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
-    return found | dead_cells() | hanging() | squeezed() | by_rows()
+    return found | dead_cells() | hanging() | squeezed() | by_rows() | in_blocks()
