@@ -17,7 +17,7 @@ from fracsim.mesh.simplices import local_edges, node_groups
 from fracsim.meshes.builders.box import lattice
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.studies.evidence import __main__ as program
-from fracsim.studies.evidence import faces, growth, ladder
+from fracsim.studies.evidence import faces, growth, ladder, solvers
 from fracsim.studies.evidence.section import Point, Section, fitted_order, pareto_front, recommended, timed
 from fracsim.studies.evidence.trial import Trial
 from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
@@ -280,3 +280,15 @@ def test_a_section_that_cannot_be_made_says_so(tmp_path: Path) -> None:
     path = program.write_evidence(tmp_path, {"growth": [{"group": "growth"}]}, {"growth": broken})
     (section,) = json.loads(path.read_text())["groups"]["growth"]["sections"]
     assert "KeyError: 'step'" in section["text"]
+
+
+def test_the_default_solver_is_held_against_the_better_of_two() -> None:
+    def record(name: str, default: float) -> dict[str, Any]:
+        counts = {"newton": 1, "krylov": 9, "apart": 0.0}
+        seconds = {"default": default, "CG": 1.0, "factors": 2.0}
+        figures = {"dofs": 10} | {way: counts | {"seconds": each} for way, each in seconds.items()}
+        return {"settings": {"of": name}, "figures": figures, "outcome": "done", "message": ""}
+
+    claim = solvers.section([record("a", 1.2), record("b", 0.9)]).claims[0]
+    assert claim.holds and claim.measured.startswith("1.20 at most (a), of 2")
+    assert solvers.section([record("a", 1.2), record("b", 1.4)]).claims[0].holds is False

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .blocks import Blocks, worth_it
-from .factors import FACTORISED, SOONER_THAN_GMRES, Factors
+from .factors import FACTORISED, MANY, SOONER_THAN_GMRES, Factors
 from .forcing import Forcing, Sparing
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
@@ -109,8 +109,14 @@ class Solver:
         self._forcing = None if self._asked else _forcing(balance, chosen)
         self._small: float | None = None  # of the last tangent (Balance.assemble_tangent)
         self._first = self._last_little = 0.0
-        self._factors = Factors(self._preconditioner)
+        self._factors = Factors(
+            self._preconditioner, symmetric=balance.symmetric, dofs=balance.vector.getSize(), dim=balance.domain.dim
+        )
         self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
+        own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
+        self._may_prefer = own and self._may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
+        self._preferred = False  # whether they do because iterations were dear, not because they failed
+        self._watches, self._dear = self._may_prefer, False  # whether a solve stops where it gets dear, and has
 
     def _loosen(self, body: PETSc.PC) -> LooseParts | None:
         from .loose_parts import loose_parts
@@ -169,20 +175,58 @@ class Solver:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution.
 
         Where iterations fail the system is factorised. The next solves start with factors then: as many as the spell
-        says, which doubles each time that iterations fail again, and is short again once they do not.
+        says, which doubles each time that iterations fail again, and is short again once they do not. So they do where
+        iterations were dearer than factors, as long as those find a balance that is stable.
         """
         if self._with_factors:
             self._with_factors -= 1
-            return self._attempt_directly(guess)
+            result = self._attempt_directly(guess)
+            if not self._preferred or (result.converged and self._factors.positive):
+                return result
+            self._with_factors = 0
         result = self._attempt_iteratively(guess)
-        if not self._misled(result):
-            self._spell = FIRST_SPELL
-            self._factors.forget()
-        elif self._may_factorise():
+        if self._dear:
+            return self._go_on_directly(guess)
+        if self._misled(result) and self._may_factorise():
             result = self._attempt_directly(guess)
             if result.converged:
-                self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+                self._take_factors(preferred=False)
+        elif self._was_dear(result):
+            self._take_factors(preferred=True)
+        elif not self._misled(result):
+            self._spell = FIRST_SPELL
+            self._factors.forget()
         return result
+
+    def _go_on_directly(self, guess: Values) -> SolveResult:
+        """From where iterations have become dear; all the way by them where factors find nothing that is stable."""
+        self._dear, krylov = False, self.snes.getLinearSolveIterations()
+        tangents = self._tangents_of_factors(self.snes.its)
+        result = self._attempt_directly(None)
+        if result.converged and self._factors.positive:
+            if krylov > self._factors.worth * tangents:
+                self._take_factors(preferred=True)
+            return result
+        self._watches = False
+        result = self._attempt_iteratively(guess)
+        self._watches = self._may_prefer
+        return result
+
+    def _take_factors(self, *, preferred: bool) -> None:
+        """For the next spell of solves."""
+        self._preferred = preferred
+        self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+
+    def _was_dear(self, result: SolveResult) -> bool:
+        """Whether factors would have cost less than the iterations of a solve."""
+        dear = result.krylov > self._factors.worth * self._tangents_of_factors(result.newton)
+        return self._may_prefer and result.converged and dear
+
+    def _tangents_of_factors(self, newton: int) -> int:
+        """How many a solve of so many Newton iterations would take by factors. Without inertia moduli made positive
+        take several times as many as exact ones."""
+        made_positive = self.snes is not self._first_choice[0] and not self.balance.scheme.inertia
+        return min(newton, MANY) if made_positive else max(newton, 1)
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)
@@ -246,9 +290,14 @@ class Solver:
         dofs = self.balance.vector.getSize()
         return self._iterative and dofs <= most and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
-    def _attempt_directly(self, guess: Values) -> SolveResult:
+    def _attempt_directly(self, guess: Values | None) -> SolveResult:
+        watched, self._watches = self._watches, False
         with self._factors.of(self.snes.ksp):
-            return self._attempt(guess)
+            result = self._attempt(guess)
+            if result.newton and result.converged and self.snes.ksp.getType() == "preonly":
+                self._factors.learn(self.snes.ksp)
+        self._watches = watched
+        return result
 
     def _misled(self, result: SolveResult) -> bool:
         """Whether it was the linear solves that failed: outright, or by what they found.
@@ -460,7 +509,14 @@ class Solver:
         reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norms[2]):
             return int(reason.DIVERGED_FNORM_NAN)
-        return int(reason.CONVERGED_FNORM_RELATIVE if self._is_small(norms[2], its) else reason.ITERATING)
+        if self._is_small(norms[2], its):
+            return int(reason.CONVERGED_FNORM_RELATIVE)
+        krylov = snes.getLinearSolveIterations()
+        factors = self._factors
+        if self._watches and its and krylov > max(factors.dear, factors.worth * self._tangents_of_factors(its)):
+            self._dear = True
+            return int(reason.DIVERGED_INNER)
+        return int(reason.ITERATING)
 
     def _is_small(self, norm: float, its: int) -> bool:
         """Whether that is so of |r| after so many iterations (collective)."""

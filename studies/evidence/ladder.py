@@ -23,7 +23,7 @@ from typing import Any
 from ...study import Study
 from ..bench import study as bench_study
 from ..bench import timed
-from . import faces
+from . import faces, solvers
 from .section import Cell, Claim, Plot, Section, Series, Table
 from .trial import Trial
 
@@ -108,8 +108,8 @@ def rungs(n: int) -> dict[str, Rung]:
 
 
 def trials() -> list[Trial]:
-    """Every rung at 24k tetrahedra, and at 192k in full; and what touches flat."""
-    return [*(_trial(name, n) for n in (SHORT, LONG) for name in rungs(n)), *faces.trials()]
+    """Every rung at 24k tetrahedra, and at 192k in full; what touches flat; and solvers."""
+    return [*(_trial(name, n) for n in (SHORT, LONG) for name in rungs(n)), *faces.trials(), *solvers.trials()]
 
 
 def _trial(name: str, n: int) -> Trial:
@@ -285,9 +285,9 @@ def _inside(module: str, part: str) -> bool:
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Table, bars of ratios, and the claims; and what touches flat."""
-    touching = [record for record in records if record["case"] == "faces"]
-    records = [record for record in records if record["case"] != "faces"]
+    """Table, bars of ratios, and the claims; what touches flat; and solvers."""
+    touching, solved = ([record for record in records if record["case"] == case] for case in ("faces", "solvers"))
+    records = [record for record in records if record["case"] not in ("faces", "solvers")]
     columns = (
         "cells along 1 m", "scene", "cells", "s a step", "±", "compared with", "ratio", "± ", "Newton", "frame s",
         "start-up s", "memory bytes/cell", "fields", "field bytes/cell", "modules",
@@ -314,7 +314,8 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     table = Table("ladder", "What each feature costs", columns, rows)
     title = "Ladder: the cost of what is used, and of what is not"
     first = Section(title, text, _claims(records), (table,), (plot,))
-    return [first, faces.section(touching)] if touching else [first]
+    others = [part.section(found) for part, found in ((faces, touching), (solvers, solved)) if found]
+    return [first, *others]
 
 
 def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:

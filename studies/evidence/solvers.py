@@ -1,0 +1,153 @@
+"""The solver that nobody chose beside CG with multigrid throughout and factors throughout: ten quasi-static studies.
+
+    python -m fracsim.studies.evidence.solvers NAME -o figures.json
+
+Processor seconds in the steps, set-up included, each way in turn; medians where a run is short.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from .precision import brazilian
+from .precision.common import QUIET
+from .precision.solver import DIRECT
+from .section import Claim, Section, Table
+from .trial import Trial
+
+LIMIT, SHORT, REPEATS = 1.3, 2.0, 3  # of the best; s; runs of what takes less
+WAYS: dict[str, dict[str, Any]] = {"default": {}, "CG": {"ksp_type": "cg", "pc_type": "gamg"}, "factors": DIRECT}
+STEEL = {"energy": "linear", "young": 210e9, "poisson": 0.3, "density": 7850.0}
+RUBBER = {"energy": "neo-hookean", "young": 1e6, "poisson": 0.35, "density": 1000.0}
+
+
+def loaded(size: list[float], h: float, material: dict[str, Any], load: list[float], steps: int, order: int = 1) -> Any:
+    """A box (m) held at x = 0, its other end under a traction (Pa) that grows over the steps."""
+    value = [[0.0] * len(size), load]
+    return {
+        "title": "a box under a traction",
+        "mesh": {"builder": "box", "size": size, "h": h, "order": order},
+        "material": material,
+        "boundary": [
+            {"on": "left", "fix": "xyz"[: len(size)]},
+            {"on": "right", "traction": {"time": [0.0, 1.0], "value": value}},
+        ],
+        "time": {"scheme": "quasi-static", "step": 1 / steps, "end": 1.0},
+        "output": QUIET,
+    }
+
+
+CASES: dict[str, Any] = {
+    "plane, slender": loaded([1.0, 0.02], 0.00125, STEEL, [0.0, -1e4], 5),
+    "plane, nearly incompressible": loaded([2.0, 1.0], 1 / 40, RUBBER | {"poisson": 0.4999}, [1e5, -2e4], 5),
+    "plane, large": loaded([2.0, 1.0], 1 / 160, RUBBER, [1e5, -2e4], 5),
+    "plane, breaking": brazilian.split(16, 0.0),
+    "slender": loaded([1.0, 0.05, 0.05], 0.0125, RUBBER, [0.0, 0.0, -20.0], 10),
+    "compact": loaded([1.0, 1.0, 1.0], 1 / 12, RUBBER, [1e5, 0.0, -2e4], 5),
+    "nearly incompressible": loaded([2.0, 1.0, 1.0], 1 / 8, RUBBER | {"poisson": 0.499}, [1e5, 0.0, -2e4], 5),
+    "quadratic": loaded([1.0, 0.1, 0.1], 0.025, STEEL, [0.0, 0.0, -1e5], 5, order=2),
+    "thin": loaded([1.0, 1.0, 0.01], 0.02, STEEL, [0.0, 0.0, -1e3], 5),
+    "small": loaded([0.4, 0.1, 0.1], 0.034, RUBBER, [1e4, 0.0, -1e3], 20),
+}
+
+
+def trials() -> list[Trial]:
+    """One for each study."""
+    script = "fracsim.studies.evidence.solvers"
+    return [
+        Trial("ladder", "solvers", name.replace(", ", "-").replace(" ", "-"), script=(script, name),
+              settings={"of": name}, limit=300.0)
+        for name in CASES
+    ]  # fmt: skip
+
+
+def measured(name: str) -> dict[str, Any]:
+    """Seconds and iterations of each way, and how far the displacement is from that of factors, of the greatest."""
+    runs: dict[str, list[dict[str, Any]]] = {way: [_run(name, way)] for way in WAYS}
+    if min(each[0]["seconds"] for each in runs.values()) < SHORT:
+        for _ in range(REPEATS - 1):
+            for way, each in runs.items():
+                each.append(_run(name, way))
+    exact = runs["factors"][0]["u"]
+    return {
+        "dofs": len(exact),
+        **{way: {key: each[0][key] for key in ("newton", "krylov")} | {
+            "seconds": median(run["seconds"] for run in each),
+            "apart": float(np.abs(each[0]["u"] - exact).max() / np.abs(exact).max()),
+        } for way, each in runs.items()},
+    }  # fmt: skip
+
+
+def _run(name: str, way: str) -> dict[str, Any]:
+    from mpi4py import MPI
+
+    from ...run import Run
+    from ...scene import build_scene
+    from ...study.file import validate
+    from .results import history
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(build_scene(MPI.COMM_WORLD, validate(CASES[name] | {"solver": WAYS[way]}, name)), Path(folder))
+        began = time.process_time()
+        while not run.scene.ended(run.state):
+            run.step()
+        seconds, rows = time.process_time() - began, history(Path(folder))
+        run.scene.destroy()
+    counts = {key: int(rows[f"{key}_its"].sum()) for key in ("newton", "krylov")}
+    return {"seconds": seconds, "u": run.state.u.copy(), **counts}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", choices=CASES)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.write_text(json.dumps(measured(given.name), indent=1) + "\n")
+
+
+# --- the section ----------------------------------------------------------------------------------------------------
+
+
+def section(records: list[dict[str, Any]]) -> Section:
+    """Table and claim."""
+    done = [(record["settings"]["of"], record["figures"]) for record in records if record["figures"]]
+    share = {name: figures["default"]["seconds"] / _best(figures) for name, figures in done}
+    text = (
+        "Quasi-static studies, processor seconds in the steps (medians of three where a run is short). CG: with "
+        "multigrid, throughout. Factors: of MUMPS, throughout. The default begins with CG and goes on with factors "
+        "where they cost less than the iterations did, as their operations tell once they have been made, "
+        "only where there are at most 100,000 dofs in the plane, 10,000 in space."
+    )
+    worst = max(share, key=share.__getitem__, default="")
+    told = f"{share[worst]:.2f} at most ({worst}), of {len(share)} studies" if share else "nothing"
+    claim = Claim(f"The default takes at most {LIMIT:g} times the better of CG and factors", told,
+                  all(each <= LIMIT for each in share.values()) if share else None)  # fmt: skip
+    columns = ("study", "dofs", *(f"{way}, s" for way in WAYS), "default over best",
+               *(f"{way}: Newton / Krylov" for way in WAYS), "default apart from factors", "outcome")  # fmt: skip
+    rows = tuple(_row(record, share.get(record["settings"]["of"])) for record in records)
+    return Section("The solver that nobody chose", text, (claim,), (Table("ladder-solvers", "Solvers", columns, rows),))
+
+
+def _best(figures: dict[str, Any]) -> float:
+    return float(min(figures[way]["seconds"] for way in ("CG", "factors")))
+
+
+def _row(record: dict[str, Any], share: float | None) -> tuple[Any, ...]:
+    name, figures = record["settings"]["of"], record["figures"]
+    if not figures:
+        return (name, *[None] * 9, f"{record['outcome']}: {record['message']}")
+    seconds = (figures[way]["seconds"] for way in WAYS)
+    counts = (f"{figures[way]['newton']} / {figures[way]['krylov']}" for way in WAYS)
+    return (name, figures["dofs"], *seconds, share, *counts, figures["default"]["apart"], record["outcome"])
+
+
+if __name__ == "__main__":
+    main()

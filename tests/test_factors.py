@@ -1,0 +1,84 @@
+"""Factors in place of iterations that are dearer: fewer of those, the same answer, and no balance that is unstable."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fracsim.studies.evidence import solvers
+from support.reference import dense_tangent
+from support.scenes import displacement, make_scene
+
+TABLES = ("mesh", "material", "boundary", "time")
+
+
+def pressed(**more: Any) -> Any:
+    """A slender column, a little aside of straight, pressed together by 0.3 of its length in one step."""
+    return make_scene(
+        mesh={"builder": "box", "size": [0.1, 1.0], "h": 0.05, "pattern": "structured"},
+        material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},
+        load={"gravity": [1.0, 0.0]},
+        boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": [0.0, -0.3]}],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0, "adapt": False},
+        **more,
+    )
+
+
+def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
+    """Nearly incompressible, in the plane: the same displacement, a fifth of the iterations. Who asks for CG has it."""
+    found = {}
+    for way, solver in solvers.WAYS.items():
+        study = solvers.loaded([2.0, 1.0], 0.1, solvers.RUBBER | {"poisson": 0.4999}, [1e5, -2e4], 2)
+        tight = solver | {"snes_rtol": 1e-9}
+        scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=tight)
+        krylov = sum(walk.advance().solve.krylov for _ in range(2))
+        found[way] = krylov, displacement(scene, walk)
+        scene.destroy()
+    assert found["default"][0] < found["CG"][0] / 5
+    for way in ("default", "CG"):
+        assert np.abs(found[way][1] - found["factors"][1]).max() < 1e-5 * np.abs(found["factors"][1]).max()
+
+
+def test_a_body_that_cg_is_cheap_for_keeps_it() -> None:
+    """Compact, in space: of the answer that CG gives not a bit is other."""
+    study = solvers.loaded([1.0] * 3, 0.25, solvers.RUBBER, [1e5, 0.0, -2e4], 2)
+    found = []
+    for solver in (solvers.WAYS["default"], solvers.WAYS["CG"]):
+        scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=solver)
+        found.append([walk.advance().solve.krylov for _ in range(2)])
+        assert scene.solver is not None and scene.solver._with_factors == 0
+        scene.destroy()
+    assert found[0] == found[1]
+
+
+def test_factors_that_are_preferred_find_a_stable_balance() -> None:
+    """They give way to what goes downhill where need be: the column bends, and the tangent that it ends with is
+    positive (dense eigenvalues)."""
+    scene, walk = pressed(solver={"snes_rtol": 1e-9})
+    assert scene.solver is not None
+    scene.solver._take_factors(preferred=True)
+    assert walk.advance().solve.converged
+    assert abs(displacement(scene, walk)[:, 0]).max() > 0.2 and scene.balance.stress.stored() < 20.0
+    free = np.flatnonzero(scene.balance.motion.free)
+    assert np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0] > 0
+
+
+@pytest.mark.parametrize("shift, positive", [(0.0, True), (-0.3, False)])
+def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive: bool) -> None:
+    """Of the tangent of the column as it is, and of the one pressed straight, far beyond Euler's load."""
+    scene, _ = pressed()
+    solver, balance = scene.solver, scene.balance
+    assert solver is not None
+    X = scene.domain.nodes
+    straight = np.stack([0.0 * X[:, 0], shift * X[:, 1]], axis=1).reshape(-1)
+    balance.displace(straight)
+    with solver._factors.of(solver.snes.ksp):
+        balance.vector.array_w[:] = 1.0
+        assert solver._solve_linear()
+        solver._factors.learn(solver.snes.ksp)
+    free = np.flatnonzero(balance.motion.free)
+    least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
+    assert (least > 0) == positive == solver._factors.positive
+    assert 1 < solver._factors.worth < 100
