@@ -33,13 +33,17 @@ def two_blocks(path: Path, dim: int, gap: float) -> str:
 
 
 @pytest.mark.parametrize(
-    ("dim", "scheme"), [(2, "backward-euler"), (3, "backward-euler"), (2, "newmark"), (2, "generalized-alpha")]
-)
-def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str) -> None:
+    ("dim", "scheme", "order"),
+    [
+        (2, "backward-euler", 1), (3, "backward-euler", 1), (2, "newmark", 1), (2, "generalized-alpha", 1),
+        (2, "backward-euler", 2),
+    ],
+)  # fmt: skip
+def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -> None:
     """Thrown at each other: momentum is kept to the solver's tolerance, they touch, nothing cuts anything, and no
     scheme gains energy."""
     scene, state = make_scene(
-        mesh={"file": two_blocks(tmp_path, dim, 0.05)}, material=SOFT, contact={}, solver=FINE,
+        mesh={"file": two_blocks(tmp_path, dim, 0.05), "order": order}, material=SOFT, contact={}, solver=FINE,
         time={"scheme": scheme, "step": 0.01, "end": 0.18},
     )  # fmt: skip
     X = positions(scene)

@@ -146,14 +146,16 @@ def test_a_body_at_rest_is_carried(tmp_path: Path) -> None:
     assert abs(found["contact_block_x"]) < 1e-4 * 100 * G and 0 < found["gap_block"] < 0.03
 
 
-def test_it_presses_as_the_analytic_shape_does(tmp_path: Path) -> None:
+@pytest.mark.parametrize("order", [1, 2])
+def test_it_presses_as_the_analytic_shape_does(tmp_path: Path, order: int) -> None:
     """A block driven down on a body, and a plane: forces by both sorts of barrier within 1 %, gaps within their
     distance; the work of the block is what the body takes up."""
     forces, way = [], {"time": [0.0, 1.0], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -0.2]]}
     plane = {"name": "block", "shape": "plane", "normal": [0.0, 0.0, -1.0]}
+    mesh = CUBE | {"order": order, "h": 0.5 * order}  # as many nodes
     for shape, high in ((plane, 0.0), (block(tmp_path), 0.5)):
         scene, state = make_scene(
-            mesh=CUBE, material=SOFT, boundary=[{"on": "bottom", "fix": "xyz"}], solver=FINE,
+            mesh=mesh, material=SOFT, boundary=[{"on": "bottom", "fix": "xyz"}], solver=FINE,
             obstacle=[shape | {"at": [0.5, 0.5, 1.002 + high], "displacement": way}],
             contact={"itself": False, "distance": 2e-3}, time={"scheme": "quasi-static", "step": 0.25, "end": 1.0},
         )  # fmt: skip

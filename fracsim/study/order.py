@@ -46,11 +46,10 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
             "walls of cracks follow the corners of cells alone",
         ),
         (
-            '[[obstacle]] shape = "mesh"',
-            any(each.shape == "mesh" for each in study.obstacle),
-            "it is felt by the corners of cells alone",
+            "[contact] itself and [fracture]",
+            contact is not None and bool(contact.itself) and fracture is not None,
+            "walls of cracks follow the corners of cells alone",
         ),
-        ("[contact] itself", contact is not None and bool(contact.itself), "it is felt by the corners of cells alone"),
     ]
 
 

@@ -8,7 +8,7 @@ timings of Pairs: for 50,000 triangles less than a step of the body inside them.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ from ..term import Cuts, Level, Term
 from .crowd import Law, Surface
 from .slip import Friction
 from .stiffening import stiffening
+
+if TYPE_CHECKING:
+    from ...meshes.data import MeshData
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -48,7 +51,8 @@ class SelfContact(Term):
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = Coupling(domain)
         self._stiff = STIFF * law.stiffness * domain.mean_edge ** (domain.dim - 2)
-        self._skeleton = None if domain.source is None else Skeleton(domain.source)
+        mesh = domain.source if domain.order == 1 else _refined(domain)
+        self._skeleton = None if mesh is None else Skeleton(mesh)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
@@ -59,7 +63,7 @@ class SelfContact(Term):
 
     def _rebuild(self) -> None:
         """The surface of the damage of now (collective)."""
-        pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
+        pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
         cuts = None if self._cuts is None else self._cuts()
 
         def made() -> Surface:
@@ -82,6 +86,12 @@ class SelfContact(Term):
         if self._surface is not None and self._surface.serves(pattern):
             return self._surface
         return Surface(self._skeleton, pattern, self.law, u, self._surface, cut)
+
+    def _gathered_pattern(self) -> npt.NDArray[np.uint8] | None:
+        """(C,) of the cells of the skeleton, on rank 0; of quadratic ones, which are cut up there, nothing breaks
+        (collective)."""
+        pattern = self._domain.gather_cells(self._pattern)
+        return None if pattern is None else np.repeat(pattern, 1 if self._domain.order == 1 else 2**self._domain.dim)
 
     def _gathered(self, u: Values) -> Values | None:
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
@@ -291,3 +301,9 @@ class SelfContact(Term):
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self._coupling.destroy()
+
+
+def _refined(domain: Domain) -> MeshData | None:
+    from ...mesh.split.refined import refined_input
+
+    return refined_input(domain)

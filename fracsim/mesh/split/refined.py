@@ -14,6 +14,7 @@ from ...meshes.data import MeshData
 from ...meshes.topology import oriented
 from ..dolfinx_calls import exterior_facets
 from ..domain import Domain
+from ..middles import with_middles
 from ..simplices import local_edges
 
 Ints = npt.NDArray[np.int64]
@@ -35,22 +36,38 @@ SMALL = {
 
 def refined(domain: Domain, outside: str) -> MeshData:
     """This rank's cells cut up, over all nodes of the displacement; `outside`: the group of the body's boundary."""
-    between = _between(domain)
-    cells = _cut(between, np.arange(domain.cell_count)[:, None], np.arange(domain.dim + 1)[None, :], domain.dim)
+    between = _between(domain.cell_nodes, domain.cell_middles)
+    cells = _all_cut(between)
     cell, opposite = exterior_facets(domain.mesh, domain._exterior).reshape(-1, 2).T
     corners = np.array([[j for j in range(domain.dim + 1) if j != i] for i in range(domain.dim + 1)])[opposite]
     facets = _cut(between, cell[:, None], corners, domain.dim - 1)
     return MeshData(domain.nodes, oriented(domain.nodes, cells)[0], {outside: facets})
 
 
-def _between(domain: Domain) -> Ints:
+def refined_input(domain: Domain) -> MeshData | None:
+    """The input mesh on rank 0, where displacement is quadratic with its cells cut up, without groups; its points are
+    those that `Domain.node_input` numbers. None elsewhere."""
+    if domain.middles is None or domain.source is None:
+        return domain.source
+    whole = with_middles(domain.source, domain.middles, written=False)
+    cells = _all_cut(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
+    return MeshData(whole.points, oriented(whole.points, cells)[0])
+
+
+def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:
     """(cells, d + 1, d + 1) the corner i of each cell at (i, i), the middle of the edge ij at (i, j)."""
-    count = domain.dim + 1
-    result = np.empty((domain.cell_count, count, count), np.int64)
-    result[:, range(count), range(count)] = domain.cell_nodes
-    i, j = local_edges(domain.dim).T
-    result[:, i, j] = result[:, j, i] = domain.cell_middles
+    count = corners.shape[1]
+    result = np.empty((len(corners), count, count), np.int64)
+    result[:, range(count), range(count)] = corners
+    i, j = local_edges(count - 1).T
+    result[:, i, j] = result[:, j, i] = middles
     return result
+
+
+def _all_cut(between: Ints) -> Ints:
+    """(cells 2^d, d + 1) nodes of the parts of all cells, those of one cell after another."""
+    count = between.shape[1]
+    return _cut(between, np.arange(len(between))[:, None], np.arange(count)[None, :], count - 1)
 
 
 def _cut(between: Ints, cells: npt.NDArray[np.integer], corners: npt.NDArray[np.integer], dim: int) -> Ints:

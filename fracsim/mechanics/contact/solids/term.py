@@ -83,7 +83,7 @@ class Solids(SelfContact):
     # --- where the surface and the solids are ---
 
     def _rebuild(self) -> None:
-        pattern, u = self._domain.gather_cells(self._pattern), self._gathered(self._u.x.array[: self._owned])
+        pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
 
         def made() -> Front:
             assert self._skeleton is not None and pattern is not None and u is not None
