@@ -148,6 +148,10 @@ class Sight:
             not self._stress.energy.linear,
         )  # fmt: skip
 
+    def places(self, edges: npt.NDArray[np.integer], cut: Values) -> Values:
+        """(n, d) where local edges are cut, m."""
+        return self._front.places(edges, cut)
+
     def means_at(self, cells: Ints, stress: Values) -> Values:
         """(n, d, d) mean stress around the centres of cells (n,) of this rank that are far from cracks, Pa, of all
         cells' (cells, 3 or 6) (collective)."""

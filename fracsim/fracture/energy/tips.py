@@ -25,7 +25,7 @@ from ..edge_stress import frobenius_norm
 from ..strength import Strength, hashed
 from .around import local_size
 from .branching import TIPS, each, rotated, unit
-from .cutting import Cuts, cleave, fork, through_centre
+from .cutting import Cuts, cleave, fork, leave, through_centre
 from .mixed import gain, kink
 from .neighbourhoods import Reach, Tips
 from .seen import Seen, Sight
@@ -37,6 +37,7 @@ Values = npt.NDArray[np.float64]
 DISC = {2: 5.0, 3: 4.0}  # R over h: the radius of the disc (ball) on which a tip's force is summed
 AVERAGE = 3.0  # radius over h on which stress is averaged
 CELLS = {2: 2.5, 3: 5.0}  # passes in which a crack gets on by h
+AT_ONCE = 2  # cells by which a tip in the plane gets on in a pass without inertia
 APART = {2: 5.0, 3: 0.5}  # h between tips that advance at once
 FULL = 1.5  # h beyond R within which there is a split cell once a tip is mature
 # mean square of the first principal stress over a disc of radius rho about a tip, in E' G / rho:
@@ -278,15 +279,45 @@ class CrackTips:
         """Remember where the cells are cut, on every rank; (n,) local edges of this one (collective)."""
         if self._idle:
             return np.empty(0, np.int64)
-        graph = self._graph
         grows, begins = self._rows(grown, self._way_out(grown)), self._rows(begun, self._through(begun))
-        every = np.concatenate(self._domain.comm.allgather(np.concatenate([grows, begins])))
+        edges, ahead = self._remembered(np.concatenate([grows, begins]))
+        if self._domain.dim == 3 or self.sight.motion is not None:
+            return edges
+        for _ in range(AT_ONCE - 1):
+            further, ahead = self._further(edges, ahead)
+            edges = np.concatenate([edges, further])
+        return edges
+
+    def _remembered(self, rows: Values) -> tuple[Edges, Values]:
+        """Where edges are cut, from all ranks: (n,) local edges of this one, and (n, d) whither cracks go on from there
+        (collective)."""
+        every = np.concatenate(self._domain.comm.allgather(rows))
         every = every[np.lexsort(every[:, 5:2:-1].T)]  # neighbours cut the same edge where the first of them does
         keys, first = np.unique(every[:, :2].astype(np.int64), axis=0, return_index=True)
-        local, place = graph.find_keys(keys)
-        new = ~graph.broken[local]
-        self.cut[local[new]] = every[first[place[new]], 2]
-        return local[new]
+        local, place = self._graph.find_keys(keys)
+        new = ~self._graph.broken[local] & np.isnan(self.cut[local])
+        chosen = every[first[place[new]]]
+        self.cut[local[new]] = chosen[:, 2]
+        return local[new], chosen[:, 6:]
+
+    def _further(self, edges: Edges, ahead: Values) -> tuple[Edges, Values]:
+        """Whole cells beyond edges (n,) that were cut just now are cut straight `ahead` (n, d); 0: not (collective).
+
+        A tip that turned by K_I and K_II knows where it goes for more than a cell; g, of a disc of 5 h, is the same in
+        the next to some per cent. Looked at anew there without a solve it would be that of a body out of balance.
+        """
+        graph, way = self._graph, np.zeros((len(self._graph.broken), ahead.shape[1]))
+        way[edges] = ahead
+        entered = np.any(way[graph.cell_edges], axis=2)
+        cells = np.flatnonzero((entered.sum(axis=1) == 1) & ~(graph.damaged | self.barred)).astype(np.int64)
+        entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
+        came = graph.cell_edges[cells, entry]
+        place, torn, ahead = self.sight.places(came, self.cut), self._torn()[graph.cell_edges[cells]], way[came]
+        cuts = leave(self._corners(cells), entry, place, rotated(ahead, np.pi / 2), ahead, torn)
+        self.cells = np.concatenate([self.cells, cells])
+        rank = self._ranked(0, np.zeros(len(cells)), place, np.zeros(len(cells)))
+        none = np.empty((len(cells), 2, 2))
+        return self._remembered(self._rows(Proposal(rank, cells, none, entry, ahead, turns, ~turns), cuts))
 
     def _way_out(self, grown: Proposal) -> Cuts:
         """Where the cells of tips are left (collective)."""
@@ -306,10 +337,14 @@ class CrackTips:
         return self._domain.nodes[self._domain.cell_nodes[cells]]
 
     def _rows(self, cracks: Proposal, cuts: Cuts) -> Values:
-        """(n, 6) key of each edge that is cut, where, from the end that comes first in the input mesh, and its rank."""
+        """(n, 6 + d) key of each edge that is cut, where, from the end that comes first in the input mesh, its rank,
+        and whither the crack goes straight on; 0 where it does not."""
         cells = cracks.cells[cuts.row]
         ends = self._domain.node_input[
             self._domain.cell_nodes[cells[:, None], local_edges(self._domain.dim)[cuts.edge]]
         ]
         share = np.where(ends[:, 0] > ends[:, 1], 1 - cuts.share, cuts.share)
-        return np.column_stack([np.sort(ends, axis=1), share, cracks.rank[cuts.row, :3]])
+        straight = np.zeros((len(cells), self._domain.dim))
+        if cracks.turns is not None and cracks.ahead is not None:
+            straight[:] = np.where(cracks.turns[:, None], cracks.ahead, 0.0)[cuts.row]
+        return np.column_stack([np.sort(ends, axis=1), share, cracks.rank[cuts.row, :3], straight])
