@@ -56,7 +56,8 @@ PULLED: Changes = {
     "boundary": [
         {"on": "bottom", "fix": "xy"},
         {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, 8e-6]]}},
-    ]
+    ],
+    "time": {"breaking_step": 0.001},  # one of 0.01 is 1.8 % of the peak, told by the last before it
 }
 PLATES = ("h", (3e-5, 2e-5, 1.25e-5))
 NOTCHED = ("h_notch", (4e-4, 3e-4, 2.2e-4))
