@@ -31,7 +31,7 @@ ANGLE = np.radians(27.0)  # between each branch and the crack that they come fro
 
 
 def unit(vectors: Values) -> Values:
-    """(n, 2) of length 1; 0 stays."""
+    """(n, d) of length 1; 0 stays."""
     length = np.linalg.norm(vectors, axis=1)[:, None]
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
