@@ -8,6 +8,9 @@ crack has come: ahead of a tip the stress along t is nearly as large as that acr
 stress of s itself may be either (a beam's crack lay down above its middle). By the mean alone a tip that has soft cells
 on one side waits too long (a bar of six cells took 1.09 G_c), and at an inner corner a crack begins too late (at 9.7 kN
 in a panel of 25 mm tetrahedra), so that the cell's own stress counts as well: what it carries is bounded all the same.
+
+In space cells beside a crack are cut as well, where they share an edge with it: those that no front is near, whose disc
+the crack goes through, stay (a bar took 1.2 G_c, and takes 1.03).
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import numpy.typing as npt
 from ..brittle.principal import largest, tensors
 from ..criterion import Edges
 from ..energy.branching import unit
-from ..energy.seen import Seen
+from ..energy.seen import LEAST, Seen
 from ..energy.tips import APART, CrackTips, Proposal
 
 Ints = npt.NDArray[np.int64]
@@ -47,7 +50,10 @@ class CohesiveTips(CrackTips):
         tips = seen.tips
         mean = seen.means(np.arange(len(tips)))
         sigma = self._greatest(mean, tips.cell)
-        rows = np.flatnonzero((sigma >= self._strength_of(tips.cell)) & ~self.barred[tips.cell])
+        loaded = sigma >= self._strength_of(tips.cell)
+        if self._domain.dim == 3:
+            loaded &= ~(tips.mature & (np.linalg.norm(tips.ahead, axis=1) <= LEAST * seen.disc))
+        rows = np.flatnonzero(loaded & ~self.barred[tips.cell])
         cells, ahead, no = tips.cell[rows], tips.point[rows] - tips.behind[rows], np.zeros(len(rows), bool)
         rank = self._ranked(0, sigma[rows], tips.point[rows], APART[self._domain.dim] * self._h[cells])
         entry = np.argmax(~self._graph.intact(cells), axis=1)
