@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import peers
-from fracsim.studies.evidence.peers import akantu, akantu_static, linear_step, start_up
+from fracsim.studies.evidence.peers import akantu, akantu_static, linear_step, phase_field, start_up
 from fracsim.studies.evidence.precision import brazilian, common, statics
 from fracsim.study.file import validate
 
@@ -26,6 +26,8 @@ def absent(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A Python that cannot import Akantu: this one."""
     monkeypatch.setenv(akantu.VARIABLE, sys.executable)
     akantu.interpreter.cache_clear()
+    monkeypatch.delenv(phase_field.VARIABLE, raising=False)
+    phase_field.interpreter.cache_clear()
     yield
     akantu.interpreter.cache_clear()
 
@@ -75,7 +77,7 @@ def test_where_akantu_is_missing_nothing_runs_and_the_page_says_so(
 ) -> None:
     assert [trial.case for trial in peers.trials()] == ["start-up"], "which measures this program by itself, too"
     assert common.beside_akantu("plate", 0.01, 1) == []
-    assert [section.text for section in peers.sections([])] == [akantu.ABSENT]
+    assert [section.text for section in peers.sections([])] == [akantu.ABSENT, phase_field.ABSENT]
     with pytest.raises(RuntimeError, match="AKANTU_PYTHON"):
         akantu.Akantu({}, None)  # type: ignore[arg-type]
     monkeypatch.setenv(akantu.VARIABLE, "/nowhere")

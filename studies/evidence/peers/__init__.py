@@ -11,6 +11,7 @@ from ..trial import Trial
 
 FAMILIES = (
     "linear_step",
+    "phase_field",
     "start_up",
 )  # by name: they are scripts as well, which are not to be imported before they run
 
