@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from .touches import Touches
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -51,9 +53,24 @@ class Contacts:
 
     def slipping(self, velocity: Values, spin: Values, chosen: Flags) -> Values:
         """(k,) how fast things slip along one another in chosen (k,) contacts, m/s; 0 in all others."""
-        first, second = self.things[chosen].T
-        v = velocity[first] - velocity[second]
-        v += np.cross(spin[first], self.arms[0, chosen]) - np.cross(spin[second], self.arms[1, chosen])
         slip = np.zeros(len(self))
-        slip[chosen] = np.linalg.norm(np.einsum("kij,kj->ki", self.axes[chosen, 1:], v), axis=1)
+        slip[chosen] = np.linalg.norm(self.chosen(np.flatnonzero(chosen)).parting(velocity, spin)[:, 1:], axis=1)
         return slip
+
+    def parting(self, velocity: Values, spin: Values) -> Values:
+        """(k, 3) velocities of the second things beside the first, along the axes, m/s."""
+        first, second = self.things.T
+        v = velocity[second] - velocity[first]
+        v += np.cross(spin[second], self.arms[1]) - np.cross(spin[first], self.arms[0])
+        return np.asarray(np.einsum("kij,kj->ki", self.axes, v))
+
+    def chosen(self, rows: Ints) -> Contacts:
+        """Some (m,) of them."""
+        return Contacts(self.geoms[rows], self.things[rows], self.point[rows], self.axes[rows], self.gap[rows],
+                        self.arms[:, rows], self.levers[:, rows])  # fmt: skip
+
+    def touches(self, rows: Ints, impulse: Values, closing: Values) -> Touches:
+        """Of contacts (m,) that gave impulses (m, 3) along their axes, N s; all met at speeds (k,), m/s."""
+        axes, (first, second) = self.axes[rows], self.things[rows].T
+        given = np.einsum("ki,kij->kj", impulse, axes)
+        return Touches(first, second, self.point[rows], axes[:, 0], given, closing[rows])

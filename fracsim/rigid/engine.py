@@ -10,7 +10,7 @@ springs and dashpots that let things in, and its own way of turning bodies loses
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import NotConverged
 from .bodies import Bodies
 from .contacts import Contacts
+from .crowd import Crowd
 from .meeting import Meetings, flown, meetings
 from .model import ITERATIONS, Part, Rules, Stand, model_of, plane_contact
 from .siblings import Overlaps, Parting
@@ -28,19 +29,43 @@ from .tumbling import rotated, tumbled
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 TURN = 1.0  # rad a step that contacts set a body spinning by, at most: they are of one place, and a crumb would whirl
 ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farther than was thought,
 FARTHER = 1.5  # by as many times
-CLOSE = 0.5  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
+SLIPS = 10  # rounds of slip, at most,
+CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
 ROOM = 2.0  # times how far bodies come as they move: what is struck in a crowd goes farther
 FIELDS = ("frame", "dim", "friction", "solref", "solreffriction", "solimp", "includemargin", "exclude", "efc_address",
           "mu", "H", "flex", "elem", "vert", "adhesion", "surfacevel")  # fmt: skip
 STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
           mujoco.mj_fwdConstraint)  # fmt: skip
-AT_ONCE = 20  # iterations of Newton's method: a crowd that takes more is solved with softer contacts first,
-CROWD = 300  # rows of an island: contacts, three times
+AT_ONCE = 20  # iterations of Newton's method: what takes more is solved with softer contacts first,
 SOFTER = (100.0, 10.0, 1.0)  # times what they give way by, each from where the last came to
+CROWD = 300  # contacts: more are not given to Newton's method
+ISLAND = 300  # rows of an island: three times its contacts
+MOST, NEARLY = 300, 0.01  # iterations on a crowd, at most, and what velocities may be off by, c_0,
+LOOKS, ROUGH = 3, 50  # after so many looks of so many iterations, at most, for what meets what
+
+
+@dataclass
+class _Met:
+    """What comes together in a step.
+
+    Attributes:
+        start: the bodies before it.    bodies: where they are struck, after the share (n,) of it.
+        contacts, meeting: k of them.    near: (k,) those that are looked at so far.
+        impulse: (k, 3) of them so far, along their axes, N s.
+    """
+
+    start: Bodies
+    bodies: Bodies
+    share: Values
+    contacts: Contacts
+    meeting: Meetings
+    near: Flags
+    impulse: Values
 
 
 class Engine:
@@ -62,7 +87,7 @@ class Engine:
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
         self._data = mujoco.MjData(self._model.made)
-        self._crowded = False  # whether contacts of this step were too many to be solved at once
+        self._jammed = False  # whether contacts of this step were too many to be solved at once
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         planes = self._model.planes
         self._plane_contacts = [
@@ -85,13 +110,15 @@ class Engine:
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [ROOM * self._reach(bodies, of) for of in (common, 0.0)]
         self._data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
-        self._crowded, rough = False, True
         for _ in range(ROUNDS):
-            moved, touches, exact = self._moved(bodies, rates, common, reach, rough=rough)
-            rough, farther = False, [self._reach(moved, of) for of in (common, 0.0)]
-            if exact and not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
+            met = self._met(bodies, rates, common, reach)
+            moved, touches, done = self._moved(met, rates, rough=True)
+            farther = [self._reach(moved, of) for of in (common, 0.0)]
+            if not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
                 break
             reach = [np.maximum(now, then) for now, then in zip(farther, reach, strict=True)]
+        if not done:
+            moved, touches, _ = self._moved(met, rates, rough=False)
         if ways is not None:
             self._way = ways.copy()
         return moved, touches
@@ -103,12 +130,9 @@ class Engine:
         speed = np.linalg.norm(bodies.velocity - common, axis=1) + turning
         return np.asarray(self._rules.step * (speed + self._rules.fast))
 
-    def _moved(
-        self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values], *, rough: bool = False
-    ) -> tuple[Bodies, Touches, bool]:
-        """The bodies a step later where none of their points comes farther than a reach (n,) beside what moves with a
-        common velocity (3,), and than another (n,) beside what stands, m and m/s; whether contacts are as hard as they
-        are: of a crowd they may be soft where it is `rough`."""
+    def _met(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> _Met:
+        """What comes together in a step where no point of the bodies comes farther than a reach (n,) beside what moves
+        with a common velocity (3,), and than another (n,) beside what stands, m and m/s."""
         dt, n, g = self._rules.step, self._count, self._rules.gravity
         start = bodies
         contacts = self._find(bodies, rates, common, reach)
@@ -122,11 +146,17 @@ class Engine:
             falling = replace(bodies, velocity=bodies.velocity + fallen)
             meeting, parting = self._meeting(contacts, falling, rates)
         self._parting = parting
-        force, touches, exact = self._pushed(contacts, meeting, bodies, rates, rough=rough)
-        after = self._flown(self._driven_on(bodies, force), dt * (1 - share))
+        return _Met(start, bodies, share, contacts, meeting, meeting.near, np.zeros((len(contacts), 3)))
+
+    def _moved(self, met: _Met, rates: Values, *, rough: bool) -> tuple[Bodies, Touches, bool]:
+        """The bodies at the end of the step, what touched, and whether that is all that can be said of it: a crowd is
+        only looked through where it may be `rough`."""
+        dt, start = self._rules.step, met.start
+        force, touches, done = self._pushed(met, rates, rough=rough)
+        after = self._flown(self._driven_on(met.bodies, force), dt * (1 - met.share))
         alone = ~np.any(force, axis=1)
-        after.place[alone] = start.place[alone] + dt * (start.velocity[alone] + dt * g / 2)
-        return after, touches, exact
+        after.place[alone] = start.place[alone] + dt * (start.velocity[alone] + dt * self._rules.gravity / 2)
+        return after, touches, done
 
     def _meeting(self, contacts: Contacts, bodies: Bodies, rates: Values) -> tuple[Meetings, Parting]:
         """How contacts act in the step, and how overlaps stand then."""
@@ -204,54 +234,66 @@ class Engine:
             made.dist[first:], made.pos[first:] = gaps, points
             made.geom[first:] = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
 
-    def _pushed(
-        self, contacts: Contacts, meeting: Meetings, bodies: Bodies, rates: Values, *, rough: bool
-    ) -> tuple[Values, Touches, bool]:
+    def _pushed(self, met: _Met, rates: Values, *, rough: bool) -> tuple[Values, Touches, bool]:
         """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched; and
-        whether they are of hard contacts.
+        whether these are the last ones.
 
         What does not come near enough to touch is left out, and looked at again with the velocities that come of it.
-        The convex problem wants what slips at a speed s to part at mu s, which would throw up what spins: contacts may
-        come by as much nearer, mu s dt, with s as it comes out (G. De Saxce, Z.-Q. Feng 1991).
         """
-        data, n, kept, dt = self._data, self._count, meeting.near, self._rules.step
-        if not np.any(kept):
-            return np.zeros((n, 6)), Touches.none(), True
+        crowded, done = np.count_nonzero(met.meeting.near) > CROWD, True
+        if not np.any(met.meeting.near):
+            return np.zeros((self._count, 6)), Touches.none(), done
+        if crowded:
+            force, done = self._by_projections(met, rates, rough=rough), not rough
+        else:
+            force = self._by_newton(met, rates)
+        rows = np.flatnonzero(met.impulse[:, 0] > 0)
+        return force, met.contacts.touches(rows, met.impulse[rows], met.meeting.closing), done
+
+    def _by_newton(self, met: _Met, rates: Values) -> Values:
+        """Forces and moments (n, 6) of contacts by MuJoCo's solver.
+
+        The convex problem wants what slips at a speed s to part at mu s, which would throw up what spins: contacts may
+        come by as much nearer, mu s dt, with s as it comes out (see rigid.crowd). What is given too much of it sinks
+        in by the difference, at every step in which it slides.
+        """
+        data, n, dt, contacts = self._data, self._count, self._rules.step, met.contacts
+        mujoco.mj_makeM(self._model.made, data)
+        mujoco.mj_factorM(self._model.made, data)
+        self._jammed, kept = False, met.near
         lifts = dt * data.contact.friction[:, 0]
-        thrown = lifts * contacts.slipping(*self._motion(bodies, rates), kept)
-        settled = False
-        for number in range(ROUNDS):
-            data.contact.dist[:], data.contact.exclude[:] = meeting.aim + thrown, ~kept
-            exact = self._solve(rough=rough or (not settled and number < ROUNDS - 1))
+        thrown = lifts * contacts.slipping(*self._motion(met.bodies, rates), kept)
+        for _ in range(SLIPS):
+            data.contact.dist[:], data.contact.exclude[:] = met.meeting.aim + thrown, ~kept
+            self._solve()
             force = data.qfrc_constraint.reshape(-1, 6)[:n].copy()
-            motion = self._motion(self._driven_on(bodies, force), rates)
-            missed = ~kept & (meeting.gap < dt * contacts.closing(*motion))
+            motion = self._motion(self._driven_on(met.bodies, force), rates)
+            missed = self._missed(met, kept, motion)
+            pressed = kept & (data.efc_force[data.contact.efc_address] > 0)
             kept, before = kept | missed, thrown
             thrown = np.minimum(thrown, lifts * contacts.slipping(*motion, kept))
-            pressed = data.efc_force[data.contact.efc_address] > 0
-            slower = (before - thrown)[pressed & kept]
-            settled = not np.any(missed) and bool(np.all(slower < CLOSE * self._rules.fast * dt))
-            if settled and (exact or rough):
+            if not np.any(missed) and np.all((before - thrown)[pressed] < CLOSE * self._rules.fast * dt):
                 break
-        return force, self._touches(contacts, meeting.closing), exact
+        rows = np.flatnonzero(pressed)
+        met.impulse[rows] = dt * data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
+        return force
 
-    def _solve(self, *, rough: bool = False) -> bool:
-        """Forces of the contacts that are not excluded, for MuJoCo's data; whether they are of hard ones: where it may
-        be `rough`, a crowd is left with the softest, which tell what comes near what.
+    def _missed(self, met: _Met, kept: Flags, motion: tuple[Values, Values]) -> Flags:
+        """(k,) contacts beside those kept (k,) that things come to touch in with these velocities and spins."""
+        return np.asarray(~kept & (met.meeting.gap < self._rules.step * met.contacts.closing(*motion)))
 
-        Which of a thousand hard contacts press Newton's method finds by trial: it flips some at every iteration, and
-        is not there after 200. Soft ones, taken first, tell it in 30, and each harder set takes a dozen.
+    def _solve(self) -> None:
+        """Forces of the contacts that are not excluded, for MuJoCo's data.
+
+        Which of many contacts press Newton's method finds by trial: it flips some at every iteration. Soft ones, taken
+        first, tell it sooner, and each harder set takes a dozen.
         """
-        mujoco.mj_makeM(self._model.made, self._data)
-        mujoco.mj_factorM(self._model.made, self._data)
-        if not self._crowded:
+        if not self._jammed:
             self._press(1.0, AT_ONCE)
-            if self._simple():
-                return True
-            self._crowded = True
-        for softer in SOFTER[:1] if rough else SOFTER:
-            self._press(softer, ITERATIONS)
-        return not rough
+            self._jammed = not self._simple()
+        if self._jammed:
+            for softer in SOFTER:
+                self._press(softer, ITERATIONS)
 
     def _press(self, softer: float, most: int) -> None:
         """Solve, in so many iterations from the last solution on, with contacts that give way by so many times more."""
@@ -267,20 +309,36 @@ class Engine:
     def _simple(self) -> bool:
         """Whether what was solved at once has been solved; MuJoCo counts iterations of the first twenty islands."""
         data, many = self._data, self._data.nisland
-        if not many or data.island_nefc[:many].max() < CROWD:
+        if not many or data.island_nefc[:many].max() < ISLAND:
             return bool(data.solver_niter[: max(many, 1)].max() < AT_ONCE)
         return many <= len(data.solver_niter) and bool(data.solver_niter[:many].max() < AT_ONCE)
 
-    def _touches(self, contacts: Contacts, closing: Values) -> Touches:
-        """Contacts of the step that gave something, which met at these speeds (k,), m/s."""
-        rows = self._data.contact.efc_address
-        felt = np.flatnonzero((rows >= 0) & (self._data.contact.exclude == 0))
-        force = self._data.efc_force[rows[felt, None] + np.arange(3)]
-        pressed = force[:, 0] > 0
-        felt = felt[pressed]
-        axes, (first, second) = contacts.axes[felt], contacts.things[felt].T
-        impulse = self._rules.step * np.einsum("ki,kij->kj", force[pressed], axes)
-        return Touches(first, second, contacts.point[felt], axes[:, 0], impulse, closing[felt])
+    def _by_projections(self, met: _Met, rates: Values, *, rough: bool) -> Values:
+        """As `_by_newton`, whatever there is of them, from where it was left: where it may be `rough`, until nothing
+        more is missed."""
+        dt, bodies, friction = self._rules.step, met.bodies, self._data.contact.friction[:, 0]
+        inverse = bodies.turn @ self._model.inverse @ np.swapaxes(bodies.turn, 1, 2)
+        free = self._motion(self._driven_on(bodies, np.zeros((self._count, 6))), rates)
+        for _ in range(LOOKS if rough else 1):
+            rows = np.flatnonzero(met.near)
+            some = met.contacts.chosen(rows)
+            crowd = Crowd.of(some, friction[rows], self._model.mass, inverse)
+            aim: Values = np.asarray(met.meeting.aim[rows] / dt)
+            enough, most = NEARLY * self._rules.fast, ROUGH if rough else MOST
+            met.impulse[rows] = crowd.impulses(some.parting(*free), aim, enough, most, met.impulse[rows])
+            force = self._forces(bodies, crowd.gained(met.impulse[rows]))
+            missed = self._missed(met, met.near, self._motion(self._driven_on(bodies, force), rates))
+            if not np.any(missed):
+                break
+            met.near |= missed
+        return force
+
+    def _forces(self, bodies: Bodies, gained: Values) -> Values:
+        """Forces and moments (n, 6), these in the axes of the bodies, that give them velocities and spins (n, 6) in a
+        step, m/s and rad/s."""
+        turning = np.einsum("nji,nj->ni", bodies.turn, gained[:, 3:])
+        moment = np.einsum("nij,nj->ni", self._model.inertia, turning)
+        return np.concatenate([self._model.mass[:, None] * gained[:, :3], moment], axis=1) / self._rules.step
 
     def depth(self, bodies: Bodies) -> list[tuple[int, int, float]]:
         """(thing, thing, depth in m) of what is in one another, the deepest place of each pair."""

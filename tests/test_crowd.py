@@ -1,0 +1,94 @@
+"""Many contacts at once: Coulomb's law in each, whatever the bodies weigh, and momentum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.contacts import Contacts
+from fracsim.rigid.crowd import Crowd, projected
+from fracsim.rigid.engine import Engine
+from fracsim.rigid.model import Rules
+from support.falling import CUBE, DOWN, MASS, cubes
+
+Values = npt.NDArray[np.float64]
+
+
+def test_the_nearest_of_a_cone_is_where_what_is_left_is_at_right_angles() -> None:
+    """Moreau: p = a + b with a in the cone |a_t| <= mu a_n, b in its polar cone, mu |b_t| <= -b_n, and a . b = 0."""
+    p, mu = np.random.default_rng(0).normal(size=(3, 500)), np.linspace(0.0, 2.0, 500)
+    near = projected(p, mu)
+    left = p - near
+    assert np.all(np.hypot(near[1], near[2]) <= mu * near[0] + 1e-12)
+    assert np.all(mu * np.hypot(left[1], left[2]) <= -left[0] + 1e-12)
+    assert np.allclose((near * left).sum(axis=0), 0.0, atol=1e-12)
+    assert np.count_nonzero(near[0] == 0) > 50 and np.count_nonzero((left == 0).all(axis=0)) > 50
+
+
+def pile() -> tuple[Contacts, Bodies]:
+    """Blocks of 30 and 1000 kg in turn, three on three in four layers, that spin and slide, each on four corners of the
+    one below or on what stands."""
+    at = np.indices((3, 3, 4)).reshape(3, -1).T
+    rng, mass = np.random.default_rng(3), np.where(at.sum(axis=1) % 2, 0.03, 1.0) * MASS
+    bodies = cubes((at + np.array([0, 0, 0.5])).tolist())
+    inertia = mass[:, None, None] * np.eye(3) / 6
+    velocity, spin = rng.normal(size=(2, 36, 3))
+    bodies = replace(bodies, mass=mass, inertia=inertia, velocity=velocity, spin=spin)
+    second = np.repeat(np.arange(36), 4)
+    first = np.where(at[second, 2] > 0, second - 1, 36)
+    corners = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    point = bodies.place[second] + np.tile(corners, (36, 1))
+    axes = np.tile(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), (len(point), 1, 1))
+    things = np.stack([first, second], axis=1)
+    places = np.concatenate([bodies.place, np.zeros((1, 3))])
+    return Contacts.found(things, things, point, axes, np.zeros(len(point)), places), bodies
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
+def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
+    """Nothing comes nearer than it may, what parts gives nothing, what sticks stays within the cone and what slips
+    gives mu times its pressure against the slip; bodies get what contacts give, by sums that share no code with it."""
+    contacts, bodies = pile()
+    mu, aim = np.full(len(contacts), friction), np.random.default_rng(4).uniform(0.0, 0.3, len(contacts))
+    crowd = Crowd.of(contacts, mu, bodies.mass, np.linalg.inv(bodies.inertia))
+    still = np.zeros((1, 3))
+    free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
+    p = crowd.impulses(free, aim, 1e-7, 5000, np.zeros_like(free))
+    velocity, spin = np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still])
+    for (first, second), at, axes, each in zip(contacts.things, contacts.point, contacts.axes, p, strict=True):
+        for body, sign in ((first, -1.0), (second, 1.0)):
+            if body < 36:
+                velocity[body] += sign * each @ axes / bodies.mass[body]
+                arm = np.cross(at - bodies.place[body], sign * each @ axes)
+                spin[body] += np.linalg.solve(bodies.inertia[body], arm)
+    after = np.concatenate([bodies.velocity, bodies.spin], axis=1) + crowd.gained(p)
+    assert np.allclose(after, np.concatenate([velocity, spin], axis=1)[:36], atol=1e-10)
+    u = contacts.parting(velocity, spin)
+    spare, slip, along = u[:, 0] + aim, np.linalg.norm(u[:, 1:], axis=1), np.linalg.norm(p[:, 1:], axis=1)
+    pressed, sliding = p[:, 0] > 1e-3, slip > 1e-3
+    assert spare.min() > -1e-5 and np.all(along <= friction * p[:, 0] * (1 + 1e-9))
+    assert np.allclose(spare[pressed], 0.0, atol=1e-5) and 40 < np.count_nonzero(pressed) < len(contacts)
+    both = pressed & sliding
+    assert np.allclose(p[both, 1:], -friction * p[both, :1] * u[both, 1:] / slip[both, None], rtol=0.01, atol=1e-3)
+    if friction == 0.3:
+        assert np.count_nonzero(both) > 10 and np.count_nonzero(pressed & ~sliding) > 10
+
+
+def test_a_heap_keeps_its_momentum_and_loses_energy() -> None:
+    """A thousand contacts of blocks that fly together, without weight or a floor: as a crowd, m v and m x x v + I w."""
+    grid = 1.01 * np.indices((7, 7, 7)).reshape(3, -1).T
+    bodies = cubes(grid.tolist())
+    inwards = -2.0 * (grid - grid.mean(axis=0))
+    bodies = replace(bodies, velocity=inwards, spin=np.random.default_rng(1).normal(size=(343, 3)))
+    engine = Engine(bodies, [[CUBE]] * 343, [], Rules(5e-3, 0 * DOWN, 0.4))
+    after, touches = engine.advance(bodies)
+    size = MASS * np.abs(bodies.velocity).sum()
+    assert len(touches) > 1000 and after.kinetic < 0.9 * bodies.kinetic
+    assert np.allclose(after.momentum, bodies.momentum, atol=1e-9 * size)
+    assert np.allclose(after.angular_momentum, bodies.angular_momentum, atol=1e-8 * size)
