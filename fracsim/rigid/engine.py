@@ -36,7 +36,6 @@ ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farthe
 FARTHER = 1.5  # by as many times
 SLIPS = 10  # rounds of slip, at most,
 CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
-ROOM = 2.0  # times how far bodies come as they move: what is struck in a crowd goes farther
 FIELDS = ("frame", "dim", "friction", "solref", "solreffriction", "solimp", "includemargin", "exclude", "efc_address",
           "mu", "H", "flex", "elem", "vert", "adhesion", "surfacevel")  # fmt: skip
 STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
@@ -108,7 +107,7 @@ class Engine:
         at the end of the step, m (None: where they were)."""
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
-        reach = [ROOM * self._reach(bodies, of) for of in (common, 0.0)]
+        reach = [self._reach(bodies, of) for of in (common, 0.0)]
         self._data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
         for _ in range(ROUNDS):
             met = self._met(bodies, rates, common, reach)
