@@ -6,6 +6,7 @@ body       the edges and triangles of the input mesh
 level_set  the surface through a start: a plane, or one that turns with the principal direction
 sheet      what a level set cuts: from the start through intact material, up to the boundary or an older crack
 grains     grain boundaries: regions of seeded points
+one_by_one nodes without a whole cell on their side, moved one after the other
 pattern    all surfaces so far, and the edges that new ones cut
 surfaces   the part of the fracture pass that starts surfaces and breaks the edges that they cut
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .body import Body
+from .one_by_one import one_by_one
 from .rules import GrainRules
 from .sheet import NEAREST, ROUNDS
 
@@ -106,7 +107,7 @@ def _settled(cells: Ints, grain: Ints) -> Ints:
             if np.count_nonzero(_lost(cells, moved)) >= np.count_nonzero(lost):
                 break
         grain, lost = moved, _lost(cells, moved)
-    return grain
+    return one_by_one(cells, grain, np.ones(len(grain), bool)) if lost.any() else grain
 
 
 def _lost(cells: Ints, grain: Ints) -> Flags:

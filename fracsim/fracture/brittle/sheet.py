@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ...mesh.simplices import local_edges
 from ...meshes.components import components
 from .body import Body, Cells, triangles
+from .one_by_one import one_by_one
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -106,7 +107,7 @@ def _settled(body: Cells, sides: Flags, usable: Flags, movable: Flags | None) ->
         count = np.count_nonzero(_loose(cells, trial, near))
         if count < fewest:
             best, fewest = trial, count
-    return best
+    return one_by_one(cells, best, near) if fewest else best
 
 
 def _loose(cells: Ints, sides: Flags, near: Flags) -> Flags:
