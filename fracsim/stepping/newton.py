@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -188,7 +189,7 @@ class Solver:
         if self._dear:
             return self._go_on_directly(guess)
         if self._misled(result) and self._may_factorise():
-            result = self._attempt_directly(guess)
+            result = self._attempt_directly(self.balance.level.u if self._sets_out_anew else guess)
             if result.converged:
                 self._take_factors(preferred=False)
         elif self._was_dear(result):
@@ -232,6 +233,8 @@ class Solver:
         result = self._attempt(guess)
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
         if self._misled(result):
+            if self._sets_out_anew:
+                start = self.balance.level.u
             # Smoothers of an older tangent need not be positive for this one.
             self._preconditioner.due = Due.REBUILD
             if self.balance.conservative:
@@ -248,6 +251,13 @@ class Solver:
             result = self._attempt(start)
             self.snes.ksp.setType("cg")
         return result
+
+    @cached_property
+    def _sets_out_anew(self) -> bool:
+        """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
+        inside out, and without a potential (a pressure has none) there is no going down from it. Where prescribed dofs
+        or contact set the pace that place is no better."""
+        return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_steps
 
     def _attempt_positively(self, guess: Values | None) -> SolveResult:
         """With moduli made positive, down the incremental potential. (From the start of every attempt they would cost
