@@ -26,7 +26,7 @@ from fracsim.study import Mesh
 from fracsim.study.mesh_source import build_mesh
 from support.brittle import cut_points, enclosed, open_at, scene_surface, volume_above
 from support.laws import rotation
-from support.scenes import deform, make_scene, make_study, march, mesh_of
+from support.scenes import deform, make_scene, make_study, march, mesh_of, positions
 
 EPS = np.finfo(float).eps
 UNSTRUCTURED = {"pattern": "unstructured"}
@@ -61,6 +61,39 @@ def cuts(scene: Scene) -> tuple[Any, Any]:
     keys = scene.fracture.graph.edge_keys(own)
     order = np.lexsort(keys.T[::-1])
     return keys[order], cut[own][order]
+
+
+# --- quadratic cells ---
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_quadratic_cells_are_cut_as_linear_ones(dim: int) -> None:
+    """Of one deformation of the whole body: the same edges, at the same places, and the same pieces."""
+    found = []
+    for order in (1, 2):
+        mesh = {"builder": "box", "size": [1.0, 0.8, 0.5][:dim], "h": 0.2, "pattern": "unstructured", "order": order}
+        scene = strained(dim, stretched(dim, [1.0, 0.3, 0.2]), "neo-hookean", mesh=mesh)
+        assert scene.fracture().broken > 0
+        found.append((*cuts(scene), scene.fracture.criterion.starts))
+        assert scene_surface(scene).pieces == 2
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-9)
+    np.testing.assert_allclose(found[0][2], found[1][2], atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_the_gradient_of_a_quadratic_cell_is_its_mean(dim: int) -> None:
+    """u_k = X Q_k X / 2 has the slope Q_k X: its mean is that at the centroid."""
+    mesh = {"builder": "box", "size": [1.0, 0.8, 0.5][:dim], "h": 0.5, "pattern": "unstructured", "order": 2}
+    scene = strained(dim, np.eye(dim), "neo-hookean", mesh=mesh)
+    Q = np.random.default_rng(1).normal(size=(dim, dim, dim))
+    Q = 0.05 * (Q + np.swapaxes(Q, 1, 2))
+    X, domain = positions(scene), scene.domain
+    scene.balance.displace((np.einsum("ni,kij,nj->nk", X, Q, X) / 2).reshape(-1))
+    centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
+    exact = np.eye(dim) + np.einsum("kij,cj->cki", Q, centroids)
+    found = scene.fracture.criterion._gradients(np.arange(domain.cell_count))
+    np.testing.assert_allclose(found, exact, atol=1e-12)
 
 
 # --- planar cuts ----------------------------------------------------------------------------------------------------

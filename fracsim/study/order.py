@@ -39,7 +39,6 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
             "springs between the ends of an edge would press its middle, which is free once the cell is cut",
         ),
         ('output.cut = "forces"', study.output.cut == "forces", "corners carry no share of a uniform stress"),
-        ("[brittle]", study.brittle is not None, "level sets cut straight cells whose stress is one value"),
         (
             "[[obstacle]] and [fracture]",
             bool(study.obstacle) and fracture is not None,

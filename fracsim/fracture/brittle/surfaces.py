@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
 from ...mesh.ranks import from_root, total
+from ...mesh.simplices import local_edges
 from ..criterion import Average, CarriedStress, Edges
 from ..strength import Strength
 from .level_set import DirectionField
@@ -94,10 +95,27 @@ class BrittleSurfaces:
         return np.asarray(self.strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
 
     def _gradients(self, cells: Cells) -> Values:
-        """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0)."""
+        """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0). Of quadratic cells
+        the mean, as stress is: that of linear cells with `_mean_corners`."""
         rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.corners(cells)
+        if self._domain.order == 2 and not self._stress.energy.linear:
+            now = self._mean_corners(cells)
         span, moved = (corners[:, 1:] - corners[:, :1] for corners in (rest, now))
         return np.swapaxes(np.linalg.solve(span, moved), 1, 2)
+
+    def _mean_corners(self, cells: Cells) -> Values:
+        """(n, d + 1, d) corners of the straight cells with the mean gradient of quadratic ones, but for a shift, m.
+
+        It is the gradient at the centroid, where the shape functions l_i (2 l_i - 1) of corners have the slope
+        (4 / (d + 1) - 1) grad l_i and 4 l_i l_j of middles 4 / (d + 1) (grad l_i + grad l_j).
+        """
+        domain, d = self._domain, self._domain.dim
+        x = domain.nodes + self._stress.u.x.array.reshape(-1, d)
+        middles, share = x[domain.cell_middles[cells]], 4 / (d + 1)
+        result: Values = (share - 1) * x[domain.cell_nodes[cells]]
+        for number, ends in enumerate(local_edges(d)):
+            result[:, ends] += share * middles[:, number, None]
+        return result
 
     def _field(self, averaged: Values) -> tuple[Any, ...]:
         """Stress, F and strength of all cells in input order, on rank 0 (collective)."""
