@@ -9,7 +9,6 @@ forces on nodes; stiffness and mass are its own.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -17,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from .interpreters import able
 
 VARIABLE = "AKANTU_PYTHON"
 ABSENT = f"Akantu is not installed here ({VARIABLE} names no Python that can import it)."
@@ -28,14 +29,7 @@ Values = npt.NDArray[np.float64]
 @cache
 def interpreter() -> str | None:
     """A Python that can import Akantu, where there is one."""
-    given = os.environ.get(VARIABLE)
-    if not given:
-        return None
-    try:
-        done = subprocess.run([given, "-I", "-c", "import akantu"], capture_output=True, timeout=60)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return given if done.returncode == 0 else None
+    return able(VARIABLE, "import akantu")
 
 
 def problem_of(scene: Any, step: float) -> dict[str, Any]:

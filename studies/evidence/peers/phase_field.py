@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import tempfile
 import time
@@ -26,6 +25,7 @@ import numpy.typing as npt
 
 from ..section import Cell, Section, Table
 from ..trial import Trial
+from .interpreters import able
 
 VARIABLE = "PHASEFIELDX_PYTHON"
 ABSENT = f"PhaseFieldX is not installed here ({VARIABLE} names no Python that can import it)."
@@ -42,15 +42,7 @@ Values = npt.NDArray[np.float64]
 @cache
 def interpreter() -> str | None:
     """A Python that can import PhaseFieldX, where there is one."""
-    given = os.environ.get(VARIABLE)
-    if not given:
-        return None
-    asked = "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve"
-    try:
-        done = subprocess.run([given, "-c", asked], capture_output=True, timeout=120)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return given if done.returncode == 0 else None
+    return able(VARIABLE, "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve")
 
 
 def study(n: int) -> dict[str, Any]:
