@@ -37,6 +37,15 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 0.1, "approach": "edge"},
         "brittle": {"surfaces": 3, "grains": {"count": 25, "seed": 3, "mode": "bias"}},
     },
+    # torn along grains, then pushed together: pieces touch where grains are cut
+    "shut": {
+        "mesh": MESHES["2d"], "material": STONE | {"energy": "neo-hookean"},
+        "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "displacement": {
+            "time": [0.0, 0.125, 0.4], "value": [[0.0, 0.0], [0.07, 0.02], [-0.1, 0.0]]}}],
+        "fracture": {"strength": 0.1}, "brittle": {"surfaces": 3, "grains": {"count": 8, "seed": 3}},
+        "contact": {"itself": "pieces", "friction": 0.2},
+        "time": {"scheme": "backward-euler", "step": 0.025, "end": 0.3},
+    },
     # a lattice stretched alike in all directions: every cell is tied and every direction a principal one
     "ties": {
         "mesh": {"builder": "box", "size": [1.0, 0.5], "h": 0.0625},
