@@ -37,7 +37,7 @@ class CohesiveTips(CrackTips):
         begins: whether a crack may begin.
     """
 
-    begins = False
+    begins, pairs = False, False
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, as loaded as they may be (collective)."""

@@ -37,7 +37,6 @@ Values = npt.NDArray[np.float64]
 DISC = {2: 5.0, 3: 4.0}  # R over h: the radius of the disc (ball) on which a tip's force is summed
 AVERAGE = 3.0  # radius over h on which stress is averaged
 CELLS = {2: 2.5, 3: 5.0}  # passes in which a crack gets on by h
-AT_ONCE = 2  # cells by which a tip in the plane gets on in a pass without inertia
 APART = {2: 5.0, 3: 0.5}  # h between tips that advance at once
 FULL = 1.5  # h beyond R within which there is a split cell once a tip is mature
 # mean square of the first principal stress over a disc of radius rho about a tip, in E' G / rho:
@@ -87,7 +86,10 @@ class CrackTips:
         cut: (edges,) where cracks cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
         toughness: G_c in J/m^2, a number or (cells,).    strength: of each edge in each cell.
         cells: (n,) of this rank that were chosen last.    barred: (cells,) not to be cut (joined).
+        pairs: whether tips in the plane go through two cells in a pass without inertia.
     """
+
+    pairs = True
 
     def __init__(
         self,
@@ -281,12 +283,9 @@ class CrackTips:
             return np.empty(0, np.int64)
         grows, begins = self._rows(grown, self._way_out(grown)), self._rows(begun, self._through(begun))
         edges, ahead = self._remembered(np.concatenate([grows, begins]))
-        if self._domain.dim == 3 or self.sight.motion is not None:
+        if not self.pairs or self._domain.dim == 3 or self.sight.motion is not None:
             return edges
-        for _ in range(AT_ONCE - 1):
-            further, ahead = self._further(edges, ahead)
-            edges = np.concatenate([edges, further])
-        return edges
+        return np.concatenate([edges, self._further(edges, ahead)])
 
     def _remembered(self, rows: Values) -> tuple[Edges, Values]:
         """Where edges are cut, from all ranks: (n,) local edges of this one, and (n, d) whither cracks go on from there
@@ -300,7 +299,7 @@ class CrackTips:
         self.cut[local[new]] = chosen[:, 2]
         return local[new], chosen[:, 6:]
 
-    def _further(self, edges: Edges, ahead: Values) -> tuple[Edges, Values]:
+    def _further(self, edges: Edges, ahead: Values) -> Edges:
         """Whole cells beyond edges (n,) that were cut just now are cut straight `ahead` (n, d); 0: not (collective).
 
         A tip that turned by K_I and K_II knows where it goes for more than a cell; g, of a disc of 5 h, is the same in
@@ -317,7 +316,7 @@ class CrackTips:
         self.cells = np.concatenate([self.cells, cells])
         rank = self._ranked(0, np.zeros(len(cells)), place, np.zeros(len(cells)))
         none = np.empty((len(cells), 2, 2))
-        return self._remembered(self._rows(Proposal(rank, cells, none, entry, ahead, turns, ~turns), cuts))
+        return self._remembered(self._rows(Proposal(rank, cells, none, entry, ahead, turns, ~turns), cuts))[0]
 
     def _way_out(self, grown: Proposal) -> Cuts:
         """Where the cells of tips are left (collective)."""
