@@ -100,7 +100,7 @@ EXPERIMENTS = (
         "kalthoff", "kalthoff", ("h", (9.5e-4, 8.5e-4, 7.5e-4)), "", "", 0.0, "no load, but the angle below", {}
     ),
     Experiment(
-        "branching", "branching", ("h", (5e-4, 4.5e-4, 4e-4)), "", "", 0.0, "no load, but the angles below",
+        "branching", "branching", ("h", (5e-4, 4.7e-4, 4e-4)), "", "", 0.0, "no load, but the angles below",
         {"fracture": {"crumbs": True}},
     ),
 )  # fmt: skip
