@@ -318,7 +318,7 @@ class Engine:
         dt, bodies, friction = self._rules.step, met.bodies, self._data.contact.friction[:, 0]
         inverse = bodies.turn @ self._model.inverse @ np.swapaxes(bodies.turn, 1, 2)
         free = self._motion(self._driven_on(bodies, np.zeros((self._count, 6))), rates)
-        for _ in range(LOOKS if rough else 1):
+        for _ in range(LOOKS):
             rows = np.flatnonzero(met.near)
             some = met.contacts.chosen(rows)
             crowd = Crowd.of(some, friction[rows], self._model.mass, inverse)
