@@ -46,14 +46,15 @@ class LooseParts:
         self.pc.setType("python")
         self.pc.setPythonContext(self)
 
-    def follow(self, tangent: PETSc.Mat) -> bool:
-        """Serve this tangent, and the body where it is now; False: all that hangs is held (collective)."""
+    def follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None = None) -> bool:
+        """Serve this tangent, and the body where it is now; `products`: what it is multiplied with, if that is another
+        matrix. False: all that hangs is held (collective)."""
         if self._at == (at := (tangent.handle, tangent.stateGet())):
             return True
         self._forget_parts()
         if (Z := self._motions(tangent)) is None:
             return False
-        self._K, self._Z, self._at = tangent, Z, at
+        self._K, self._Z, self._at = products or tangent, Z, at
         self._small, self._inner = Z.createVecRight(), Z.createVecRight()
         self._moved, self._left = tangent.createVecs()
         E, self._solve = tangent.ptap(Z), PETSc.PC().create(tangent.comm)

@@ -97,7 +97,7 @@ class Preconditioner:
         self._count()
         ksp = self._ksp
         if self.due == Due.NOTHING:
-            self._follow(tangent)
+            self._follow(tangent, products)
             return
         if self.due == Due.REBUILD:
             self.pc.reset()
@@ -111,12 +111,12 @@ class Preconditioner:
         if self._sees_to_parts:
             self.forget_parts()
             self._loose = self._loosen(self.pc)
-        self._follow(tangent)
+        self._follow(tangent, products)
 
-    def _follow(self, tangent: PETSc.Mat) -> None:
+    def _follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None) -> None:
         """What serves is brought to a tangent that is solved with next."""
         self.serving, loose = self.pc, self._loose
-        if loose is not None and loose.body is self.pc and loose.follow(tangent):
+        if loose is not None and loose.body is self.pc and loose.follow(tangent, products):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
 
