@@ -318,12 +318,12 @@ class Engine:
         dt, bodies, friction = self._rules.step, met.bodies, self._data.contact.friction[:, 0]
         inverse = bodies.turn @ self._model.inverse @ np.swapaxes(bodies.turn, 1, 2)
         free = self._motion(self._driven_on(bodies, np.zeros((self._count, 6))), rates)
-        for _ in range(LOOKS):
+        for number in range(LOOKS):
             rows = np.flatnonzero(met.near)
             some = met.contacts.chosen(rows)
             crowd = Crowd.of(some, friction[rows], self._model.mass, inverse)
             aim: Values = np.asarray(met.meeting.aim[rows] / dt)
-            enough, most = NEARLY * self._rules.fast, ROUGH if rough else MOST
+            enough, most = NEARLY * self._rules.fast, ROUGH if rough or number else MOST
             met.impulse[rows] = crowd.impulses(some.parting(*free), aim, enough, most, met.impulse[rows])
             force = self._forces(bodies, crowd.gained(met.impulse[rows]))
             missed = self._missed(met, met.near, self._motion(self._driven_on(bodies, force), rates))
