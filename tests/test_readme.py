@@ -20,6 +20,7 @@ from fracsim.study.file import validate
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def test_the_study_in_the_readme_runs(tmp_path: Path) -> None:
@@ -59,9 +60,16 @@ def test_the_lines_of_python_in_the_readme_step_as_the_command_does(tmp_path: Pa
         np.testing.assert_allclose([*row[:4], count, *row[5:]], found, rtol=1e-10, atol=1e-14)
 
 
-def test_files_that_the_readme_names_exist() -> None:
-    """Source files and pictures."""
-    for name in re.findall(r"`((?:fracsim|forms|meshes|studies|tests)/[\w/]+\.py)`", TEXT) + re.findall(
-        r"\((docs/[^)]+)\)", TEXT
-    ):
-        assert (ROOT / name).exists(), name
+def test_files_that_the_pages_name_exist() -> None:
+    """Source files, pictures and other pages, with the headings that links go to."""
+    for page in PAGES:
+        text = page.read_text()
+        for name in re.findall(r"`((?:fracsim|forms|meshes|studies|tests)/[\w/]+\.py)`", text):
+            assert (ROOT / name).exists(), name
+        for name, _, heading in (link.partition("#") for link in re.findall(r"\]\(([^):]+)\)", text)):
+            assert (page.parent / name).exists(), (page.name, name)
+            headings = [
+                re.sub(r"[^\w -]", "", line).lower().replace(" ", "-")
+                for line in re.findall(r"^#+ (.*)$", (page.parent / name).read_text(), re.MULTILINE)
+            ] if heading else []  # fmt: skip
+            assert not heading or heading in headings, (page.name, heading)
