@@ -48,7 +48,7 @@ def test_a_body_that_cg_is_cheap_for_keeps_it() -> None:
     for solver in (solvers.WAYS["default"], solvers.WAYS["CG"]):
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=solver)
         found.append([walk.advance().solve.krylov for _ in range(2)])
-        assert scene.solver is not None and scene.solver._with_factors == 0
+        assert scene.solver is not None and scene.solver._choice.left == 0
         scene.destroy()
     assert found[0] == found[1]
 
@@ -58,7 +58,7 @@ def test_factors_that_are_preferred_find_a_stable_balance() -> None:
     positive (dense eigenvalues)."""
     scene, walk = pressed(solver={"snes_rtol": 1e-9})
     assert scene.solver is not None
-    scene.solver._take_factors(preferred=True)
+    scene.solver._choice.take(preferred=True)
     assert walk.advance().solve.converged
     assert abs(displacement(scene, walk)[:, 0]).max() > 0.2 and scene.balance.stress.stored() < 20.0
     free = np.flatnonzero(scene.balance.motion.free)

@@ -11,7 +11,14 @@ condensed          a tangent less what terms have eliminated
 energy_book        work and viscous loss of a step
 stress_release     what broken edges no longer hold
 newton             one nonlinear solve, and what is tried where it fails
+choice             iterations or factors: what a solve begins with; factors: what they cost
+forcing            how exactly its linear systems are solved
+one_solve          steps that are one linear solve
+descent, downhill  what its line search goes down, with moduli made positive where it would go up
+blocks             products with the tangent in blocks of a node's dofs
+woodbury           few stiff pairs beside what a preconditioner knows
 preconditioner     when multigrid is made anew
+rigid_modes        its near null space; loose_parts: the same of parts that hang by a node or an edge
 petsc_options      options of one solver
 frequencies        bounds on how fast cells vibrate, for explicit steps
 edge_frequencies   the same of cells with broken edges

@@ -16,7 +16,8 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .blocks import Blocks, worth_it
-from .factors import FACTORISED, MANY, SOONER_THAN_GMRES, Factors
+from .choice import Choice
+from .factors import FACTORISED, SOONER_THAN_GMRES, Factors
 from .forcing import Forcing, Sparing
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
@@ -48,8 +49,6 @@ LARGE_GAP = 0.01
 
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
-# solves that start with factors once iterations have failed: the first time, and at most
-FIRST_SPELL, LONGEST_SPELL = 8, 256
 
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
@@ -113,11 +112,9 @@ class Solver:
         self._factors = Factors(
             self._preconditioner, symmetric=balance.symmetric, dofs=balance.vector.getSize(), dim=balance.domain.dim
         )
-        self._with_factors, self._spell = 0, FIRST_SPELL  # solves that start with factors: still to come, next time
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
-        self._may_prefer = own and self._may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
-        self._preferred = False  # whether they do because iterations were dear, not because they failed
-        self._watches, self._dear = self._may_prefer, False  # whether a solve stops where it gets dear, and has
+        may_prefer = own and self._may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
+        self._choice = Choice(self._factors, may_prefer=may_prefer)
 
     def _loosen(self, body: PETSc.PC) -> LooseParts | None:
         from .loose_parts import loose_parts
@@ -173,61 +170,46 @@ class Solver:
     # --- a solve, and what is tried where it fails ---
 
     def solve(self, guess: Values) -> SolveResult:
-        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution.
-
-        Where iterations fail the system is factorised. The next solves start with factors then: as many as the spell
-        says, which doubles each time that iterations fail again, and is short again once they do not. So they do where
-        iterations were dearer than factors, as long as those find a balance that is stable.
-        """
-        if self._with_factors:
-            self._with_factors -= 1
-            result = self._attempt_directly(guess)
-            if not self._preferred or (result.converged and self._factors.positive):
-                return result
-            self._with_factors = 0
+        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice)."""
+        choice = self._choice
+        if choice.begins_with_factors() and choice.trusts(result := self._attempt_directly(guess)):
+            return result
         result = self._attempt_iteratively(guess)
-        if self._dear:
+        if choice.dear:
             return self._go_on_directly(guess)
         if self._misled(result) and self._may_factorise():
             result = self._attempt_directly(self.balance.level.u if self._sets_out_anew else guess)
             if result.converged:
-                self._take_factors(preferred=False)
-        elif self._was_dear(result):
-            self._take_factors(preferred=True)
+                choice.take(preferred=False)
+        elif choice.was_dear(result, positively=self._positively):
+            choice.take(preferred=True)
         elif not self._misled(result):
-            self._spell = FIRST_SPELL
-            self._factors.forget()
+            choice.iterate()
         return result
 
     def _go_on_directly(self, guess: Values) -> SolveResult:
         """From where iterations have become dear; all the way by them where factors find nothing that is stable."""
-        self._dear, krylov = False, self.snes.getLinearSolveIterations()
-        tangents = self._tangents_of_factors(self.snes.its)
+        choice, positively = self._choice, self._positively
+        choice.dear, krylov, newton = False, self.snes.getLinearSolveIterations(), self.snes.its
         result = self._attempt_directly(None)
         if result.converged and self._factors.positive:
-            if krylov > self._factors.worth * tangents:
-                self._take_factors(preferred=True)
+            if krylov > choice.worth(newton, positively=positively):
+                choice.take(preferred=True)
             return result
-        self._watches = False
-        result = self._attempt_iteratively(guess)
-        self._watches = self._may_prefer
-        return result
+        with self._to_the_end():
+            return self._attempt_iteratively(guess)
 
-    def _take_factors(self, *, preferred: bool) -> None:
-        """For the next spell of solves."""
-        self._preferred = preferred
-        self._with_factors, self._spell = self._spell, min(2 * self._spell, LONGEST_SPELL)
+    @property
+    def _positively(self) -> bool:
+        """Whether the last attempt was with moduli made positive, and without inertia."""
+        return self.snes is not self._first_choice[0] and not self.balance.scheme.inertia
 
-    def _was_dear(self, result: SolveResult) -> bool:
-        """Whether factors would have cost less than the iterations of a solve."""
-        dear = result.krylov > self._factors.worth * self._tangents_of_factors(result.newton)
-        return self._may_prefer and result.converged and dear
-
-    def _tangents_of_factors(self, newton: int) -> int:
-        """How many a solve of so many Newton iterations would take by factors. Without inertia moduli made positive
-        take several times as many as exact ones."""
-        made_positive = self.snes is not self._first_choice[0] and not self.balance.scheme.inertia
-        return min(newton, MANY) if made_positive else max(newton, 1)
+    @contextmanager
+    def _to_the_end(self) -> Iterator[None]:
+        """However dear iterations get."""
+        watched, self._choice.watches = self._choice.watches, False
+        yield
+        self._choice.watches = watched
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)
@@ -301,12 +283,10 @@ class Solver:
         return self._iterative and dofs <= most and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
     def _attempt_directly(self, guess: Values | None) -> SolveResult:
-        watched, self._watches = self._watches, False
-        with self._factors.of(self.snes.ksp):
+        with self._to_the_end(), self._factors.of(self.snes.ksp):
             result = self._attempt(guess)
             if result.newton and result.converged and self.snes.ksp.getType() == "preonly":
                 self._factors.learn(self.snes.ksp)
-        self._watches = watched
         return result
 
     def _misled(self, result: SolveResult) -> bool:
@@ -409,7 +389,7 @@ class Solver:
         """
         self._shrink()
         with_factors = [False, True] if self._may_factorise() else [False]
-        for factors in with_factors[1:] if self._with_factors else with_factors:
+        for factors in with_factors[1:] if self._choice.left else with_factors:
             self.balance.vector.array_w[:] = force
             with self.balance.untouched(), self._factors.of(self.snes.ksp) if factors else nullcontext():
                 solved = self._solve_linear()
@@ -521,10 +501,7 @@ class Solver:
             return int(reason.DIVERGED_FNORM_NAN)
         if self._is_small(norms[2], its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
-        krylov = snes.getLinearSolveIterations()
-        factors = self._factors
-        if self._watches and its and krylov > max(factors.dear, factors.worth * self._tangents_of_factors(its)):
-            self._dear = True
+        if self._choice.gets_dear(snes.getLinearSolveIterations(), its, positively=self._positively):
             return int(reason.DIVERGED_INNER)
         return int(reason.ITERATING)
 

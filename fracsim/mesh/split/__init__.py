@@ -4,6 +4,7 @@ table     what every damage pattern does to one cell, derived once
 skeleton  numbers of the edges, facets and boundary of the input mesh
 points    the points of a state of damage, numbered
 build     damage -> points, elements and the parents of every point
+flat      cells cut flat between pieces; solid: the surface of pieces alone; laid: all walls, those of pieces there
 smooth    where edges are cut so that what is drawn is smooth
 local     the surface of one rank's cells, whose points follow nodes linearly
 places    the same points drawn in towards their nodes by any share; identity: which are the same after a break
