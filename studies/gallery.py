@@ -100,7 +100,7 @@ ENTRIES = (
         "punched-slab", "A ball shot through a slab of metal, from below.",
         (("punched-slab", "punched-slab --set mesh.h=0.008"),), "--view=0.5,-1.1,-0.45 --zoom 1.9",
     ),
-    one("table-loaf", "A loaf torn over a table, and the chunk that fell on it.", "--view 0.35,-1.3,0.45 --zoom 1.7"),
+    one("table-loaf", "A loaf torn over a table, and chunks that fell on it.", "--view 0.35,-1.3,0.45 --zoom 1.7"),
     one("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9 --zoom 1.6"),
     one("rigid-wall", "A wall of adobe as rigid bodies.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor --zoom 1.3"),
     one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
