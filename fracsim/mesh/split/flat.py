@@ -1,8 +1,8 @@
 """Cells cut flat between pieces: by one triangle around a node, or by two between two nodes and two.
 
 What a node owns of its cell ends at six triangles that meet in the middle of the cell (table). Between pieces, where
-every edge from one group of nodes to another is broken, the plane through the middles of these edges does: a fifth of
-the elements, and no corners that stick out. Its points are on edges alone, so that neighbours agree on them.
+every edge from one group of nodes to another is broken, the plane through the places where these are cut does: a fifth
+of the elements, and no corners that stick out. Its points are on edges alone, so that neighbours agree on them.
 """
 
 from __future__ import annotations

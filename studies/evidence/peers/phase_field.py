@@ -11,7 +11,6 @@ Its length scale is two cells, the least that is taken for resolved.
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import tempfile
@@ -25,6 +24,7 @@ import numpy.typing as npt
 
 from ..section import Cell, Section, Table
 from ..trial import Trial
+from . import write_of_size
 from .interpreters import able
 
 VARIABLE = "PHASEFIELDX_PYTHON"
@@ -140,11 +140,7 @@ def _figures(load: Values, seconds: float, solves: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--n", type=int, default=SIZES[0])
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    given = parser.parse_args()
-    given.out.write_text(json.dumps(beside(given.n), indent=1) + "\n")
+    write_of_size(__doc__, SIZES[0], beside)
 
 
 # --- the section ----------------------------------------------------------------------------------------------------
