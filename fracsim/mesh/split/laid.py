@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, eye_array
 
 from ..simplices import local_edges
-from .build import points_of, split
+from .build import points_of
 from .flat import flat_table, middles
 from .places import Places, whole
 from .points import SurfacePoints
@@ -26,21 +26,23 @@ def laid(at: Places, skeleton: Skeleton, pattern: npt.NDArray[np.integer], flat:
     Where a crack within the piece has come to one its sides are there at rest, and go with their own nodes from then
     on. Nodes without a whole cell keep their walls.
     """
-    points, mean, cracked = _on_flat(skeleton, pattern)
+    drawn = points_of(skeleton, pattern)
+    points, mean, cracked = _on_flat(skeleton, pattern, drawn)
     at = at.laid_on(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
         return at
-    made = split(skeleton, pattern)
-    places, beside = made.points.copy(), points[cracked]
+    places, beside = drawn.positions.copy(), points[cracked]
     places[beside] = mean[cracked] @ flat.rest
-    return at.laid_on(beside, eye_array(len(places), format="csr")[beside], whole(made, skeleton, pattern, places))
+    return at.laid_on(beside, eye_array(len(places), format="csr")[beside], whole(drawn, skeleton, pattern, places))
 
 
-def _on_flat(skeleton: Skeleton, pattern: npt.NDArray[np.integer]) -> tuple[Ints, csr_matrix, Flags]:
-    """Numbers (k,) of the points on walls between pieces, rows (k, m) of which points of the flat surface each is the
-    mean, and flags (k,) of those beside a crack within the piece."""
+def _on_flat(
+    skeleton: Skeleton, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
+) -> tuple[Ints, csr_matrix, Flags]:
+    """Numbers (k,) of the points `drawn` on walls between pieces, rows (k, m) of which points of the flat surface each
+    is the mean, and flags (k,) of those beside a crack within the piece."""
     apart, loose, piece = parted(skeleton, pattern)
-    drawn, flat = points_of(skeleton, pattern), points_of(skeleton, patterns_of(skeleton, apart), flat_table)
+    flat = points_of(skeleton, patterns_of(skeleton, apart), flat_table)
     node = skeleton.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
     own = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]

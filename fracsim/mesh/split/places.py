@@ -18,6 +18,7 @@ from scipy.sparse import csr_matrix, diags
 from ..simplices import is_split
 from .build import Split
 from .follow import Follow
+from .points import SurfacePoints
 from .skeleton import Skeleton
 
 Ints = npt.NDArray[np.int64]
@@ -82,10 +83,10 @@ def middles(points: Values, follow: Follow) -> Values:
     return result
 
 
-def whole(made: Split, skeleton: Skeleton, pattern: npt.NDArray[np.integer], places: Values) -> Places:
+def whole(made: Split | SurfacePoints, skeleton: Skeleton, pattern: npt.NDArray[np.integer], places: Values) -> Places:
     """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
     that has the whole mesh."""
-    d, count, follow = skeleton.dim, len(made.points), made.follow
+    d, count, follow = skeleton.dim, len(places), made.follow
     parents = np.diff(follow.start)
     rows = np.repeat(np.arange(count), parents)
     share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
