@@ -46,11 +46,13 @@ def mass(scene: Scene) -> Values:
 # --- the surface that touches ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("order", (1, 2))
 @pytest.mark.parametrize("dim", (2, 3))
-def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int) -> None:
+def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int, order: int) -> None:
     """With a third of the body torn: x = A X + b at every point, and sum f, sum X f^T of forces are those at the
     points. The area grows by that of the walls."""
-    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0] * dim, "h": 0.25, "pattern": "unstructured"})
+    mesh = {"builder": "box", "size": [1.0] * dim, "h": 0.25, "pattern": "unstructured", "order": order}
+    scene, _ = make_scene(mesh=mesh)
     domain = scene.domain
     surface, graph = LocalSurface(domain), EdgeGraph(domain)
     assert surface.area.sum() == pytest.approx(2 * dim)

@@ -15,6 +15,8 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 
 import xdmf_reader
+from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.split.local import LocalSurface
 from fracsim.output.breaks import Breaks
 from fracsim.run import run_study
 from fracsim.stepping.frequencies import cell_frequencies
@@ -109,7 +111,6 @@ def test_vtk_reads_curved_cells(tmp_path: Path) -> None:
         ({"fracture": {"strength": 1.0, "approach": "edge"}}, "fracture.approach"),
         ({"fracture": {"strength": 1.0, "unilateral": True}}, "fracture.unilateral"),
         ({"fracture": {"strength": 1.0, "energy": 1.0}}, "fracture.energy"),
-        ({"contact": {}, "fracture": {"strength": 1.0}}, "contact"),
     ],
 )
 def test_what_needs_straight_cells_is_refused(tables: dict[str, Any], key: str) -> None:
@@ -175,7 +176,7 @@ def test_plastic_bending_does_not_lock() -> None:
 # --- contact ---
 
 
-def pressed(order: int) -> tuple[float, Any]:
+def pressed(order: int, **more: Any) -> tuple[float, Any]:
     """Force of a plate that presses a block by a twentieth of its height, and the displacement of the block's top."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5, "order": order},
@@ -194,6 +195,7 @@ def pressed(order: int) -> tuple[float, Any]:
             }
         ],
         time={"scheme": "quasi-static", "step": 0.2, "end": 1.0},
+        **more,
     )
     march(scene, state)
     top = np.abs(scene.domain.nodes[:, 1] - 1) < 1e-9
@@ -208,6 +210,35 @@ def test_middles_touch_too() -> None:
     force, top = pressed(2)
     assert force == pytest.approx(linear, rel=0.02)
     assert np.ptp(top) < 0.01 * 0.5
+
+
+def test_what_may_break_is_touched_alike() -> None:
+    """As long as it is whole."""
+    force, top = pressed(2)
+    found, at = pressed(2, fracture={"strength": 1e9})
+    assert found == pytest.approx(force, rel=1e-9)
+    np.testing.assert_allclose(at, top, atol=1e-12)
+
+
+def test_cells_with_broken_edges_are_touched_by_their_corners() -> None:
+    """Middles are points of the facets of whole cells alone, and the surface is as large as that of linear cells."""
+    area = {}
+    for order in (1, 2):
+        scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0, 0.5], "h": 0.25, "order": order})
+        domain = scene.domain
+        surface, graph = LocalSurface(domain), EdgeGraph(domain)
+        ends = domain.nodes[graph.edge_nodes][:, :, 0]
+        graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.4))
+        surface.follow_damage(graph.pattern)
+        area[order] = surface.area.sum()
+        if order == 2:
+            touched = surface.columns[abs(surface.at.weights).max(axis=0).toarray().ravel() > 1e-12]
+            cells = np.flatnonzero(graph.pattern)
+            of_whole = domain.cell_middles[np.flatnonzero(graph.pattern == 0)]
+            only_broken = np.setdiff1d(domain.cell_middles[cells], of_whole)
+            assert len(only_broken) and not np.isin(only_broken, touched).any()
+            assert np.isin(of_whole, touched).any()
+    assert area[2] == pytest.approx(area[1], rel=1e-12)
 
 
 # --- mass ---

@@ -205,9 +205,10 @@ def test_on_a_slope_it_sticks_or_slides_as_coulomb_says(mu: float, tmp_path: Pat
         assert lost1 - lost0 == pytest.approx(mu * 100 * G * np.cos(slope) * way, rel=0.05)
 
 
-def test_walls_that_come_to_light_are_outside(tmp_path: Path) -> None:
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_walls_that_come_to_light_are_outside(order: int) -> None:
     """A body broken by an axe: no corner of its walls is in the axe, and none of its elements is cut, in any step."""
-    scene, state = make_scene(**RUNS["hewn"])
+    scene, state = make_scene(**RUNS["hewn"] | {"mesh": RUNS["hewn"]["mesh"] | {"order": order}})
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     broken, drawn_in = 0, 0
     for report in each_step(scene, state):

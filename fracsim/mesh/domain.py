@@ -19,7 +19,7 @@ from ..meshes.words import format_point
 from .dolfinx_calls import KeptCell, coordinate_element, create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
-from .ranks import Gather, total
+from .ranks import Gather, GatherSome, total
 from .simplices import local_edges
 
 if TYPE_CHECKING:
@@ -191,6 +191,22 @@ class Domain:
     @cached_property
     def gather_nodes(self) -> Gather:
         return Gather(self.comm, self.node_input[: self.node_count])
+
+    @cached_property
+    def gather_corners(self) -> Gather:
+        """The same of corners alone: the points of the input mesh."""
+        if self.middles is None:
+            return self.gather_nodes
+        return GatherSome(self.comm, self.node_input[: self.node_count], self.corners[: self.node_count])  # type: ignore[index]
+
+    def straight(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(owned dofs,) with those of middles half-way between those of the ends of their edges (collective)."""
+        if self.middles is None:
+            return owned
+        nodal = self.with_ghosts(owned).reshape(-1, self.dim).copy()
+        between, ends = self.middle_ends
+        nodal[between] = nodal[ends].mean(axis=1)
+        return nodal.reshape(-1)[: len(owned)]
 
     @cached_property
     def gather_cells(self) -> Gather:

@@ -149,3 +149,21 @@ class Gather:
             parts = np.split(values[self._order], np.cumsum(self._counts)[:-1])
         result: npt.NDArray[Any] = self.comm.scatter(parts)
         return result
+
+
+class GatherSome(Gather):
+    """The same of some rows: those left out are 0 when scattered."""
+
+    def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64], which: npt.NDArray[np.bool_]) -> None:
+        """`which`: (n,) of the entities this rank owns, with `input_index` (n,) from 0 on for these."""
+        super().__init__(comm, input_index[which])
+        self._which = which
+
+    def __call__(self, values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
+        return super().__call__(values[: len(self._which)][self._which])
+
+    def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
+        some = super().scatter(values)
+        result = np.zeros((len(self._which), *some.shape[1:]), some.dtype)
+        result[self._which] = some
+        return result

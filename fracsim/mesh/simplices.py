@@ -12,7 +12,7 @@ import basix
 import numpy as np
 import numpy.typing as npt
 
-CELL = {2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}
+CELL = {1: basix.CellType.interval, 2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}
 
 
 @cache

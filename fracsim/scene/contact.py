@@ -54,7 +54,7 @@ OF_SPEED = 0.05
 def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
     entries = obstacle_entries(study, domain.dim)
-    law = _law(study.contact or Contact(), domain, material)
+    law = _law(_contact(study), domain, material)
     if not any(each.free for each in entries):
         return Obstacles(domain, u, entries, law)
     from ..mechanics.contact.free_obstacles import FreeObstacles
@@ -70,7 +70,7 @@ def explicit_obstacles_of(
     from ..mechanics.contact.penalty import Penalty
 
     entries = obstacle_entries(study, domain.dim)
-    contact = study.contact or Contact()
+    contact = _contact(study)
     law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
     if not any(each.free for each in entries):
         return ExplicitObstacles(domain, u, entries, law, mass, most)
@@ -100,10 +100,11 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
         ) from None
     every = enumerate(obstacles(study, domain.dim))
     entries = {number: _solid(domain.comm, each, number) for number, each in every if each.shape == "mesh"}
-    contact = study.contact or Contact()
+    contact = _contact(study)
     law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     of_speed = 0.0 if contact.creep else OF_SPEED
-    how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed)
+    straight = domain.order == 2 and study.fracture is not None
+    how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed, straight=straight)
     if not any(each.free for each in entries.values()):
         return Solids(domain, u, entries, how)
     from ..mechanics.contact.solids.free_term import FreeSolids
@@ -139,17 +140,17 @@ def _free_solid(entry: Placing, loose: Loose, solid: Solid) -> Obstacle:
     )  # fmt: skip
 
 
-def self_contact_of(contact: Contact, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
+def self_contact_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
     """The term of a body that touches itself (collective). InputError without ipctk."""
     itself = _by_ipctk("itself")
-    return _self_contact(contact, domain, material, DISTANCE_ITSELF, partial(itself.SelfContact, domain, u))
+    return _self_contact(study, domain, material, DISTANCE_ITSELF, partial(itself.SelfContact, domain, u))
 
 
-def explicit_self_contact_of(contact: Contact, domain: Domain, u: fem.Function, stress: Stress, mass: Values) -> Term:
+def explicit_self_contact_of(study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values) -> Term:
     """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
-    most, itself = _most_added(contact, domain, stress), _by_ipctk("explicit_itself")
+    most, itself = _most_added(_contact(study), domain, stress), _by_ipctk("explicit_itself")
     made = partial(itself.ExplicitSelfContact, domain, u, mass=mass, most=most)
-    return _self_contact(contact, domain, stress.material, DISTANCE, made)
+    return _self_contact(study, domain, stress.material, DISTANCE, made)
 
 
 def _by_ipctk(name: str) -> Any:
@@ -163,15 +164,17 @@ def _by_ipctk(name: str) -> Any:
 
 
 def _self_contact(
-    contact: Contact, domain: Domain, material: MaterialFields, share: float, made: Callable[[Any], Any]
+    study: Study, domain: Domain, material: MaterialFields, share: float, made: Callable[[Any], Any]
 ) -> Term:
     """A term that begins at this `share` of an edge, `made` for a law."""
     from ..mechanics.contact import crowd
 
+    contact = _contact(study)
     distance = contact.distance or share * domain.mean_edge
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
-    law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, contact.itself == "pieces")
+    straight = domain.order == 2 and study.fracture is not None
+    law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, contact.itself == "pieces", straight)
     term = made(law)
     if (gap := term.least_gap()) == np.inf:
         return term
@@ -221,6 +224,10 @@ def _free_obstacle(entry: Placing, loose: Loose, shape: Shape) -> Obstacle:
         entry.name, shape, at, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
         ways=loose.ways, centre=centre, gravity=loose.gravity, rate=loose.rate,
     )  # fmt: skip
+
+
+def _contact(study: Study) -> Contact:
+    return study.contact or Contact()
 
 
 def _law(contact: Contact, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier) -> Law:

@@ -111,8 +111,8 @@ def _contact(parts: Parts) -> Term | None:
     from .contact import explicit_self_contact_of, self_contact_of
 
     if not parts.scheme.implicit:
-        return explicit_self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress, parts.mass.lumped)
-    return self_contact_of(parts.study.contact, parts.domain, parts.u, parts.stress.material)
+        return explicit_self_contact_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
+    return self_contact_of(parts.study, parts.domain, parts.u, parts.stress.material)
 
 
 def _tethers(parts: Parts) -> Term | None:

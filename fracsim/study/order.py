@@ -24,7 +24,7 @@ def check_order(study: Study) -> None:
 
 def _refused(study: Study) -> list[tuple[str, bool, str]]:
     """(key, whether it is given, why not) of all that needs linear displacement."""
-    fracture, contact = study.fracture, study.contact
+    fracture = study.fracture
     return [
         ('time.scheme = "rigid"', study.time.scheme == "rigid", "bodies are solved for with linear displacement"),
         ("fracture.energy", fracture is not None and fracture.energy is not None, "tips go by linear displacement"),
@@ -39,16 +39,6 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
             "springs between the ends of an edge would press its middle, which is free once the cell is cut",
         ),
         ('output.cut = "forces"', study.output.cut == "forces", "corners carry no share of a uniform stress"),
-        (
-            "[[obstacle]] and [fracture]",
-            bool(study.obstacle) and fracture is not None,
-            "walls of cracks follow the corners of cells alone",
-        ),
-        (
-            "[contact] itself and [fracture]",
-            contact is not None and bool(contact.itself) and fracture is not None,
-            "walls of cracks follow the corners of cells alone",
-        ),
     ]
 
 

@@ -21,6 +21,18 @@ RUNS: dict[str, dict[str, Any]] = {
         "boundary": [{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.1]}],
         "fracture": {"strength": 0.2}, "time": {"scheme": "explicit", "step": 0.01, "end": 0.25},
     },
+    # a bar that tears, whose halves are then pressed together beside a wall that is in the way
+    "closed": {
+        "mesh": {"builder": "box", "size": [1.0, 0.3], "h": 0.15, "pattern": "unstructured", "order": 2},
+        "material": SOFT | {"energy": "neo-hookean"}, "fracture": {"strength": 0.2, "crumbs": False},
+        "boundary": [
+            {"on": "left", "fix": "xy"},
+            {"on": "right", "displacement": {"time": [0.0, 0.6, 1.2], "value": [[0.0, 0.0], [0.4, 0.0], [-0.1, 0.0]]}},
+        ],
+        "contact": {"itself": True},
+        "obstacle": [{"name": "wall", "shape": "plane", "at": [0.0, -0.001], "normal": [0.0, 1.0]}],
+        "time": {"scheme": "backward-euler", "step": 0.05, "end": 1.2},
+    },
     "disk": {
         "mesh": {"builder": "disk", "radius": 1.0, "h": 0.3, "arc": 60.0, "order": 2},
         "material": SOFT | {"energy": "stvk"},

@@ -49,7 +49,7 @@ NEAR_END = 1.0, 0.1
 class Law:
     """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s, or below the
     share `of_speed` of the speed of the body, where that is more. `pieces`: without walls inside a piece, and without
-    crumbs (split.solid)."""
+    crumbs (split.solid). `straight`: quadratic cells are touched by their corners alone, as walls of cracks are."""
 
     distance: float
     stiffness: float
@@ -57,6 +57,7 @@ class Law:
     creep: float
     of_speed: float = 0.0
     pieces: bool = False
+    straight: bool = False
 
 
 class Surface:

@@ -51,10 +51,11 @@ class SelfContact(Term):
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = Coupling(domain)
         self._stiff = STIFF * law.stiffness * domain.mean_edge ** (domain.dim - 2)
-        mesh = domain.source if domain.order == 1 else _refined(domain)
+        mesh = _refined(domain) if self._is_refined(law) else domain.source
         self._skeleton = None if mesh is None else Skeleton(mesh)
+        self._gather = domain.gather_corners if law.straight else domain.gather_nodes
         first = domain.space.dofmap.index_map.local_range[0]
-        self._numbers = domain.gather_nodes(first + np.arange(domain.node_count))  # of input nodes, on rank 0
+        self._numbers = self._gather(first + np.arange(domain.node_count))  # of input nodes, on rank 0
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
         self._surface: Surface | None = None
         self._rebuild()
@@ -88,14 +89,17 @@ class SelfContact(Term):
         return Surface(self._skeleton, pattern, self.law, u, self._surface, cut)
 
     def _gathered_pattern(self) -> npt.NDArray[np.uint8] | None:
-        """(C,) of the cells of the skeleton, on rank 0; of quadratic ones, which are cut up there, nothing breaks
-        (collective)."""
+        """(C,) of the cells of the skeleton, on rank 0; nothing breaks where quadratic ones are cut up (collective)."""
         pattern = self._domain.gather_cells(self._pattern)
-        return None if pattern is None else np.repeat(pattern, 1 if self._domain.order == 1 else 2**self._domain.dim)
+        parts = 2**self._domain.dim if self._is_refined(self.law) else 1
+        return None if pattern is None else np.repeat(pattern, parts)
+
+    def _is_refined(self, law: Law) -> bool:
+        return self._domain.order == 2 and not law.straight
 
     def _gathered(self, u: Values) -> Values | None:
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
-        return self._domain.gather_nodes(np.asarray(u).reshape(-1, self._domain.dim))
+        return self._gather(np.asarray(u).reshape(-1, self._domain.dim))
 
     def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
@@ -187,7 +191,7 @@ class SelfContact(Term):
                 gradient = gradient + self._rubbing.gradient(x)
             return self._surface.handed_down(-gradient)
 
-        return np.asarray(self._domain.gather_nodes.scatter(on_root(self.comm, found))).reshape(-1)
+        return np.asarray(self._gather.scatter(on_root(self.comm, found))).reshape(-1)
 
     def struck(self) -> Values:
         """(owned dofs,) forces at the end of the step, N (collective)."""
@@ -222,7 +226,7 @@ class SelfContact(Term):
             matrix = self._coupling(K, self._numbers)
         if (stiffness := self.comm.bcast(stiff and stiff[1])) is None:
             return matrix
-        directions = self._domain.gather_nodes.scatter(stiff and stiff[0])
+        directions = self._gather.scatter(stiff and stiff[0])
         return Stiff(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def least_gap(self) -> float:

@@ -50,6 +50,10 @@ class LocalSurface:
     def follow_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Be the surface of a body with these patterns of broken edges, (cells,) (collective)."""
         made = split(self._skeleton, pattern)
+        if self._domain.order == 2:
+            from .refined import with_middles_of
+
+            made = with_middles_of(made, self._domain, pattern)
         area = _areas(made, self._skeleton)
         self._touching = np.flatnonzero(area > 0)
         self.area, self._made = area[self._touching], made
@@ -134,10 +138,6 @@ class LocalSurface:
 
 def _mesh_of(domain: Domain) -> MeshData:
     """This rank's cells, and which of their facets are on the boundary of the body."""
-    if domain.order == 2:
-        from .refined import refined
-
-        return refined(domain, OUTSIDE)
     exterior = domain._exterior
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
     of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)

@@ -1,21 +1,25 @@
-"""The surface of cells with quadratic displacement, for what touches it: each cell taken for 4 (2D) or 8 straight ones
-between its corners and the middles of its edges.
+"""The surface of cells with quadratic displacement, for what touches it: the middles of edges are points of it too.
 
 On the straight cells alone the middles would be free of contact: between two plates they bulge by a twentieth of an
-edge, and a block is pressed with seven eighths of the force.
+edge, and a block is pressed with seven eighths of the force. A cell with broken edges has no middles that its parts
+could follow: they follow its corners.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ...meshes.data import MeshData
 from ...meshes.topology import oriented
-from ..dolfinx_calls import exterior_facets
 from ..domain import Domain
 from ..middles import with_middles
 from ..simplices import local_edges
+from .build import Split
+from .follow import Follow
+from .skeleton import CRACK
 
 Ints = npt.NDArray[np.int64]
 
@@ -34,14 +38,36 @@ SMALL = {
 }  # fmt: skip
 
 
-def refined(domain: Domain, outside: str) -> MeshData:
-    """This rank's cells cut up, over all nodes of the displacement; `outside`: the group of the body's boundary."""
-    between = _between(domain.cell_nodes, domain.cell_middles)
-    cells = _all_cut(between)
-    cell, opposite = exterior_facets(domain.mesh, domain._exterior).reshape(-1, 2).T
-    corners = np.array([[j for j in range(domain.dim + 1) if j != i] for i in range(domain.dim + 1)])[opposite]
-    facets = _cut(between, cell[:, None], corners, domain.dim - 1)
-    return MeshData(domain.nodes, oriented(domain.nodes, cells)[0], {outside: facets})
+def with_middles_of(made: Split, domain: Domain, pattern: npt.NDArray[np.integer]) -> Split:
+    """The surface of this rank's straight cells with 2 segments (2D) or 4 triangles for each facet of the body's own
+    boundary whose cell is whole: the middles come after all its points, and follow themselves alone."""
+    on_boundary = (made.edge < 0) & (made.origin != CRACK) & (pattern[made.cell] == 0)
+    facets, cell = made.elements[on_boundary], made.cell[on_boundary]
+    i, j = local_edges(domain.dim - 1).T
+    between = _middle_of(domain, cell, made.follow.first_parent[facets[:, i]], made.follow.first_parent[facets[:, j]])
+    nodes, place = np.unique(between, return_inverse=True)
+    smaller = _all_cut(_between(facets, len(made.points) + place.reshape(between.shape)))
+    rest, each = ~on_boundary, len(SMALL[domain.dim - 1])
+    count = np.concatenate([np.diff(made.follow.start), np.ones(len(nodes), np.int64)])
+    points = np.concatenate([made.points, domain.nodes[nodes]])
+    parents = np.concatenate([made.follow.parents, nodes])
+    return replace(
+        made,
+        points=points,
+        follow=Follow.of(parents, count, points, domain.nodes),
+        elements=np.concatenate([made.elements[rest], smaller]),
+        cell=np.concatenate([made.cell[rest], np.repeat(cell, each)]),
+        edge=np.concatenate([made.edge[rest], np.full(len(smaller), -1)]),
+        origin=np.concatenate([made.origin[rest], np.repeat(made.origin[on_boundary], each)]),
+    )
+
+
+def _middle_of(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
+    """(m, n) nodes of the middles between the nodes `low` and `high` (m, n) of cells (m,)."""
+    ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]  # (m, edges, 2)
+    pair = np.sort(np.stack([low, high], axis=-1), axis=-1)
+    same = (pair[:, :, None] == np.sort(ends, axis=-1)[:, None]).all(axis=-1)
+    return np.asarray(np.take_along_axis(domain.cell_middles[cell], same.argmax(axis=-1), axis=1), np.int64)
 
 
 def refined_input(domain: Domain) -> MeshData | None:
@@ -65,13 +91,6 @@ def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer])
 
 
 def _all_cut(between: Ints) -> Ints:
-    """(cells 2^d, d + 1) nodes of the parts of all cells, those of one cell after another."""
-    count = between.shape[1]
-    return _cut(between, np.arange(len(between))[:, None], np.arange(count)[None, :], count - 1)
-
-
-def _cut(between: Ints, cells: npt.NDArray[np.integer], corners: npt.NDArray[np.integer], dim: int) -> Ints:
-    """(n 2^dim, dim + 1) nodes of the parts of simplices of cells (n, 1) with local corners (n or 1, dim + 1)."""
-    parts = np.array(SMALL[dim])  # (2^dim, dim + 1, 2)
-    first, second = corners[:, parts[..., 0]], corners[:, parts[..., 1]]
-    return between[cells[:, :, None], first, second].reshape(-1, dim + 1)
+    """(cells 2^d, d + 1) nodes of the parts of all simplices, those of one after another."""
+    parts = np.array(SMALL[between.shape[1] - 1])  # (2^d, d + 1, 2)
+    return between[:, parts[..., 0], parts[..., 1]].reshape(-1, between.shape[1])

@@ -188,7 +188,7 @@ class FreeSolids(Solids):
         parts = on_root(self.comm, found) or []
         self._put_free({k: each.z for k, each in self.free.items()})
         compliances = self.comm.bcast([compliance for _, compliance in parts])
-        mixed = [self._domain.gather_nodes.scatter(parts[i][0] if parts else None) for i in range(len(compliances))]
+        mixed = [self._gather.scatter(parts[i][0] if parts else None) for i in range(len(compliances))]
         return [(U.reshape(self._owned, len(C)), C) for U, C in zip(mixed, compliances, strict=True)]
 
     def _to_nodes(self, mixed: Values) -> Values:

@@ -241,13 +241,13 @@ class Solids(SelfContact):
         def found() -> Values | None:
             assert self._surface is not None and start is not None and end is not None
             led = self._guided(self._surface, start, end)
-            return None if led is end else led
+            return None if led is end else led - end
 
-        led = on_root(self.comm, found)
-        if not self.comm.bcast(led is not None):
+        aside = on_root(self.comm, found)
+        if not self.comm.bcast(aside is not None):
             return u
-        to = np.asarray(self._domain.gather_nodes.scatter(led)).reshape(-1)
-        return np.asarray(level.u + level.share * (to - level.u))
+        by = np.asarray(self._gather.scatter(aside)).reshape(-1)
+        return np.asarray(u + level.share * (self._domain.straight(by) if self.law.straight else by))
 
     def _guided(self, front: Front, start: Values, end: Values) -> Values:
         """(nodes, 3) where the body gets to on its way from the `start` to the `end` of the step, on rank 0."""
