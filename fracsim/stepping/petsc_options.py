@@ -24,6 +24,8 @@ COMMON = (
 
 _prefixes = itertools.count()
 PETSc.Options()["options_left"] = "false"  # what PETSc would say at the end is checked here at the start
+# or products with several vectors would sum in another order where these happen to lie side by side in memory
+PETSc.Options()["vec_mdot_use_gemv"] = "false"
 _library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptionsUsed
 
 
