@@ -9,7 +9,7 @@ here: with a lumped or constant mass matrix it is linear algebra (stepping.newto
 from __future__ import annotations
 
 import ufl
-from ufl.algorithms import estimate_total_polynomial_degree
+from ufl.algorithms.analysis import extract_elements
 from ufl.core.expr import Expr
 from ufl.form import Form
 
@@ -18,8 +18,9 @@ from .kinematics import deformation_gradient
 
 
 def points_of_stress(field: Expr) -> dict[str, int]:
-    """Metadata of the quadrature of a stress, by the order of a displacement or its test function: 2 (order - 1)."""
-    return {"quadrature_degree": 2 * (estimate_total_polynomial_degree(field) - 1)}
+    """Metadata of the quadrature of a stress, by the order of a displacement (a sum of fields) or its test function:
+    2 (order - 1)."""
+    return {"quadrature_degree": 2 * (max(each.embedded_superdegree for each in extract_elements(field)) - 1)}
 
 
 def internal_work(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import errno
 import gc
 import os
@@ -13,13 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
+from .process import begin_work, import_dolfinx, kept_out, leave
 
 # typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
-_kept_out = sys.modules.setdefault("rich", None) is None  # type: ignore[arg-type]
-import typer  # noqa: E402
-
-if _kept_out:
-    del sys.modules["rich"]
+with kept_out("rich"):
+    import typer
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -58,9 +55,10 @@ def run(
     path = find_study(study)
     folder = out or Path("out") / path.stem
     loaded = _load(comm, path, set_, folder)
+    import_dolfinx()
     from .run import run_study
 
-    gc.enable()
+    begin_work()
     how = {"restart": restart, "overwrite": overwrite}
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
@@ -148,7 +146,7 @@ def render(
     from .report.pictures.look import Look, limits_of, size_of
     from .report.pictures.picture import render
 
-    gc.enable()
+    begin_work()
     how = Look(
         colour, explode, view, zoom, skin=look, size=size_of(size), limits=limits_of(limits) if limits else None,
         magnify=magnify, floor=floor, title=title, bare=bare, dust=dust,
@@ -189,7 +187,7 @@ def report(
         return
     from .report.make import make_report
 
-    gc.enable()
+    begin_work()
     print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
 
 
@@ -208,7 +206,7 @@ def sweep(
     from .report.sweep import run_sweep
     from .study.file import find_study
 
-    gc.enable()
+    begin_work()
     path = find_study(study)
     folder = out or Path("out") / f"{path.stem}-sweep"
     run_sweep(study, path, set_, folder, ranks=ranks, only_list=list_, overwrite=overwrite)
@@ -263,17 +261,21 @@ def _is_root() -> bool:
     return all(os.environ.get(name, "0") == "0" for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK"))
 
 
+def program() -> NoReturn:
+    """Entry point of the console script: main(), in a process of its own."""
+    gc.disable()  # what imports make stays; to look through it for garbage takes a tenth of a small run
+    try:
+        main()
+    except SystemExit as end:
+        leave(end.code)
+
+
 def main() -> NoReturn:
-    """Entry point: one message and an exit code for what a user can mend, on any number of ranks."""
+    """The command line: one message and an exit code for what a user can mend, on any number of ranks."""
     bare = len(sys.argv) == 1  # shows the help, and yet is bad usage
     if not _is_root() and (bare or "--help" in sys.argv):
         sys.exit(Exit.DONE)
-    gc.disable()  # what imports make stays; to look through it for garbage takes a tenth of a small run,
-    atexit.register(gc.freeze)  # and a fifth of it as the process ends
-    try:
-        code = _guarded(lambda: app(standalone_mode=False))
-    finally:
-        gc.enable()
+    code = _guarded(lambda: app(standalone_mode=False))
     if not _is_root() and "mpi4py.MPI" not in sys.modules:
         sys.exit(Exit.DONE)  # mpirun kills all ranks at the first that fails, and rank 0 may still have to say why
     sys.exit(Exit.BAD_INPUT if bare else code)
@@ -326,4 +328,4 @@ def _end_others(message: str, code: int, *, late: bool) -> None:
         end_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
 
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "program"]

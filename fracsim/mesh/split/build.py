@@ -12,7 +12,7 @@ from ...meshes.topology import facets_of
 from .follow import Follow
 from .points import SurfacePoints
 from .skeleton import CRACK, Skeleton
-from .table import Elements, Table, table
+from .table import Elements, Table, table, table_of_whole_cells
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -61,7 +61,8 @@ def split(
     `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle. `table`: what the
     patterns mean, by dimension.
     """
-    return _Builder(skeleton, pattern, cut, table(skeleton.dim))()
+    rows = table if pattern.any() else table_of_whole_cells
+    return _Builder(skeleton, pattern, cut, rows(skeleton.dim))()
 
 
 def points_of(

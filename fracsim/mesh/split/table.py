@@ -94,9 +94,15 @@ def table(dim: int) -> Table:
     return tabled(Cell, dim)
 
 
-def tabled(kind: type[Cell], dim: int) -> Table:
-    """What that kind of cell makes of every pattern."""
-    cells = [kind(dim, pattern) for pattern in range(1 << len(local_edges(dim)))]
+@cache
+def table_of_whole_cells(dim: int) -> Table:
+    """The first row of it, which does for a body in which nothing has broken."""
+    return tabled(Cell, dim, 1)
+
+
+def tabled(kind: type[Cell], dim: int, patterns: int | None = None) -> Table:
+    """What that kind of cell makes of every pattern, or of the first few."""
+    cells = [kind(dim, pattern) for pattern in range(patterns or 1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
     return Table(
         _copies(cells, dim),
@@ -174,6 +180,7 @@ class Cell:
         return [(triangle, -1) for triangle in triangles]
 
 
+@cache
 def _turned(dim: int) -> list[tuple[int, ...]]:
     """Orderings (i, j, ...) of the nodes, one for each ordered pair: in 3D the even ones."""
     return [order for order in permutations(range(dim + 1)) if dim == 2 or sign(order) > 0]
