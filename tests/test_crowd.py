@@ -31,7 +31,7 @@ def test_the_nearest_of_a_cone_is_where_what_is_left_is_at_right_angles() -> Non
     assert np.count_nonzero(near[0] == 0) > 50 and np.count_nonzero((left == 0).all(axis=0)) > 50
 
 
-def pile() -> tuple[Contacts, Bodies]:
+def pile(friction: float) -> tuple[Contacts, Bodies]:
     """Blocks of 30 and 1000 kg in turn, three on three in four layers, that spin and slide, each on four corners of the
     one below or on what stands."""
     at = np.indices((3, 3, 4)).reshape(3, -1).T
@@ -47,16 +47,17 @@ def pile() -> tuple[Contacts, Bodies]:
     axes = np.tile(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), (len(point), 1, 1))
     things = np.stack([first, second], axis=1)
     places = np.concatenate([bodies.place, np.zeros((1, 3))])
-    return Contacts.found(things, things, point, axes, np.zeros(len(point)), places), bodies
+    mu = np.full(len(point), friction)
+    return Contacts.found(things, things, point, axes, np.zeros(len(point)), mu, places), bodies
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
 def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
     """Nothing comes nearer than it may, what parts gives nothing, what sticks stays within the cone and what slips
     gives mu times its pressure against the slip; bodies get what contacts give, by sums that share no code with it."""
-    contacts, bodies = pile()
-    mu, aim = np.full(len(contacts), friction), np.random.default_rng(4).uniform(0.0, 0.3, len(contacts))
-    crowd = Crowd.of(contacts, mu, bodies.mass, np.linalg.inv(bodies.inertia))
+    contacts, bodies = pile(friction)
+    aim = np.random.default_rng(4).uniform(0.0, 0.3, len(contacts))
+    crowd = Crowd.of(contacts, bodies.mass, np.linalg.inv(bodies.inertia))
     still = np.zeros((1, 3))
     free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
     p = crowd.impulses(free, aim, 1e-7, 5000, np.zeros_like(free))

@@ -11,11 +11,13 @@ from scipy.integrate import solve_ivp
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-import fracsim.rigid.engine as engine_of_mujoco
+import fracsim.rigid.engine as engine_room
+import fracsim.rigid.newton as newton_room
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.model import Rules, Stand
+from fracsim.rigid.finding import Finder
+from fracsim.rigid.model import Rules, Stand, model_of
 from fracsim.rigid.primitives import primitive
 from fracsim.rigid.siblings import Overlaps
 from fracsim.rigid.touches import Touches
@@ -44,7 +46,7 @@ def received(touches: list[Touches], thing: int) -> Values:
 def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few contacts, and as many as if they were a crowd."""
     if request.param == "projections":
-        monkeypatch.setattr(engine_of_mujoco, "CROWD", 0)
+        monkeypatch.setattr(engine_room, "CROWD", 0)
 
 
 @pytest.mark.parametrize("step", [2e-3, 5e-4])
@@ -126,8 +128,8 @@ def test_soft_contacts_first_lead_to_the_same_hard_ones(monkeypatch: pytest.Monk
     spin = 5.0 * np.random.default_rng(1).normal(size=(64, 3))
     falling = replace(cubes(grid.tolist()), velocity=np.tile(6.0 * DOWN / G, (64, 1)), spin=spin)
     found = []
-    for at_once in (engine_of_mujoco.AT_ONCE, 1):
-        monkeypatch.setattr(engine_of_mujoco, "AT_ONCE", at_once)
+    for at_once in (newton_room.AT_ONCE, 1):
+        monkeypatch.setattr(newton_room, "AT_ONCE", at_once)
         engine = Engine(falling, [[CUBE]] * 64, [floor()], Rules(5e-3, DOWN, 0.4))
         found.append(run(engine, falling, 1))
     (one, touches), (other, others) = found
@@ -285,9 +287,10 @@ def test_a_round_body_meets_a_floor_with_few_of_its_corners() -> None:
     angle = np.pi * (3 - np.sqrt(5)) * number
     ball = 0.5 * np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
     bodies = replace(cubes([[0.0, 0.0, 0.6]]), velocity=np.array([[0.0, 0.0, -20.0]]))
-    engine = Engine(bodies, [[ball]], [floor()], Rules(2e-2, DOWN))
-    after, _ = engine.advance(bodies)
-    assert 6 <= len(engine._data.contact.dist) <= 24
+    rules, reach, still = Rules(2e-2, DOWN), np.array([2e-2 * 20.0]), np.zeros(1)
+    find = Finder(model_of(bodies, [[ball]], [floor()], rules))
+    assert 6 <= len(find(bodies, np.zeros((1, 3)), [reach, reach], [still, still], rules.step)) <= 24
+    after, _ = Engine(bodies, [[ball]], [floor()], rules).advance(bodies)
     low = (ball @ after.turn[0].T + after.place[0])[:, 2].min()
     assert -5e-4 < low < 5e-3
 

@@ -23,8 +23,11 @@ hulls        unions of convex parts
 clusters     of pieces of shells, all at once
 primitives   shapes of obstacles
 obstacles    those that stand, and those that move freely, as bodies do
-model        the scene as MuJoCo has it; this and the engine alone import it
-engine       MuJoCo: finds contacts, and solves for what they give
+model        the scene as MuJoCo has it; this and the next two alone import it
+finding      MuJoCo finds contacts
+newton       MuJoCo solves for what few contacts give
+crowd        and projected gradients for what many do
+engine       a step of motion: what meets what, and what that gives
 contacts     where they are, and how fast things come together there
 planes       those of hulls with planes
 meeting      the law that they follow

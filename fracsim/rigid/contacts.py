@@ -21,8 +21,8 @@ class Contacts:
     Attributes:
         geoms: (k, 2) of the engine.    things: (k, 2) bodies by their numbers, then what stands in their way.
         point: (k, 3) m.    axes: (k, 3, 3), the first from the first thing to the second.
-        gap: (k,) m, below 0 of what is in one another.    arms: (2, k, 3) r from what the two things turn about, m.
-        levers: (2, k, 3) r x n, m.
+        gap: (k,) m, below 0 of what is in one another.    friction: (k,) Coulomb's coefficient.
+        arms: (2, k, 3) r from what the two things turn about, m.    levers: (2, k, 3) r x n, m.
     """
 
     geoms: Ints
@@ -30,14 +30,17 @@ class Contacts:
     point: Values
     axes: Values
     gap: Values
+    friction: Values
     arms: Values
     levers: Values
 
     @classmethod
-    def found(cls, geoms: Ints, things: Ints, point: Values, axes: Values, gap: Values, places: Values) -> Contacts:
+    def found(
+        cls, geoms: Ints, things: Ints, point: Values, axes: Values, gap: Values, friction: Values, places: Values
+    ) -> Contacts:
         """With the places (things, 3) that things turn about, m."""
         arms = np.stack([point - places[each] for each in things.T])
-        return cls(geoms, things, point, axes, gap, arms, np.cross(arms, axes[:, 0]))
+        return cls(geoms, things, point, axes, gap, friction, arms, np.cross(arms, axes[:, 0]))
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -67,7 +70,14 @@ class Contacts:
     def chosen(self, rows: Ints) -> Contacts:
         """Some (m,) of them."""
         return Contacts(self.geoms[rows], self.things[rows], self.point[rows], self.axes[rows], self.gap[rows],
-                        self.arms[:, rows], self.levers[:, rows])  # fmt: skip
+                        self.friction[rows], self.arms[:, rows], self.levers[:, rows])  # fmt: skip
+
+    def and_more(self, more: Contacts) -> Contacts:
+        """And others after them."""
+        return Contacts(*(
+            np.concatenate([mine, others], axis=int(name in ("arms", "levers")))
+            for (name, mine), others in zip(vars(self).items(), vars(more).values(), strict=True)
+        ))  # fmt: skip
 
     def touches(self, rows: Ints, impulse: Values, closing: Values) -> Touches:
         """Of contacts (m,) that gave impulses (m, 3) along their axes, N s; all met at speeds (k,), m/s."""

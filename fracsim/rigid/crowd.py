@@ -50,7 +50,7 @@ class Crowd:
     levels: Values
 
     @classmethod
-    def of(cls, contacts: Contacts, friction: Values, mass: Values, inverse: Values) -> Crowd:
+    def of(cls, contacts: Contacts, mass: Values, inverse: Values) -> Crowd:
         """Of contacts of bodies with masses (n,) kg and inverse inertia (n, 3, 3) in the axes of space."""
         n, k = len(mass), len(contacts)
         levels: Values = np.zeros((n + 1, 6, 6))
@@ -67,7 +67,7 @@ class Crowd:
         columns = np.where(things == n, 0, 6 * things).T[:, :, None] + np.arange(6)
         at = np.arange(0, 36 * k + 1, 12)
         across = csr_array((entries.ravel(), np.tile(columns.ravel(), 3), at), shape=(3 * k, 6 * n))
-        return cls(across, across.T.tocsr(), scale, things, friction, levels[:n])
+        return cls(across, across.T.tocsr(), scale, things, contacts.friction, levels[:n])
 
     def impulses(self, free: Values, aim: Values, enough: float, most: int, start: Values) -> Values:
         """(k, 3) N s that second things receive, along the axes of the contacts.

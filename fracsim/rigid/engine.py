@@ -2,9 +2,9 @@
 
     v' = v + dt g + J / m,   x' = x + s dt (v + s dt g / 2) + (1 - s) dt v',   l' = l + r x J,   turns: rigid.tumbling
 
-with impulses J that MuJoCo's solver finds (a convex problem, elliptic friction cones) for the law of rigid.meeting,
-where bodies are after the share s of the step that they fly for before they are struck. MuJoCo's own contacts are
-springs and dashpots that let things in, and its own way of turning bodies loses angular momentum: neither is used.
+with impulses J for the law of rigid.meeting, of few contacts by rigid.newton, of many by rigid.crowd, where bodies are
+after the share s of the step that they fly for before they are struck. MuJoCo's own contacts are springs and dashpots
+that let things in, and its own way of turning bodies loses angular momentum: neither is used.
 """
 
 from __future__ import annotations
@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
-from ..errors import NotConverged
 from .bodies import Bodies
 from .contacts import Contacts
 from .crowd import Crowd
+from .finding import Finder
 from .meeting import Meetings, flown, meetings
-from .model import ITERATIONS, Part, Rules, Stand, model_of, plane_contact
+from .model import Part, Rules, Stand, model_of
+from .newton import Newton
 from .siblings import Overlaps, Parting
 from .touches import Touches
 from .tumbling import rotated, tumbled
@@ -36,14 +35,7 @@ ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farthe
 FARTHER = 1.5  # by as many times
 SLIPS = 10  # rounds of slip, at most,
 CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
-FIELDS = ("frame", "dim", "friction", "solref", "solreffriction", "solimp", "includemargin", "exclude", "efc_address",
-          "mu", "H", "flex", "elem", "vert", "adhesion", "surfacevel")  # fmt: skip
-STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
-          mujoco.mj_fwdConstraint)  # fmt: skip
-AT_ONCE = 20  # iterations of Newton's method: what takes more is solved with softer contacts first,
-SOFTER = (100.0, 10.0, 1.0)  # times what they give way by, each from where the last came to
 CROWD = 300  # contacts: more are not given to Newton's method
-ISLAND = 300  # rows of an island: three times its contacts
 MOST, NEARLY = 300, 0.01  # iterations on a crowd, at most, and what velocities may be off by, c_0,
 LOOKS, ROUGH = 3, 50  # after so many looks of so many iterations, at most, for what meets what
 
@@ -85,13 +77,9 @@ class Engine:
         (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers."""
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
-        self._data = mujoco.MjData(self._model.made)
-        self._jammed = False  # whether contacts of this step were too many to be solved at once
+        self._finder = Finder(self._model)
+        self._newton: Newton | None = None
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
-        planes = self._model.planes
-        self._plane_contacts = [
-            plane_contact(planes.normal[k], float(planes.friction[k]), rules) for k in range(len(planes.stand))
-        ]
         known = np.arange(len(bodies)) if names is None else names
         self._parting = Parting.of(overlaps or Overlaps.none(), known, self._model.first, len(self._model.thing))
 
@@ -108,7 +96,6 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [self._reach(bodies, of) for of in (common, 0.0)]
-        self._data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
         for _ in range(ROUNDS):
             met = self._met(bodies, rates, common, reach)
             moved, touches, done = self._moved(met, rates, rough=True)
@@ -188,50 +175,13 @@ class Engine:
         place = bodies.place + time[:, None] * bodies.velocity
         return replace(bodies, place=place, turn=turn, spin=rotated(turn, model.inverse, momentum))
 
-    # --- MuJoCo ---
+    # --- contacts ---
 
     def _find(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> Contacts:
-        """Contacts of what comes together within the step; see `_moved`."""
-        model, data, n = self._model, self._data, self._count
-        q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-        q[:n, :3], q[n:, :3] = bodies.place, self._way[model.driven]
-        q[:n, 3:] = Rotation.from_matrix(bodies.turn).as_quat(scalar_first=True) if n else 1.0
-        q[n:, 3:] = [1.0, 0.0, 0.0, 0.0]
-        v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates[model.driven], 0.0
-        v[:n, 3:] = np.einsum("nji,nj->ni", bodies.turn, bodies.spin)
-        of_thing = np.concatenate([reach[0], self._rules.step * np.linalg.norm(rates - common, axis=1)])
-        model.made.geom_gap[:] = of_thing[model.thing]
-        model.made.body_margin[:] = np.concatenate(
-            [[of_thing[n:].max(initial=0.0)], reach[0], of_thing[n:][model.driven]]
-        )
-        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):
-            stage(model.made, data)
-        self._add_planes(bodies, reach[1], self._rules.step * np.linalg.norm(rates, axis=1))
-        found = data.contact
-        geoms = found.geom.astype(np.int64).reshape(-1, 2)
-        axes, places = found.frame.reshape(-1, 3, 3).copy(), np.concatenate([bodies.place, self._way])
-        return Contacts.found(
-            geoms, model.thing[geoms], found.pos.reshape(-1, 3).copy(), axes, found.dist.copy(), places
-        )
-
-    def _add_planes(self, bodies: Bodies, reach: Values, speeds: Values) -> None:
-        """Contacts of hulls with planes, after those that MuJoCo finds. Raises NotConverged where there is no room."""
-        planes, data = self._model.planes, self._data
-        for number, parts, gaps, points in planes.near(bodies, self._way, reach, speeds, self._rules.step):
-            first, alike = data.ncon, self._plane_contacts[number]
-            # mj_addContact, one after the other, takes ten times as long
-            data.ncon = first + len(parts)
-            made = data.contact
-            data.parena = data.ncon * made.dist.strides[0]
-            if data.parena >= data.narena:
-                raise NotConverged(
-                    f"{data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a "
-                    "larger mesh.h has fewer"
-                )
-            for name in FIELDS:
-                getattr(made, name)[first:] = getattr(alike, name)
-            made.dist[first:], made.pos[first:] = gaps, points
-            made.geom[first:] = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
+        """Contacts of what comes together within the step; see `_met`."""
+        dt = self._rules.step
+        slide = [dt * np.linalg.norm(rates - of, axis=1) for of in (common, 0.0)]
+        return self._finder(bodies, self._way, reach, slide, dt)
 
     def _pushed(self, met: _Met, rates: Values, *, rough: bool) -> tuple[Values, Touches, bool]:
         """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched; and
@@ -256,72 +206,36 @@ class Engine:
         come by as much nearer, mu s dt, with s as it comes out (see rigid.crowd). What is given too much of it sinks
         in by the difference, at every step in which it slides.
         """
-        data, n, dt, contacts = self._data, self._count, self._rules.step, met.contacts
-        mujoco.mj_makeM(self._model.made, data)
-        mujoco.mj_factorM(self._model.made, data)
-        self._jammed, kept = False, met.near
-        lifts = dt * data.contact.friction[:, 0]
+        dt, contacts, kept, model = self._rules.step, met.contacts, met.near, self._model
+        newton = self._newton = self._newton or Newton(model, self._rules)
+        newton.begin(met.bodies, self._way[model.driven], rates[model.driven], contacts)
+        lifts = dt * contacts.friction
         thrown = lifts * contacts.slipping(*self._motion(met.bodies, rates), kept)
         for _ in range(SLIPS):
-            data.contact.dist[:], data.contact.exclude[:] = met.meeting.aim + thrown, ~kept
-            self._solve()
-            force = data.qfrc_constraint.reshape(-1, 6)[:n].copy()
+            force, each, pressed = newton.solved(met.meeting.aim + thrown, kept)
             motion = self._motion(self._driven_on(met.bodies, force), rates)
             missed = self._missed(met, kept, motion)
-            pressed = kept & (data.efc_force[data.contact.efc_address] > 0)
             kept, before = kept | missed, thrown
             thrown = np.minimum(thrown, lifts * contacts.slipping(*motion, kept))
             if not np.any(missed) and np.all((before - thrown)[pressed] < CLOSE * self._rules.fast * dt):
                 break
-        rows = np.flatnonzero(pressed)
-        met.impulse[rows] = dt * data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
+        met.impulse[pressed] = dt * each[pressed]
         return force
 
     def _missed(self, met: _Met, kept: Flags, motion: tuple[Values, Values]) -> Flags:
         """(k,) contacts beside those kept (k,) that things come to touch in with these velocities and spins."""
         return np.asarray(~kept & (met.meeting.gap < self._rules.step * met.contacts.closing(*motion)))
 
-    def _solve(self) -> None:
-        """Forces of the contacts that are not excluded, for MuJoCo's data.
-
-        Which of many contacts press Newton's method finds by trial: it flips some at every iteration. Soft ones, taken
-        first, tell it sooner, and each harder set takes a dozen.
-        """
-        if not self._jammed:
-            self._press(1.0, AT_ONCE)
-            self._jammed = not self._simple()
-        if self._jammed:
-            for softer in SOFTER:
-                self._press(softer, ITERATIONS)
-
-    def _press(self, softer: float, most: int) -> None:
-        """Solve, in so many iterations from the last solution on, with contacts that give way by so many times more."""
-        made, data = self._model.made, self._data
-        made.opt.iterations = most
-        mujoco.mj_makeConstraint(made, data)
-        data.efc_R[:] *= softer
-        data.efc_D[:] /= softer
-        for stage in STAGES:
-            stage(made, data)
-        data.qacc_warmstart[:] = data.qacc
-
-    def _simple(self) -> bool:
-        """Whether what was solved at once has been solved; MuJoCo counts iterations of the first twenty islands."""
-        data, many = self._data, self._data.nisland
-        if not many or data.island_nefc[:many].max() < ISLAND:
-            return bool(data.solver_niter[: max(many, 1)].max() < AT_ONCE)
-        return many <= len(data.solver_niter) and bool(data.solver_niter[:many].max() < AT_ONCE)
-
     def _by_projections(self, met: _Met, rates: Values, *, rough: bool) -> Values:
         """As `_by_newton`, whatever there is of them, from where it was left: where it may be `rough`, until nothing
         more is missed."""
-        dt, bodies, friction = self._rules.step, met.bodies, self._data.contact.friction[:, 0]
+        dt, bodies = self._rules.step, met.bodies
         inverse = bodies.turn @ self._model.inverse @ np.swapaxes(bodies.turn, 1, 2)
         free = self._motion(self._driven_on(bodies, np.zeros((self._count, 6))), rates)
         for number in range(LOOKS):
             rows = np.flatnonzero(met.near)
             some = met.contacts.chosen(rows)
-            crowd = Crowd.of(some, friction[rows], self._model.mass, inverse)
+            crowd = Crowd.of(some, self._model.mass, inverse)
             aim: Values = np.asarray(met.meeting.aim[rows] / dt)
             enough, most = NEARLY * self._rules.fast, ROUGH if rough or number else MOST
             met.impulse[rows] = crowd.impulses(some.parting(*free), aim, enough, most, met.impulse[rows])

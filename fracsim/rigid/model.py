@@ -1,4 +1,4 @@
-"""The model of a scene that MuJoCo steps: bodies of convex parts, and what stands in their way."""
+"""The model of a scene that MuJoCo finds contacts in: bodies of convex parts, and what stands in their way."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..mechanics.contact.axes import frame
 from .bodies import Bodies
 from .planes import Planes
 from .primitives import Primitive
@@ -20,10 +19,6 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Part = Values | Primitive  # corners (n, 3) of a hull about the body's centre, in its axes at rest, m; or a shape
 
-HARD = 0.9999  # impedance of contacts, which MuJoCo lets be no harder: what they give way by, in steps, is 1 - HARD
-IMPEDANCE = [HARD, HARD, 1e-3, 0.5, 2.0]
-TOLERANCE, ITERATIONS = 1e-10, 200  # of MuJoCo's solver, to the mean inertia, and at most
-HELD = 1e6  # mass of what is driven, in masses of all bodies
 LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
 SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
 MEMORY, LEAST_MEMORY = 2**18, 2**26  # bytes a part, and in all: pairs of parts that may touch are held at once
@@ -63,7 +58,7 @@ class Stand:
 
 @dataclass(frozen=True)
 class Model:
-    """As MuJoCo has it.
+    """As MuJoCo has it, which finds contacts in it: bodies that are put where they are, and weigh nothing.
 
     Attributes:
         made: MuJoCo's.    thing: (geoms,) bodies by their numbers, then what stands.    first: (n,) geom of each body.
@@ -96,32 +91,27 @@ def model_of(
     share is made once. MuJoCo numbers the geoms of what stands still first."""
     mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
     turn = np.tile(np.eye(3), (len(bodies), 1, 1)) if turn is None else turn
-    quat = Rotation.from_matrix(turn).as_quat(scalar_first=True) if len(turn) else turn
-    spec, things, meshes = _spec(rules), [], _Meshes()
+    quat = orientation(turn)
+    spec, things, meshes, count = mujoco.MjSpec(), [], _Meshes(), len(bodies)
     for number, each in enumerate(parts):
-        body = _free(spec, float(mass[number]), inertia[number])
-        things += [number] * _add_parts(spec, body, each, rules.friction, meshes=meshes, quat=quat[number])
-    heavy, count = HELD * max(float(bodies.mass.sum()), 1e-9), len(bodies)
+        things += [number] * _add_parts(spec, _placed(spec), each, rules.friction, meshes=meshes, quat=quat[number])
     driven, fixed = ([number for number, each in enumerate(stands) if each.driven == which] for which in (True, False))
     for number in driven:
-        body, stand = _free(spec, heavy, heavy * np.eye(3), weightless=True), stands[number]
+        stand = stands[number]
         shape, at = _movable(stand.shape, SLAB * _spread(bodies, parts))
-        flat = stand.shape.kind == "plane"
+        flat, body = stand.shape.kind == "plane", _placed(spec)
         things += [count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at, flat=flat, meshes=meshes)
-    if driven:
-        spec.option.tolerance /= HELD  # of what is not driven
     for number in fixed:
         stand = stands[number]
         flat = stand.shape.kind == "plane"
         _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat, meshes=meshes)
     first = len(fixed) + np.searchsorted(things, np.arange(count))
-    thing = [count + number for number in fixed] + things
+    thing = np.array([count + number for number in fixed] + things, np.int64)
     extent = _extents(parts if outer is None else [[*each, more] for each, more in zip(parts, outer, strict=True)])
-    planes = _planes(parts, stands, np.array(thing, np.int64), first, outer, turn, extent)
+    planes = _planes(parts, stands, thing, first, outer, turn, extent)
     spec.memory = max(LEAST_MEMORY, MEMORY * len(thing))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
-    return Model(spec.compile(), np.array(thing, np.int64), first, np.array(driven, np.int64), mass, inertia, inverse,
-                 extent, planes)  # fmt: skip
+    return Model(spec.compile(), thing, first, np.array(driven, np.int64), mass, inertia, inverse, extent, planes)
 
 
 def _planes(
@@ -142,32 +132,6 @@ def _planes(
     geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
     friction = np.array([stands[k].friction for k in stand])
     return Planes(stand, geom, normal, friction, corners, of, part, extent)
-
-
-def plane_contact(normal: Values, friction: float, rules: Rules) -> Any:
-    """A contact of a plane with a normal (3,), as MuJoCo has them, but for what it touches and where."""
-    made = mujoco.MjContact()
-    made.frame, made.dim, made.friction = frame(normal)[:, [2, 0, 1]].T.reshape(-1), 3, [friction, friction, 0, 0, 0]
-    made.flex = made.elem = made.vert = [-1, -1]
-    made.solref, made.solimp = _law(rules), IMPEDANCE
-    return made
-
-
-def _law(rules: Rules) -> list[float]:
-    """As MuJoCo has it: acceleration -(c + r / dt) / dt."""
-    return [-HARD / rules.step**2, -HARD / rules.step]
-
-
-def _spec(rules: Rules) -> Any:
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.gravity = rules.step, rules.gravity
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.tolerance, option.iterations = TOLERANCE, ITERATIONS
-    spec.compiler.balanceinertia = True  # of a sliver, which round-off has made flatter than flat
-    spec.default.geom.solref, spec.default.geom.solimp = _law(rules), IMPEDANCE
-    spec.default.geom.condim = 3
-    return spec
 
 
 def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
@@ -194,13 +158,12 @@ def _movable(shape: Primitive, side: float) -> tuple[Primitive, Values]:
     return Primitive("box", (side, side, side / 2), shape.turn, side), -side / 2 * shape.turn[:, 2]
 
 
-def _free(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> Any:
-    """A body that nothing holds, about its centre of mass."""
+def _placed(spec: Any) -> Any:
+    """A body that is put where it is. One that is free would cost MuJoCo the inverse of its mass matrix, which grows
+    as their number squared; two that could not move at all would not be looked at."""
     body = spec.worldbody.add_body()
-    body.add_freejoint()
-    body.explicitinertial, body.mass, body.ipos = True, mass, np.zeros(3)
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body.gravcomp = 1.0 if weightless else 0.0
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
+    body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
     return body
 
 
@@ -247,3 +210,8 @@ def _add_parts(
             if quat is not None:
                 geom.quat = quat
     return len(parts)
+
+
+def orientation(turn: Values) -> Values:
+    """(n, 4) of rotations (n, 3, 3), the scalar first."""
+    return Rotation.from_matrix(turn).as_quat(scalar_first=True) if len(turn) else np.empty((0, 4))

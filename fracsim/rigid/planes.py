@@ -62,17 +62,18 @@ class Planes:
     extent: Values
 
     def near(
-        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float
+        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, only: Flags | None = None
     ) -> list[tuple[int, Ints, Values, Values]]:
         """Of each plane that anything is near to: its number here, the parts (k,) that are, the distances (k,) of
         corners and the points (k, 3), m. `ways`, `speeds`: (stands, 3) and (stands,) where planes are and what they
-        come in a step, m; `reach`: (n,) what bodies do; `step`: s."""
+        come in a step, m; `reach`: (n,) what bodies do; `step`: s; `only`: (n,) of these bodies."""
         if not len(self.stand) or not len(self.corners):
             return []
         found = []
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
             high = (bodies.place - ways[stand]) @ normal
-            near = np.flatnonzero((high < self.extent + reach + speeds[stand])[self.of])
+            low = high < self.extent + reach + speeds[stand]
+            near = np.flatnonzero((low if only is None else low & only)[self.of])
             of = self.of[near]
             x = np.einsum("kij,kj->ki", bodies.turn[of], self.corners[near]) + bodies.place[of]
             gap = (x - ways[stand]) @ normal
