@@ -45,12 +45,14 @@ class _Met:
     """What comes together in a step.
 
     Attributes:
-        start: the bodies before it.    bodies: where they are struck, after the share (n,) of it.
+        start: the bodies before it.    before: what was near them then.
+        bodies: where they are struck, after the share (n,) of it.
         contacts, meeting: k of them.    near: (k,) those that are looked at so far.
         impulse: (k, 3) of them so far, along their axes, N s.
     """
 
     start: Bodies
+    before: Contacts
     bodies: Bodies
     share: Values
     contacts: Contacts
@@ -96,13 +98,15 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [self._reach(bodies, of) for of in (common, 0.0)]
+        met, far = None, np.ones(self._count, bool)
         for _ in range(ROUNDS):
-            met = self._met(bodies, rates, common, reach)
+            met = self._met(bodies, rates, common, reach, met, far)
             moved, touches, done = self._moved(met, rates, rough=True)
             farther = [self._reach(moved, of) for of in (common, 0.0)]
-            if not any(np.any(now > FARTHER * then) for now, then in zip(farther, reach, strict=True)):
+            far = np.any([now > FARTHER * then for now, then in zip(farther, reach, strict=True)], axis=0)
+            if not np.any(far):
                 break
-            reach = [np.maximum(now, then) for now, then in zip(farther, reach, strict=True)]
+            reach = [np.where(far, np.maximum(now, then), then) for now, then in zip(farther, reach, strict=True)]
         if not done:
             moved, touches, _ = self._moved(met, rates, rough=False)
         if ways is not None:
@@ -116,23 +120,45 @@ class Engine:
         speed = np.linalg.norm(bodies.velocity - common, axis=1) + turning
         return np.asarray(self._rules.step * (speed + self._rules.fast))
 
-    def _met(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> _Met:
+    def _met(
+        self, start: Bodies, rates: Values, common: Values, reach: Sequence[Values], known: _Met | None, far: Flags
+    ) -> _Met:
         """What comes together in a step where no point of the bodies comes farther than a reach (n,) beside what moves
-        with a common velocity (3,), and than another (n,) beside what stands, m and m/s."""
-        dt, n, g = self._rules.step, self._count, self._rules.gravity
-        start = bodies
-        contacts = self._find(bodies, rates, common, reach)
-        meeting, parting = self._meeting(contacts, bodies, rates)
-        share = flown(meeting, contacts.things, n)
+        with a common velocity (3,), and than another (n,) beside what stands, m and m/s; `known` so far, without what
+        comes `far`ther (n,) than was thought."""
+        dt, g, bodies = self._rules.step, self._rules.gravity, start
+        before, _ = self._renewed(start, rates, common, reach, known and known.before, far)
+        contacts, (meeting, parting) = before, self._meeting(before, start, rates)
+        share = flown(meeting, before.things, self._count)
         if np.any(share):
             fallen = dt * share[:, None] * g
-            flying = replace(bodies, velocity=bodies.velocity + fallen / 2)
-            bodies = replace(self._flown(flying, dt * share), velocity=bodies.velocity)
-            contacts = self._find(bodies, rates, common, reach)
+            flying = replace(start, velocity=start.velocity + fallen / 2)
+            bodies = replace(self._flown(flying, dt * share), velocity=start.velocity)
+        others = share > 0 if known is None else far | (share != known.share)
+        contacts, kept = self._renewed(bodies, rates, common, reach, known.contacts if known else before, others)
+        if np.any(share):
             falling = replace(bodies, velocity=bodies.velocity + fallen)
             meeting, parting = self._meeting(contacts, falling, rates)
         self._parting = parting
-        return _Met(start, bodies, share, contacts, meeting, meeting.near, np.zeros((len(contacts), 3)))
+        near, impulse = meeting.near, np.zeros((len(contacts), 3))
+        if known:
+            near[: len(kept)] |= known.near[kept]
+            impulse[: len(kept)] = known.impulse[kept]
+        return _Met(start, before, bodies, share, contacts, meeting, near, impulse)
+
+    def _renewed(
+        self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values], known: Contacts | None,
+        others: Flags,
+    ) -> tuple[Contacts, Ints]:  # fmt: skip
+        """Contacts `known`, those of bodies (n,) that are `others` now found again; and which are kept, which are the
+        first. What of a crowd flies or goes farther is little of it."""
+        if known is None:
+            return self._find(bodies, rates, common, reach), np.empty(0, np.int64)
+        stays = np.append(~others, np.ones(len(rates), bool))
+        kept = np.flatnonzero(stays[known.things].all(axis=1))
+        if not np.any(others):
+            return known, kept
+        return known.chosen(kept).and_more(self._find(bodies, rates, common, reach, others)), kept
 
     def _moved(self, met: _Met, rates: Values, *, rough: bool) -> tuple[Bodies, Touches, bool]:
         """The bodies at the end of the step, what touched, and whether that is all that can be said of it: a crowd is
@@ -177,11 +203,13 @@ class Engine:
 
     # --- contacts ---
 
-    def _find(self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values]) -> Contacts:
-        """Contacts of what comes together within the step; see `_met`."""
+    def _find(
+        self, bodies: Bodies, rates: Values, common: Values, reach: Sequence[Values], only: Flags | None = None
+    ) -> Contacts:
+        """Contacts of what comes together within the step, see `_met`, of all bodies or `only` some (n,)."""
         dt = self._rules.step
         slide = [dt * np.linalg.norm(rates - of, axis=1) for of in (common, 0.0)]
-        return self._finder(bodies, self._way, reach, slide, dt)
+        return self._finder(bodies, self._way, reach, slide, dt, only)
 
     def _pushed(self, met: _Met, rates: Values, *, rough: bool) -> tuple[Values, Touches, bool]:
         """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched; and
