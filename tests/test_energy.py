@@ -18,9 +18,11 @@ from scipy.optimize import brentq
 from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
 from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
 from fracsim.fracture.energy.mixed import Around, gain, kink, shares
+from fracsim.fracture.energy.patch import Patch
 from fracsim.fracture.energy.seen import Seen
 from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
 from fracsim.mesh.domain import distribute
+from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
 from support.resumed import assert_alike, going_stopped_resumed
@@ -49,6 +51,18 @@ def test_the_disc_function_and_its_gradient() -> None:
         moved = [plateau(np.linalg.norm(apart + s * step * np.eye(2)[axis], axis=1), radius) for s in (1, -1)]
         found = plateau_gradient(apart, radius)[:, axis]
         np.testing.assert_allclose(found[smooth], ((moved[0] - moved[1]) / (2 * step))[smooth], atol=1e-7)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_patch_has_the_gradient_and_the_middles_of_a_field(d: int) -> None:
+    """Of an affine field x -> A x + b on random simplices that share nodes: A, and its value at each centroid."""
+    chance = np.random.default_rng(d)
+    points, A, b = chance.random((20, d)), chance.random((d, d)), chance.random(d)
+    cells = np.array([chance.permutation(20)[: d + 1] for _ in range(30)])
+    patch = Patch(cells, barycentric_gradients(points[cells]))
+    field = (points @ A.T + b).ravel()
+    np.testing.assert_allclose(patch.gradients(field), np.tile(A, (30, 1, 1)), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(patch.middles(field), points[cells].mean(axis=1) @ A.T + b, rtol=1e-12)
 
 
 def test_eshelbys_stress_is_what_moving_the_material_costs() -> None:

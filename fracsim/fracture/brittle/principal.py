@@ -15,8 +15,8 @@ SAME = 1e-3
 
 
 def tensors(components: Values, dim: int) -> Values:
-    """(n, d, d) symmetric tensors from their (n, 3 or 6) components."""
-    result = np.empty((len(components), dim, dim))
+    """(n, d, d) symmetric tensors from their (n, 3 or 6) components, which lie one after the other in memory."""
+    result = np.empty((dim, dim, len(components))).transpose(2, 0, 1)
     for column, (i, j) in enumerate(SYMMETRIC_COMPONENTS[dim]):
         result[:, i, j] = result[:, j, i] = components[:, column]
     return result

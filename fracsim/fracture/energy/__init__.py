@@ -7,6 +7,7 @@ around     what lies around a place, on any rank
 asked      values of cells of other ranks
 crack      the cells that cracks cut, known on every rank
 neighbourhoods  what lies around the tips, kept until cracks change
+patch      gradients of fields around tips, by matrices that are kept
 front      in space: the crack that an advance makes, by which g is divided
 seen       the body as tips see it
 mixed      where a crack in tension and sliding turns, and what that releases

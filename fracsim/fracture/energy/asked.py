@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
@@ -25,10 +27,17 @@ class Asked:
         self.own: Ints = np.unique(np.concatenate(there))
         self._send = [np.searchsorted(self.own, each) for each in there]
 
-    def __call__(self, values: Values) -> Values:
-        """(n, k) values of the cells asked for, from those (m, k) of `own` (collective)."""
-        parts = [values[rows] for rows in self._send]
-        arrived = np.concatenate(self._comm.alltoall(parts) if self._comm.size > 1 else parts)
-        result = np.empty_like(arrived)
-        result[self._order] = arrived
-        return result
+    def __call__(self, *fields: Values) -> list[Values]:
+        """(n, ...) values of the cells asked for, from those (m, ...) of `own`; in memory one component after the other
+        (collective)."""
+        tails = [each.shape[1:] for each in fields]
+        rows = np.concatenate([each.reshape(len(each), prod(tail)).T for each, tail in zip(fields, tails, strict=True)])
+        if self._comm.size == 1:
+            result = rows[:, self._send[0]]
+        else:
+            arrived = np.concatenate(self._comm.alltoall([rows[:, each] for each in self._send]), axis=1)
+            result = np.empty_like(arrived)
+            result[:, self._order] = arrived
+        parts = np.split(result, np.cumsum([prod(tail) for tail in tails])[:-1])
+        shaped = [part.reshape(*tail, result.shape[1]) for part, tail in zip(parts, tails, strict=True)]
+        return [np.moveaxis(each, -1, 0) for each in shaped]

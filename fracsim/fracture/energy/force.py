@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ...mesh.small_matrices import cofactors
+
 Values = npt.NDArray[np.float64]
+
+
+def across(H: Values, vectors: Values) -> Values:
+    """(n, d) H^T v of matrices (n, d, d) and vectors (n, d): component by component, which is quick where these lie one
+    after the other in memory."""
+    result = np.empty_like(vectors)
+    for k in range(vectors.shape[1]):
+        result[:, k] = sum(H[:, j, k] * vectors[:, j] for j in range(vectors.shape[1]))
+    return result
 
 
 def eshelby(psi: Values, H: Values, P: Values) -> Values:
@@ -13,7 +24,11 @@ def eshelby(psi: Values, H: Values, P: Values) -> Values:
 
     Eshelby (1951); psi and P as the cell has them, chi included.
     """
-    return np.asarray(psi[:, None, None] * np.eye(H.shape[1]) - H.transpose(0, 2, 1) @ P)  # einsum: four times the time
+    result = np.empty_like(P)
+    for k in range(P.shape[2]):
+        result[:, :, k] = -across(H, P[:, :, k])
+        result[:, k, k] += psi
+    return result
 
 
 def plateau(distance: Values, radius: Values) -> Values:
@@ -51,5 +66,7 @@ def first_piola(cauchy: Values, H: Values, *, linear: bool) -> Values:
     """(n, d, d) P = J sigma F^-T in Pa, F = I + H; sigma itself where strains are taken for small."""
     if linear:
         return cauchy
-    F = H + np.eye(H.shape[1])
-    return np.asarray(np.linalg.det(F)[:, None, None] * (cauchy @ np.linalg.inv(F).transpose(0, 2, 1)))
+    cofactor, result = cofactors(H + np.eye(H.shape[1])), np.empty_like(cauchy)
+    for i in range(cauchy.shape[1]):
+        result[:, i] = across(cofactor, cauchy[:, i])
+    return result

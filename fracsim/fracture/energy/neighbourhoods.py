@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ...mesh.edges import EdgeGraph
-from ..brittle.principal import largest
+from ..brittle.principal import largest, tensors
 from . import branching, mixed
 from .around import Around, Pairs, pairs_within
 from .crack import Crack
@@ -123,30 +123,29 @@ class Neighbourhoods:
         """(n, d) - sum V Sigma grad q + sum V q f over the discs of tips: Sigma (asked, d, d) in Pa and f (asked, d) in
         N/m^3."""
         d = sigma.shape[1]
-        force = self._matrix(d + _Sum.INSIDE) @ push
-        for axis in range(d):
-            force -= self._matrix(axis) @ sigma[:, :, axis]
-        return np.asarray(force)
+        inside, slopes = self._matrix(d + _Sum.INSIDE), [self._matrix(axis) for axis in range(d)]
+        rows = [inside @ push[:, i] - sum(slopes[k] @ sigma[:, i, k] for k in range(d)) for i in range(d)]
+        return np.column_stack(rows)  # a product a component: of all at once they take half as long again
 
     def means(self, rows: Ints, stress: Values) -> Values:
-        """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, d, d) which have not come apart,
+        """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, 3 or 6) which have not come apart,
         weighted by 1 - r over the radius of the average."""
-        d = stress.shape[1]
+        d = self._graph.domain.dim
         weights = self._matrix(d + _Sum.MEAN)[rows]
-        sums = np.asarray(weights @ stress.reshape(-1, d * d)).reshape(-1, d, d)
-        return over(sums, np.asarray(weights.sum(axis=1)).reshape(-1, 1, 1))
+        sums = np.column_stack([weights @ column for column in stress.T])
+        return tensors(over(sums, np.asarray(weights.sum(axis=1))), d)
 
     def intensities(
         self, fields: tuple[Values, Values, Values], elastic: tuple[Values, Values], *, turns: bool
     ) -> Values:
         """(n, 2) K_I and K_II in Pa sqrt(m) of tips in the plane, along the crack behind them (mixed).
 
-        `fields`: stress (asked, 2, 2) in Pa, grad u (asked, 2, 2), rho a (asked, 2) in N/m^3, of cells that have not
+        `fields`: stress (asked, 3) in Pa, grad u (asked, 2, 2), rho a (asked, 2) in N/m^3, of cells that have not
         come apart. `elastic`: (n,) mu in Pa and kappa. `turns`: as seen by somebody who turns with what is in the disc.
         """
         rows, tips, count = np.flatnonzero(~self._split[self._cell]), self.tips, len(self.tips)
         place, index, inside = self._place[rows], self._index[rows], self._weights[rows, 2 + _Sum.INSIDE]
-        stress, H, push = (each[index] for each in fields)
+        stress, H, push = (np.ascontiguousarray(each)[index] for each in (tensors(fields[0], 2), *fields[1:]))
         if turns:
             F = H + np.eye(2)
             sines, cosines = (np.bincount(place, inside * each, count)
@@ -159,11 +158,13 @@ class Neighbourhoods:
         return np.column_stack([np.bincount(place, each, count) for each in mixed.shares(around).T])
 
     def squares(self, rows: Ints, stress: Values) -> Values:
-        """(m,) mean square of the positive first principal stress around tips, all cells alike, Pa^2."""
-        weights = self._matrix(stress.shape[1] + _Sum.ALIKE)[rows]
+        """(m,) mean square of the positive first principal stress around tips, of stress (asked, 3 or 6), all cells
+        alike, Pa^2."""
+        d = self._graph.domain.dim
+        weights = self._matrix(d + _Sum.ALIKE)[rows]
         cells = np.unique(weights.indices)
         squares = np.zeros(len(stress))
-        squares[cells] = np.maximum(largest(stress[cells]), 0.0) ** 2
+        squares[cells] = np.maximum(largest(tensors(stress[cells], d)), 0.0) ** 2
         return over(weights @ squares, np.asarray(weights.sum(axis=1)).ravel())
 
     def _matrix(self, column: int) -> csr_matrix:
@@ -172,9 +173,8 @@ class Neighbourhoods:
             data = self._weights[:, column]
             if column > self._graph.domain.dim:
                 data = np.where(self._split[self._cell], 0.0, data)
-            matrix = csr_matrix((data, self._index, self._ends), shape=self._shape)
-            if column > self._graph.domain.dim:
-                matrix.eliminate_zeros()
+            matrix = csr_matrix((data, self._index, self._ends), shape=self._shape, copy=True)
+            matrix.eliminate_zeros()  # in place
             self._matrices[column] = matrix
         return self._matrices[column]
 

@@ -15,10 +15,12 @@ from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..brittle.principal import tensors
 from .around import Around
+from .asked import Asked
 from .crack import Crack
-from .force import eshelby, first_piola, springs
+from .force import across, eshelby, first_piola, springs
 from .front import Front
 from .neighbourhoods import Neighbourhoods, Reach, Tips, over
+from .patch import Patch
 
 Cells = npt.NDArray[np.integer]
 Ints = npt.NDArray[np.int64]
@@ -33,7 +35,7 @@ class Seen:
 
     Attributes:
         around: the tips and their sums.    disc: (tips,) R in m.
-        stress: (asked, d, d) Cauchy stress of the undamaged material, Pa.
+        stress: (asked, 3 or 6) Cauchy stress of the undamaged material, Pa.
         sigma: (asked, d, d) Eshelby's stress of the body as it is, Pa.
         inertia: (asked, d) rho (H^T a - (grad v)^T v), N/m^3; 0 where nothing has a mass.
         H, push: (asked, 2, 2) grad u and (asked, 2) rho a in N/m^3; of nothing in space.
@@ -107,6 +109,7 @@ class Sight:
         self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks)
         # of the coordinates of cells, NaN until somebody looks there
         self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
+        self._patch: tuple[Asked, Patch] | None = None
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         every = (domain.cell_count,)
         self._elastic = np.broadcast_to(mu, every), np.broadcast_to((lmbda + 3 * mu) / (lmbda + mu), every)
@@ -120,33 +123,24 @@ class Sight:
 
     def look(self, stress: Values, psi: Values) -> Seen:
         """What is around the tips (collective)."""
-        d, cells, tips = self._domain.dim, self.around.asked.own, self.around.tips
-        flat = d == 2
-        parts = np.cumsum([d * d, d * d, d, flat * d * d])
-        rows = np.zeros((len(cells), parts[-1] + flat * d))
-        tensor, sigma, inertia, slopes, push = np.split(rows, parts, axis=1)  # views
-        tensor[:] = tensors(stress[cells], d).reshape(-1, d * d)
-        assert self._stress.chi is not None
-        felt = np.flatnonzero(self._stress.closes | (self._stress.chi.x.array[cells] > 0))
-        cells = cells[felt]
-        H = self.gradients(cells, self._stress.u.x.array)
-        sigma[felt] = self._eshelby(cells, tensors(stress[cells], d), psi[cells], H).reshape(-1, d * d)
+        asked, tips, (mu, kappa) = self.around.asked, self.around.tips, self._elastic
+        cells, patch = asked.own, self._over(asked)
+        H, own = patch.gradients(self._stress.u.x.array), stress[cells]
+        sigma, inertia, push = self._eshelby(cells, own, psi[cells], H), *np.zeros((2, len(cells), self._domain.dim))
         if self.motion is not None:
-            v, a = map(self._domain.with_ghosts, self.motion)
-            pushed = self._density[cells, None] * self._in_the_middle(cells, a)
-            kinetic, inertia[felt] = self._moved(cells, H, v, pushed)
-            sigma[felt] += kinetic[:, None] * np.eye(d).ravel()
-        if flat:
-            slopes[felt] = H.reshape(-1, d * d)
-            if self.motion is not None:
-                push[felt] = pushed
-        tensor, sigma, inertia, slopes, push = np.split(self.around.asked(rows), parts, axis=1)
-        square, (mu, kappa) = (-1, d, d), self._elastic
-        return Seen(
-            self.around, self._reach.disc[tips.cell], tensor.reshape(square), sigma.reshape(square), inertia,
-            slopes.reshape(square) if flat else slopes, push, (mu[tips.cell], kappa[tips.cell]),
-            not self._stress.energy.linear,
-        )  # fmt: skip
+            kinetic, inertia, push = self._moved(cells, H, patch, *map(self._domain.with_ghosts, self.motion))
+            for axis in range(self._domain.dim):
+                sigma[:, axis, axis] += kinetic
+        flat = (H, push) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
+        seen, sigma, inertia, H, push = asked(own, sigma, inertia, *flat)
+        elastic, turns = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
+        return Seen(self.around, self._reach.disc[tips.cell], seen, sigma, inertia, H, push, elastic, turns)
+
+    def _over(self, asked: Asked) -> Patch:
+        """Of the cells of this rank that anybody asks for: as long as they are the same."""
+        if self._patch is None or self._patch[0] is not asked:
+            self._patch = asked, Patch(self._domain.cell_nodes[asked.own], self._slopes_of(asked.own))
+        return self._patch[1]
 
     def places(self, edges: npt.NDArray[np.integer], cut: Values) -> Values:
         """(n, d) where local edges are cut, m."""
@@ -155,20 +149,20 @@ class Sight:
     def means_at(self, cells: Ints, stress: Values) -> Values:
         """(n, d, d) mean stress around the centres of cells (n,) of this rank that are far from cracks, Pa, of all
         cells' (cells, 3 or 6) (collective)."""
-        average, d = self._reach.average[cells], self._domain.dim
+        average = self._reach.average[cells]
         pairs = self._near.pairs(self.centres[cells], average)
         needed, index = np.unique(pairs.other, return_inverse=True)
         asked = self._near.asked(needed)
-        near = asked(tensors(stress[asked.own], d).reshape(-1, d * d)).reshape(-1, d, d)
+        (near,) = asked(stress[asked.own])
         weight = self._near.volumes[pairs.other] * (1 - pairs.distance / average[pairs.place])
-        return over(pairs.sum(weight[:, None, None] * near[index]), pairs.sum(weight)[:, None, None])
+        return tensors(over(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None]), self._domain.dim)
 
     def _eshelby(self, cells: Ints, stress: Values, psi: Values, H: Values) -> Values:
-        """(n, d, d) Pa."""
-        P = first_piola(stress, H, linear=self._stress.energy.linear)
+        """(n, d, d) Pa of the stress (n, 3 or 6)."""
         assert self._stress.chi is not None
         chi = self._stress.chi.x.array[cells]
-        psi, P = chi * psi, chi[:, None, None] * P
+        P = first_piola(tensors((chi * stress.T).T, self._domain.dim), H, linear=self._stress.energy.linear)
+        psi = chi * psi
         if self._stress.closes:
             pressed, push = self._pressed(cells, 1 - chi, H)
             psi, P = psi + pressed, P + push
@@ -183,23 +177,23 @@ class Sight:
         modulus = (share * stiff)[:, None] * ~graph.intact(cells)
         return springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
 
-    def _moved(self, cells: Ints, H: Values, v: Values, push: Values) -> tuple[Values, Values]:
-        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) in N/m^3, of push = rho a (n, d), in the
-        middles of cells."""
-        speed = self._in_the_middle(cells, v)
-        momentum = self._density[cells, None] * speed
-        carried = np.einsum("nik,ni->nk", H, push) - np.einsum("nik,ni->nk", self.gradients(cells, v), momentum)
-        return np.einsum("ni,ni->n", speed, momentum) / 2, carried
-
-    def _in_the_middle(self, cells: Ints, field: Values) -> Values:
-        """(n, d) of a field of nodes (nodes * d,) in the middles of cells."""
-        corners = self._domain.cell_nodes[cells].T
-        return np.asarray(sum(field.reshape(-1, self._domain.dim)[nodes] for nodes in corners) / len(corners))
+    def _moved(self, cells: Ints, H: Values, patch: Patch, v: Values, a: Values) -> tuple[Values, Values, Values]:
+        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) and rho a in N/m^3, in the middles of cells;
+        nothing of those that carry nothing."""
+        assert self._stress.chi is not None
+        felt = self._stress.closes | (self._stress.chi.x.array[cells] > 0)
+        speed, density = patch.middles(v), (self._density[cells] * felt)[:, None]
+        momentum, push = density * speed, density * patch.middles(a)
+        carried = across(H, push) - across(patch.gradients(v), momentum)
+        return np.einsum("ni,ni->n", speed, momentum) / 2, carried, push
 
     def gradients(self, cells: Ints, field: Values) -> Values:
         """(n, d, d) gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
+        return Patch(self._domain.cell_nodes[cells], self._slopes_of(cells)).gradients(field)
+
+    def _slopes_of(self, cells: Ints) -> Values:
+        """(n, d + 1, d) of the barycentric coordinates of cells, 1/m."""
         new = cells[np.isnan(self._slopes[cells, 0, 0])]
         if len(new):
             self._slopes[new] = barycentric_gradients(self._domain.nodes[self._domain.cell_nodes[new]])
-        values = field.reshape(-1, self._domain.dim)[self._domain.cell_nodes[cells]]
-        return np.asarray(values.transpose(0, 2, 1) @ self._slopes[cells])
+        return self._slopes[cells]

@@ -187,6 +187,8 @@ class CrackTips:
                 ahead = np.where(branches[:, None], tips.course, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
         may = np.flatnonzero((~mature | (size >= toughness)) & ~(tips.waits | self.barred[tips.cell]))
+        if not len(may):
+            return self._none(0)
         mean = seen.means(may)
         sigma = largest(mean)
         active = (sigma > 0) & (mature[may] | (sigma >= self._strength_of(tips.cell[may])))
@@ -214,7 +216,9 @@ class CrackTips:
     def _weak(self, stress: Values) -> Ints:
         """Whole cells, farther than R from any crack, whose stress reaches the strength."""
         graph, d, least = self._graph, self._domain.dim, self.strength.weakest
-        cells = np.flatnonzero(~(graph.damaged | self.barred) & (frobenius_norm(stress, d) >= least)).astype(np.int64)
+        # shear counts twice in the norm: most cells are passed over by a plain sum of squares, in a third of the time
+        cells = np.flatnonzero(2 * np.einsum("ni,ni->n", stress, stress) >= least**2).astype(np.int64)
+        cells = cells[~(graph.damaged[cells] | self.barred[cells]) & (frobenius_norm(stress[cells], d) >= least)]
         cells = cells[upper_bound(tensors(stress[cells], d)) >= least]
         if len(cells) and len(self.sight.crack.number):
             far = self.sight.crack.tree.query(self.sight.centres[cells])[0]
