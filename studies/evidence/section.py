@@ -29,7 +29,7 @@ from .trial import Setting
 
 __all__ = [
     "Cell", "Claim", "Picture", "Plot", "Point", "Section", "Series", "Table",
-    "fitted_order", "folder_of", "pareto_front", "recommended", "timed",
+    "again", "fitted_order", "folder_of", "pareto_front", "recommended", "timed",
 ]  # fmt: skip
 
 
@@ -53,6 +53,15 @@ def recommended(points: Sequence[Point], limit: float) -> Point | None:
     """The cheapest point with an error of at most `limit`; None where there is none."""
     good = sorted((point.cost, point.error, number) for number, point in enumerate(points) if point.error <= limit)
     return points[good[0][2]] if good else None
+
+
+def again(records: Sequence[dict[str, Any]]) -> str:
+    """How a reader runs a trial once more: the first one's command, in its folder. Empty where there is none."""
+    commands = [(record["command"], folder_of(record)) for record in records if "command" in record]
+    if not commands:
+        return ""
+    which = "it" if len(commands) == 1 else "the first trial"
+    return f" `{commands[0][0]}`, in `{commands[0][1]}`, runs {which} again."
 
 
 def timed(seconds: Sequence[float]) -> tuple[float, float]:

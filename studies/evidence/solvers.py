@@ -20,7 +20,7 @@ import numpy as np
 from .precision import brazilian
 from .precision.common import QUIET
 from .precision.solver import DIRECT
-from .section import Claim, Section, Table
+from .section import Claim, Section, Table, again
 from .trial import Trial
 
 LIMIT, SHORT, REPEATS = 1.3, 2.0, 3  # of the best; s; runs of what takes less
@@ -125,6 +125,7 @@ def section(records: list[dict[str, Any]]) -> Section:
         "multigrid, throughout. Factors: of MUMPS, throughout. The default begins with CG and goes on with factors "
         "where they cost less than the iterations did, as their operations tell once they have been made, "
         "only where there are at most 100,000 dofs in the plane, 10,000 in space."
+        f"{again(records)}"
     )
     worst = max(share, key=share.__getitem__, default="")
     told = f"{share[worst]:.2f} at most ({worst}), of {len(share)} studies" if share else "nothing"

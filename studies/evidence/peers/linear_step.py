@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, Section, Table
+from ..section import Claim, Section, Table, again
 from ..trial import Trial
 from . import write_of_size
 from .akantu import ABSENT, Akantu, interpreter, problem_of
@@ -118,6 +118,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         f"Block of 24 n^3 tetrahedra, {STEPS} steps of {STEP:g} s after the first {WARM}, in turn, one process and "
         f"thread each; medians. '{FIRST}' solves Akantu's equations. Akantu keeps the factors of a direct solver, we "
         "keep multigrid and begin CG from earlier solutions. First: the first step, with what is made in it."
+        f"{again(found)}"
     )
     columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
     rows = tuple(row for figures in done for row in _rows(figures))

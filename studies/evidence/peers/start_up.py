@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, Section, Table
+from ..section import Claim, Section, Table, again
 from ..trial import Trial
 from .akantu import ABSENT, WORKER, interpreter, problem_of
 from .linear_step import STEP, study
@@ -113,7 +113,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     figures = found["figures"]
     text = (
         f"3,000 tetrahedra, {STEPS} steps, from the command to its end: processor seconds, medians of {RUNS} runs in "
-        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}"
+        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{again([found])}"
     )
     worst = max(figures[way] for way in WAYS)
     shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())

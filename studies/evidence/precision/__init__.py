@@ -6,11 +6,11 @@ from typing import Any
 
 from ..section import Section
 from ..trial import Trial
-from . import average, beam, brazilian, finite, fracture, plastic, solver, statics, wave
+from . import average, beam, brazilian, finite, fracture, plastic, smooth, solver, statics, wave
 from .page import in_doubt, section
 from .short import summary
 
-FAMILIES = (statics, beam, wave, finite, fracture, plastic, brazilian, average, solver)
+FAMILIES = (statics, smooth, beam, wave, finite, fracture, plastic, brazilian, average, solver)
 
 
 def trials() -> list[Trial]:

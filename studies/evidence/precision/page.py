@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from ..section import Cell, Claim, Plot, Point, Section, Series, Table, fitted_order, pareto_front, recommended
+from ..section import Cell, Claim, Plot, Point, Section, Series, Table, again, fitted_order, pareto_front, recommended
 from ..trial import Setting
 
 Records = list[dict[str, Any]]
@@ -42,6 +42,7 @@ class Case:
         apart: values of settings that are no candidates for a default (explicit steps, a Newton step without a test).
         share: of a limit that the error may take; less than 1 where errors of mesh and step come on top.
         claims: what else must hold.
+        priced: whether seconds for an error are compared; not where settings are bodies that have nothing in common.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Case:
     apart: tuple[Setting, ...] = ()
     share: float = 1.0
     claims: Callable[[Records], tuple[Claim, ...]] = lambda records: ()
+    priced: bool = True
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,12 @@ def section(case: Case, records: Records) -> Section:
     except (KeyError, StopIteration) as error:
         return Section(case.title, f"Not run, or its reference is missing: {error}.", tables=(_outcomes(case, mine),))
     rows = [Row(record, errors.get(record["name"], {})) for record in mine]
-    advice, marked = _advice(case, rows)
+    advice, marked = _advice(case, rows) if case.priced else ([], [])
     orders = tuple(_order_claim(order, rows) for order in case.orders)
     tables = (_table(case, rows, marked),)
-    return Section(case.title, f"{text}\n\n{_words(advice, case)}", (*orders, *claims, *_default_claims(case, advice)),
+    words = f"{text}\n\n{_words(advice, case)}" if case.priced else text
+    words += again(mine)
+    return Section(case.title, words, (*orders, *claims, *_default_claims(case, advice)),
                    tables, _plots(case, rows))  # fmt: skip
 
 
@@ -127,7 +131,7 @@ def rows_of(case: Case, records: Records) -> list[Row]:
 
 def in_doubt(case: Case, records: Records) -> set[str]:
     """Names of trials to be timed again: a default, and what came out cheaper by more than noise, perhaps by chance."""
-    if not (rows := rows_of(case, records)):
+    if not case.priced or not (rows := rows_of(case, records)):
         return set()
     advice, _ = _advice(case, rows)
     rivals = [
@@ -305,7 +309,7 @@ def _front(case: Case, rows: list[Row]) -> set[int]:
 
 
 def _plots(case: Case, rows: list[Row]) -> tuple[Plot, ...]:
-    usable = [row for row in rows if counts(case, row)]
+    usable = [row for row in rows if case.priced and counts(case, row)]
     if not usable:
         return ()
     return tuple(

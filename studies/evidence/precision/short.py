@@ -13,7 +13,7 @@ PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` o
 
 def summary(cases: list[Case], records: Records) -> list[Section]:
     """The section, where any case has rows."""
-    found = [(case, rows) for case in cases if (rows := rows_of(case, records))]
+    found = [(case, rows) for case in cases if case.priced and (rows := rows_of(case, records))]
     if not found:
         return []
     peers = sorted({peer for _, rows in found for row in rows if (peer := peer_of(row.record))})
