@@ -410,7 +410,7 @@ class Solver:
         """K correction = balance.vector at the present u; whether it was solved."""
         tangent, ksp = self.balance.tangent, self.snes.ksp
         self._assemble_tangent(tangent)
-        self._preconditioner.its = None
+        self._preconditioner.its, self._preconditioner.tells = None, True
         if self._forcing is not None:
             ksp.setTolerances(rtol=self._forcing.exact())
         ksp.setOperators(self._operator, tangent)
@@ -431,7 +431,7 @@ class Solver:
         if forcing is None:
             self._assemble_tangent(tangent)
             return
-        self._preconditioner.its = forcing.iterations(ksp.its)
+        self._preconditioner.its, self._preconditioner.tells = forcing.iterations(ksp.its), forcing.tells
         norm, little = self.snes.getFunctionNorm(), self._last_little
         if isinstance(forcing, Sparing):
             kept = forcing.reach(norm, little) and self._small == self._smallness

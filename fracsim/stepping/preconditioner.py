@@ -11,6 +11,11 @@ spoil. Where steps are so long that inertia is next to nothing, it is a hundred 
 itself (loose_parts). In shorter ones other aggregates do: those without smoothing cost a fifth of the set-up, and a
 sweep of SSOR deals with what hangs: 18 iterations where the whole body took 9 and the cut one 27 (33,000 tetrahedra, 10
 planes), a step in 0.85 of the time; after 100 planes 0.7.
+
+A whole body that is slow to solve for is thin, or all but incompressible. Aggregates are made anew of the stronger
+links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahedra) takes 38 iterations where it took
+77, and a fresh set-up costs the same. A compact body gains nothing (9 for 9), and its set-up would cost up to half as
+much again.
 """
 
 from __future__ import annotations
@@ -39,7 +44,11 @@ OF_PIECES: Options = {
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
+STRONG_LINKS: Options = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
+ALL_LINKS: Options = {"pc_gamg_threshold": 0.0, "pc_gamg_aggressive_square_graph": True}
 
+SLOW = 25  # iterations of a whole body from which on aggregates of strong links are tried
+WORTH_IT = 0.9  # of these iterations, which they may take at most
 REBUILD_ABOVE = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
 REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
@@ -65,6 +74,7 @@ class Preconditioner:
         pc: that of the body alone, also where the KSP uses one that is made of it.
         serving: that, or one made of it that sees to loose parts.
         its: iterations of the last solve, where the KSP does not know; 0: nothing is known; None: it does.
+        tells: whether they tell what a fresh one takes: rough solves see to what broke last, which is quickly done.
     """
 
     def __init__(
@@ -80,6 +90,9 @@ class Preconditioner:
         self.due, self.keep = Due.REBUILD, keep
         self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
         self.its: int | None = None
+        self.tells = True
+        # of aggregates of all links, where strong ones are on trial; 0: nothing is known; None: it is settled
+        self._all_links_its: int | None = 0 if may_change else None
         self._fresh_its = self._whole_its = 0
 
     def damage_changed(self, broke: int | None) -> None:
@@ -141,27 +154,46 @@ class Preconditioner:
 
     def _count(self) -> None:
         """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due."""
-        if self._broke:
+        if self._broke and self._fresh_its:
             self._extra += max(self._last_its - self._fresh_its, 0)
         if self._extra > REFRESH_ITS:
             self.due = max(self.due, Due.REFRESH)
 
     def _look_at(self, its: int) -> None:
         """Iterations of a solve since it was set up."""
-        if not self._fresh_its:
+        if not self._fresh_its and self.tells:
             self._fresh_its = its
+            if not self._broken and self._tries_links(its):
+                return
             self._whole_its = self._whole_its or its
             if self._broken and self._may_change and its > IN_PIECES * self._whole_its + 2:
                 self._change()
         if not self.keep:
             self.due = max(self.due, Due.REFRESH)
 
+    def _tries_links(self, its: int) -> bool:
+        """Whether it is of another kind from now on: of strong links where a fresh one took so many iterations, of all
+        of them again where that was no better."""
+        all_links = self._all_links_its
+        if all_links is None or not its:
+            return False
+        worse = its > (WORTH_IT * all_links if all_links else SLOW)
+        self._all_links_its = its if worse and not all_links else (None if all_links else 0)
+        if worse:
+            self._become(ALL_LINKS if all_links else STRONG_LINKS)
+            self._fresh_its = 0
+        return worse
+
     def _change(self) -> None:
         if (loose := self._loosen(self.pc)) is not None:
             self._may_change, self._sees_to_parts, self.due = False, True, max(self.due, Due.REFRESH)
             loose.forget()
             return
-        self._may_change, self._rebuild_above, self.due = False, REBUILD_ABOVE_OF_PIECES, Due.REBUILD
-        self._options.change(OF_PIECES)
+        self._may_change, self._rebuild_above = False, REBUILD_ABOVE_OF_PIECES
+        self._become(OF_PIECES)
+
+    def _become(self, kind: Options) -> None:
+        self.due = Due.REBUILD
+        self._options.change(kind)
         self.pc.reset()
         self.pc.setFromOptions()
