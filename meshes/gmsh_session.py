@@ -44,12 +44,16 @@ def session() -> Iterator[Any]:
 
 
 def meshed(
-    draw: Callable[[Any], None], dim: int, sizing: Sizing, move: Callable[[Points], Points] | None = None
+    draw: Callable[[Any], None],
+    dim: int,
+    sizing: Sizing,
+    move: Callable[[Points], Points] | None = None,
+    seed: int = 1,
 ) -> tuple[Points, Indices]:
     """Points (n, d) and positive cells (m, d + 1) of what `draw` puts into gmsh's OpenCASCADE model.
 
     A flat body, and the flat and cylindrical faces of a solid, have random points (`scattered`). `move` maps the nodes
-    of the surface mesh (k, 3) to other places before the volume is filled.
+    of the surface mesh (k, 3) to other places before the volume is filled. `seed`: of the random points.
 
     Raises:
         MeshError: gmsh failed; the message has its reason.
@@ -60,9 +64,9 @@ def meshed(
         sizing.apply(gmsh)
         if dim == 2:
             gmsh.model.mesh.generate(1)
-            return scatter_plane(gmsh, sizing)
+            return scatter_plane(gmsh, sizing, seed)
         gmsh.model.mesh.generate(2)
-        scatter_faces(gmsh, sizing)
+        scatter_faces(gmsh, sizing, seed)
         if move:
             _move_nodes(gmsh, move)
         fill_volumes(gmsh, sizing)

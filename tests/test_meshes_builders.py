@@ -456,6 +456,19 @@ def test_gmsh_is_ended_after_an_error() -> None:
     assert not gmsh.isInitialized()
 
 
+@pytest.mark.parametrize("size", [(1.0, 1.0), (1.0, 1.0, 1.0)])
+def test_another_seed_is_another_mesh_of_the_same_body(size: tuple[float, ...]) -> None:
+    """As fine, of the same measure, with other points; the same seed gives the same mesh."""
+    one, again, other = (
+        BUILDERS["box"](size=size, h=0.25, pattern="unstructured", seed=seed).build() for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one.points, again.points)
+    np.testing.assert_array_equal(one.cells, again.cells)
+    assert not np.array_equal(one.points, other.points)
+    assert np.abs(signed_measures(other.points, other.cells)).sum() == pytest.approx(1.0, rel=1e-12)
+    assert len(other.cells) == pytest.approx(len(one.cells), rel=0.2)
+
+
 BAD: list[tuple[str, dict[str, Any], str]] = [
     ("box", {"size": (1.0,)}, r"box: size = \[1.0\] must have two entries"),
     ("box", {"size": (1.0, -1.0)}, r"box: size\[1\] = -1.0 must be a positive number"),
@@ -463,6 +476,8 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("box", {"h": "fine"}, "box: h = 'fine' must be a positive number"),
     ("box", {"h": 1e-6}, "h = 1e-06 m would make about .* cells"),
     ("box", {"origin": (0.0, 0.0)}, "origin = .* must have as many numbers as size"),
+    ("box", {"pattern": "unstructured", "seed": 0}, "box: seed = 0 must be 1 or more"),
+    ("box", {"seed": 2}, 'seed is of random points: give pattern = "unstructured"'),
     ("box", {"pattern": "hex"}, "pattern = 'hex' is not one of structured, unstructured"),
     ("cylinder", {"length": 0.0}, "cylinder: length = 0.0 must be a positive number"),
     ("cylinder", {"axis": "w"}, "axis = 'w' is not one of x, y, z"),

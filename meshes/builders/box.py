@@ -26,6 +26,7 @@ class Box:
         pattern: "structured": a lattice, each square cut into 2 triangles or each cube into 6 tetrahedra, all alike
             (Kuhn's subdivision: conforming, and quick for any size); "unstructured": random points, no preferred
             directions.
+        seed: of the random points, where there are any: 1, 2, ... are different meshes.
 
     Groups: left, right (least and greatest x), bottom, top (y in 2D, z in 3D), and in 3D front, back (least and
     greatest y).
@@ -41,6 +42,7 @@ class Box:
     h: float = 0.05
     origin: tuple[float, ...] = ()
     pattern: Literal["structured", "unstructured"] = "structured"
+    seed: int = 1
 
     def __post_init__(self) -> None:
         if len(self.size) not in (2, 3):
@@ -51,6 +53,9 @@ class Box:
             f"box: origin = {list(self.origin)} must have as many numbers as size = {list(self.size)}.",
         )
         one_of("box", "pattern", self.pattern, ("structured", "unstructured"))
+        require(self.seed > 0, f"box: seed = {self.seed!r} must be 1 or more.")
+        random = self.pattern == "unstructured"
+        require(random or self.seed == 1, 'box: seed is of random points: give pattern = "unstructured" beside it.')
         affordable("box", self.h, self.cells_estimate())
 
     @property
@@ -71,7 +76,7 @@ class Box:
             points, cells = lattice(self._steps())
             points = self._placed(points)
         else:
-            points, cells = meshed(self._draw, len(self.size), Sizing(self.h))
+            points, cells = meshed(self._draw, len(self.size), Sizing(self.h), seed=self.seed)
         return MeshData(points, cells, plane_groups(points, boundary_facets(cells), self._planes()))
 
     def _steps(self) -> tuple[int, ...]:

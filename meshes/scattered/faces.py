@@ -18,22 +18,23 @@ from .points import scatter
 
 LINE, TRIANGLE = 1, 2  # gmsh's numbers for cell types
 TURN = 2 * np.pi
+FACES = 1_000_000  # seeds from one of a mesh to the next: each of its faces has its own
 
 
-def scatter_plane(gmsh: Any, sizing: Sizing) -> tuple[Points, Indices]:
+def scatter_plane(gmsh: Any, sizing: Sizing, seed: int = 1) -> tuple[Points, Indices]:
     """Points (n, 2) and positive triangles (m, 3) of a flat body whose curves are meshed; MeshError as of `scatter`."""
     nodes = _Curves.of(gmsh, [tag for _, tag in gmsh.model.getEntities(1)])
-    return scatter(Outline(nodes.points[:, :2], nodes.pieces), sizing.at)
+    return scatter(Outline(nodes.points[:, :2], nodes.pieces), sizing.at, seed)
 
 
-def scatter_faces(gmsh: Any, sizing: Sizing) -> None:
+def scatter_faces(gmsh: Any, sizing: Sizing, seed: int = 1) -> None:
     """Mesh the flat and cylindrical faces of a meshed surface anew; others stay as gmsh made them.
 
     Sizes are those at the first two coordinates of gmsh's model, as everywhere.
     """
     for _, face in gmsh.model.getEntities(2):
         if gmsh.model.getType(2, face) in ("Plane", "Cylinder"):
-            _mesh_anew(gmsh, face, sizing)
+            _mesh_anew(gmsh, face, sizing, face + FACES * (seed - 1))
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class _Curves:
         return cls(tags, points, pieces.reshape(-1, 2))
 
 
-def _mesh_anew(gmsh: Any, face: int, sizing: Sizing) -> None:
+def _mesh_anew(gmsh: Any, face: int, sizing: Sizing, seed: int) -> None:
     """Lay the face out in a plane, scatter points there, and put them and their triangles in the place of gmsh's."""
     sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, oriented=False)]
     seams = {side for side in sides if sides.count(side) == 2}
@@ -74,7 +75,7 @@ def _mesh_anew(gmsh: Any, face: int, sizing: Sizing) -> None:
     def place(points: Points) -> Points:
         return np.array(gmsh.model.getValue(2, face, (points / scale).ravel())).reshape(-1, 3)
 
-    points, cells = scatter(Outline(flat * scale, pieces), lambda points: sizing.at(place(points)), seed=face)
+    points, cells = scatter(Outline(flat * scale, pieces), lambda points: sizing.at(place(points)), seed)
     gmsh.model.mesh.clear([(2, face)])
     last = gmsh.model.mesh.getMaxNodeTag()
     inner = points[len(tags) :]
