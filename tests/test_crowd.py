@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.contacts import Contacts
-from fracsim.rigid.crowd import Crowd, projected
+from fracsim.rigid.crowd import Crowd, _bound, projected
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.model import Rules
 from support.falling import CUBE, DOWN, MASS, cubes
@@ -93,3 +93,21 @@ def test_a_heap_keeps_its_momentum_and_loses_energy() -> None:
     assert len(touches) > 1000 and after.kinetic < 0.9 * bodies.kinetic
     assert np.allclose(after.momentum, bodies.momentum, atol=1e-9 * size)
     assert np.allclose(after.angular_momentum, bodies.angular_momentum, atol=1e-8 * size)
+
+
+def test_no_step_of_a_crowd_is_too_long() -> None:
+    """J M^-1 J^T <= D: by the eigenvalues of the dense matrix, its rows from moments of single forces; and D is not as
+    many times too large as bodies have contacts."""
+    contacts, bodies = pile(0.3)
+    crowd, k = Crowd.of(contacts, bodies.mass, np.linalg.inv(bodies.inertia)), len(contacts)
+    across = np.zeros((3, k, 36, 6))
+    for number, (things, at, axes) in enumerate(zip(contacts.things, contacts.point, contacts.axes, strict=True)):
+        for body, sign in zip(things, (-1.0, 1.0), strict=True):
+            if body < 36:
+                turning = np.cross(at - bodies.place[body], axes)
+                across[:, number, body] = sign * np.concatenate([axes, turning], axis=1)
+    weight = np.concatenate([np.tile(1 / bodies.mass, (3, 1)), np.tile(1 / bodies.inertia[:, 0, 0], (3, 1))]).T
+    scaled = (across * np.sqrt(weight)).reshape(3, k, -1) / np.sqrt(_bound(crowd.rows, crowd.things, 36))[:, None]
+    most = np.linalg.svd(scaled.reshape(3 * k, -1), compute_uv=False)[0] ** 2
+    assert 0.4 < most <= 1 + 1e-12
+    assert np.bincount(contacts.things.ravel())[:36].max() == 8

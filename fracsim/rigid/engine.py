@@ -36,8 +36,9 @@ FARTHER = 1.5  # by as many times
 SLIPS = 10  # rounds of slip, at most,
 CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
 CROWD = 300  # contacts: more are not given to Newton's method
-MOST, NEARLY = 300, 0.01  # iterations on a crowd, at most, and what velocities may be off by, c_0,
-LOOKS, ROUGH = 3, 50  # after so many looks of so many iterations, at most, for what meets what
+NEARLY = 0.01  # c_0: what velocities of a crowd may be off by,
+MOST, WORK = 150, 500_000  # after so many iterations, at most, of few contacts so many in all
+LOOKS, ROUGH = 3, 30  # looks for what meets what, at most, and iterations of all but the first whole one
 
 
 @dataclass
@@ -98,9 +99,10 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [self._reach(bodies, of) for of in (common, 0.0)]
-        met, far = None, np.ones(self._count, bool)
+        known: _Met | None = None
+        far: Flags = np.ones(self._count, bool)
         for _ in range(ROUNDS):
-            met = self._met(bodies, rates, common, reach, met, far)
+            met = known = self._met(bodies, rates, common, reach, known, far)
             moved, touches, done = self._moved(met, rates, rough=True)
             farther = [self._reach(moved, of) for of in (common, 0.0)]
             far = np.any([now > FARTHER * then for now, then in zip(farther, reach, strict=True)], axis=0)
@@ -127,7 +129,7 @@ class Engine:
         with a common velocity (3,), and than another (n,) beside what stands, m and m/s; `known` so far, without what
         comes `far`ther (n,) than was thought."""
         dt, g, bodies = self._rules.step, self._rules.gravity, start
-        before, _ = self._renewed(start, rates, common, reach, known and known.before, far)
+        before, _ = self._renewed(start, rates, common, reach, known.before if known else None, far)
         contacts, (meeting, parting) = before, self._meeting(before, start, rates)
         share = flown(meeting, before.things, self._count)
         if np.any(share):
@@ -255,23 +257,24 @@ class Engine:
         return np.asarray(~kept & (met.meeting.gap < self._rules.step * met.contacts.closing(*motion)))
 
     def _by_projections(self, met: _Met, rates: Values, *, rough: bool) -> Values:
-        """As `_by_newton`, whatever there is of them, from where it was left: where it may be `rough`, until nothing
-        more is missed."""
+        """As `_by_newton`, whatever there is of them, from where it was left: where it may be `rough`, to see what is
+        missed."""
         dt, bodies = self._rules.step, met.bodies
         inverse = bodies.turn @ self._model.inverse @ np.swapaxes(bodies.turn, 1, 2)
         free = self._motion(self._driven_on(bodies, np.zeros((self._count, 6))), rates)
-        for number in range(LOOKS):
+        for number in range(1 if rough else LOOKS):
             rows = np.flatnonzero(met.near)
             some = met.contacts.chosen(rows)
             crowd = Crowd.of(some, self._model.mass, inverse)
             aim: Values = np.asarray(met.meeting.aim[rows] / dt)
-            enough, most = NEARLY * self._rules.fast, ROUGH if rough or number else MOST
+            enough = NEARLY * self._rules.fast
+            most = ROUGH if rough or number else max(MOST, WORK // max(len(rows), 1))
             met.impulse[rows] = crowd.impulses(some.parting(*free), aim, enough, most, met.impulse[rows])
             force = self._forces(bodies, crowd.gained(met.impulse[rows]))
             missed = self._missed(met, met.near, self._motion(self._driven_on(bodies, force), rates))
+            met.near |= missed
             if not np.any(missed):
                 break
-            met.near |= missed
         return force
 
     def _forces(self, bodies: Bodies, gained: Values) -> Values:
