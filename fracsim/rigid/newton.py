@@ -78,7 +78,7 @@ class Newton:
             getattr(made, name)[:] = getattr(self._alike, name)
         made.geom[:], made.pos[:] = self._geom[contacts.things], contacts.point
         made.frame[:] = contacts.axes.reshape(-1, 9)
-        made.friction[:], made.friction[:, :2] = 0.0, contacts.friction[:, None]
+        made.friction[:], made.friction[:, :2] = 0.0, np.maximum(contacts.friction, mujoco.mjMINMU)[:, None]
 
     def solved(self, aim: Values, kept: Flags) -> tuple[Values, Values, Flags]:
         """Forces and moments (n, 6) that kept (k,) contacts give, which may come nearer by aims (k,) m, these in the
