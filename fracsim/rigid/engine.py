@@ -19,6 +19,7 @@ from .bodies import Bodies
 from .contacts import Contacts
 from .crowd import Crowd
 from .finding import Finder
+from .lifting import lifts, raised
 from .meeting import Meetings, flown, meetings
 from .model import Part, Rules, Stand, model_of
 from .newton import Newton
@@ -33,6 +34,7 @@ Flags = npt.NDArray[np.bool_]
 TURN = 1.0  # rad a step that contacts set a body spinning by, at most: they are of one place, and a crumb would whirl
 ROUNDS = 3  # of looking for contacts, at most, where what is struck goes farther than was thought,
 FARTHER = 1.5  # by as many times
+MISSED = 0.25  # c_0 dt, that what nobody looked at may be in a floor by
 SLIPS = 10  # rounds of slip, at most,
 CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
 CROWD = 300  # contacts: more are not given to Newton's method
@@ -99,13 +101,16 @@ class Engine:
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / self._rules.step)
         common = np.median(np.concatenate([bodies.velocity, rates]), axis=0)
         reach = [self._reach(bodies, of) for of in (common, 0.0)]
+        planes, end = self._model.planes, self._way if ways is None else ways
         known: _Met | None = None
         far: Flags = np.ones(self._count, bool)
+        planes.begin()
         for _ in range(ROUNDS):
             met = known = self._met(bodies, rates, common, reach, known, far)
             moved, touches, done = self._moved(met, rates, rough=True)
             farther = [self._reach(moved, of) for of in (common, 0.0)]
             far = np.any([now > FARTHER * then for now, then in zip(farther, reach, strict=True)], axis=0)
+            far |= planes.missed(moved, end, MISSED * self._rules.fast * self._rules.step)
             if not np.any(far):
                 break
             reach = [np.where(far, np.maximum(now, then), then) for now, then in zip(farther, reach, strict=True)]
@@ -139,8 +144,10 @@ class Engine:
         others = share > 0 if known is None else far | (share != known.share)
         contacts, kept = self._renewed(bodies, rates, common, reach, known.contacts if known else before, others)
         if np.any(share):
+            lift = lifts(before, contacts, share > 0)
+            bodies = replace(bodies, place=bodies.place + lift)
             falling = replace(bodies, velocity=bodies.velocity + fallen)
-            meeting, parting = self._meeting(contacts, falling, rates)
+            meeting, parting = self._meeting(replace(contacts, gap=raised(contacts, lift)), falling, rates)
         self._parting = parting
         near, impulse = meeting.near, np.zeros((len(contacts), 3))
         if known:

@@ -1,11 +1,13 @@
 """Contacts of hulls with planes: every corner that may come as far.
 
-MuJoCo finds three places of a hull at most. A shard that turns fast falls through a floor with a fourth.
+MuJoCo finds three places of a hull at most. A shard that turns fast falls through a floor with a fourth. Which corners
+may come as far is told by how bodies move as a step begins: what something strikes comes down with others, and is
+looked at once more with these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +44,14 @@ def _bearing(of: Ints, arm: Values, normal: Values, later: Values) -> Flags:
     return np.asarray(_first(group, later, LOWEST) | _first(group, -np.hypot(*along), WIDEST) | few[of])
 
 
+@dataclass
+class _Looked:
+    """(p, N) corners that were looked at when it was last asked for what is near, and those that are in any case."""
+
+    at: Flags
+    always: Flags
+
+
 @dataclass(frozen=True)
 class Planes:
     """p planes, and N corners of hulls.
@@ -60,6 +70,39 @@ class Planes:
     of: Ints
     part: Ints
     extent: Values
+    _looked: _Looked = field(init=False)
+
+    def __post_init__(self) -> None:
+        none = np.zeros((len(self.stand), len(self.corners)), bool)
+        object.__setattr__(self, "_looked", _Looked(none, none.copy()))
+
+    def begin(self) -> None:
+        """A step: nothing has been missed in it."""
+        self._looked.always[:] = False
+
+    def missed(self, bodies: Bodies, ways: Values, deep: float) -> Flags:
+        """(n,) bodies with corners that are in a plane by more than `deep`, m, and were not looked at: now they are, in
+        this step, as far as they bear. `bodies`, `ways`: (stands, 3) where things are after it."""
+        looked, found = self._looked, np.zeros(len(bodies), bool)
+        for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
+            near, x, gap = self._around(bodies, ways[stand], normal, np.zeros(len(bodies)))
+            rows = np.flatnonzero((gap < -deep) & ~looked.at[number, near])
+            if len(rows):
+                of = self.of[near[rows]]
+                bears = _bearing(of, x[rows] - bodies.place[of], normal, gap[rows])
+                looked.always[number, near[rows[bears]]] = found[of] = True
+        return found
+
+    def _around(
+        self, bodies: Bodies, way: Values, normal: Values, reach: Values, only: Flags | None = None
+    ) -> tuple[Ints, Values, Values]:
+        """Corners (k,) of bodies that come near a plane with a normal (3,) through a point (3,), where they are (k, 3),
+        and how far from it (k,), m; `reach`: (n,) how far each and the plane come, m; `only`: (n,) of these bodies."""
+        low = (bodies.place - way) @ normal < self.extent + reach
+        near = np.flatnonzero((low if only is None else low & only)[self.of])
+        of = self.of[near]
+        x = np.einsum("kij,kj->ki", bodies.turn[of], self.corners[near]) + bodies.place[of]
+        return near, x, (x - way) @ normal
 
     def near(
         self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, only: Flags | None = None
@@ -71,19 +114,17 @@ class Planes:
             return []
         found = []
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
-            high = (bodies.place - ways[stand]) @ normal
-            low = high < self.extent + reach + speeds[stand]
-            near = np.flatnonzero((low if only is None else low & only)[self.of])
-            of = self.of[near]
-            x = np.einsum("kij,kj->ki", bodies.turn[of], self.corners[near]) + bodies.place[of]
-            gap = (x - ways[stand]) @ normal
-            rows = np.flatnonzero(gap < reach[of] + speeds[stand])
+            near, x, gap = self._around(bodies, ways[stand], normal, reach + speeds[stand], only)
+            looked, always = self._looked.at[number], self._looked.always[number]
+            looked[slice(None) if only is None else only[self.of]] = False
+            rows = np.flatnonzero((gap < reach[self.of[near]] + speeds[stand]) | always[near])
             if len(rows):
-                near, of, x, gap = near[rows], of[rows], x[rows], gap[rows]
+                near, of, x, gap = near[rows], self.of[near[rows]], x[rows], gap[rows]
                 way = -step * np.einsum("ki,i->k", bodies.velocity_at(x, of), normal)
                 soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
-                kept = _first(of, gap, NEAREST)
+                kept = _first(of, gap, NEAREST) | always[near]
                 kept[soon] |= _bearing(of[soon], x[soon] - bodies.place[of[soon]], normal, (gap - way)[soon])
+                looked[near[kept]] = True
                 points = x[kept] - gap[kept, None] / 2 * normal
                 found.append((number, self.part[near[kept]], gap[kept], points))
         return found
