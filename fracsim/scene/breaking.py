@@ -69,6 +69,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
 def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
     """What breaks where cracks take an energy."""
     from ..fracture.breaking import Breaking
+    from ..fracture.energy.row import RowTips
     from ..fracture.energy.splitting import ClosingSplitting, Splitting
     from ..fracture.energy.tips import CrackTips
 
@@ -78,8 +79,10 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
         return _cohesive(study, balance, graph, passes, opened)
     stress, strength = balance.stress, strength_of(study, balance.domain, graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
-    tips = CrackTips(stress, graph, strength, toughness, opened, branching=study.fracture.branching)
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
+    rows = balance.domain.dim == 3 and not moves
+    criterion_type = RowTips if rows else CrackTips
+    tips = criterion_type(stress, graph, strength, toughness, opened, branching=study.fracture.branching)
     pace = tips.pace() if moves and not given else None
     kind = ClosingSplitting if stress.closes else Splitting
     splitting = kind(stress, graph, tips.release_rate() if moves else None)

@@ -33,7 +33,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "crack": [{"polygon": [[-0.1, -0.1, 0.52], [0.5, -0.1, 0.52], [0.5, 0.5, 0.52], [-0.1, 0.5, 0.52]]}],
         "boundary": [
             {"on": "bottom", "fix": "xyz"}, {"on": "front", "fix": "y"},
-            {"on": "top", "displacement": {"time": [0, 1, 11], "value": [[0, 0, 0], [0, 0, 0.013], [0, 0, 0.023]]}},
+            {"on": "top", "displacement": {"time": [0, 1, 11], "value": [[0, 0, 0], [0, 0, 0.013], [0, 0, 0.05]]}},
         ],
         "time": {"scheme": "quasi-static", "step": 1.0, "end": 5.0},
     },

@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from ..brittle.principal import largest, tensors
 from ..criterion import Edges
+from ..energy.along import LEAST
 from ..energy.branching import unit
-from ..energy.seen import LEAST, Seen
+from ..energy.seen import Seen
 from ..energy.tips import APART, CrackTips, Proposal
 
 Ints = npt.NDArray[np.int64]
@@ -37,7 +38,7 @@ class CohesiveTips(CrackTips):
         begins: whether a crack may begin.
     """
 
-    begins, pairs = False, False
+    begins, onwards = False, False
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
@@ -55,7 +56,9 @@ class CohesiveTips(CrackTips):
             loaded &= ~(tips.mature & (np.linalg.norm(tips.ahead, axis=1) <= LEAST * seen.disc))
         rows = np.flatnonzero(loaded & ~self.barred[tips.cell])
         cells, ahead, no = tips.cell[rows], tips.point[rows] - tips.behind[rows], np.zeros(len(rows), bool)
-        rank = self._ranked(0, sigma[rows], tips.point[rows], APART[self._domain.dim] * self._h[cells])
+        rank = self._ranked(
+            0, sigma[rows], self._numbers(cells), tips.point[rows], APART[self._domain.dim] * self._h[cells]
+        )
         entry = np.argmax(~self._graph.intact(cells), axis=1)
         return Proposal(rank, cells, without(mean[rows], ahead), entry, ahead, no, no)
 
@@ -67,7 +70,8 @@ class CohesiveTips(CrackTips):
         """One that does, of all ranks: the one loaded most, of those that are loaded alike by a hash (collective)."""
         mean = self.sight.means_at(weak, stress)
         load = np.round(self._greatest(mean, weak) / self._strength_of(weak), DIGITS)
-        rank = self._ranked(1, load, self.sight.centres[weak], self._h[weak])
+        centres = self.sight.centres[weak]
+        rank = self._ranked(1, load, centres, centres, self._h[weak])
         every = np.concatenate(self._domain.comm.allgather(rank[load >= 1]))
         first = every[np.lexsort(every[:, 2::-1].T)][:1]
         chosen = (rank == first).all(axis=1) if len(first) else np.zeros(len(weak), bool)

@@ -9,11 +9,13 @@ crack      the cells that cracks cut, known on every rank
 neighbourhoods  what lies around the tips, kept until cracks change
 patch      gradients of fields around tips, by matrices that are kept
 front      in space: the crack that an advance makes, by which g is divided
+along      in space: G of tips by themselves, or of the front nearby
 seen       the body as tips see it
 mixed      where a crack in tension and sliding turns, and what that releases
 branching  where a crack becomes two, and tips that share a disc
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
+row        in space, without inertia: all of a front gets on at once
 joined     the same, without those that would cut a node off
 splitting  what is left of a cell that has come apart
 

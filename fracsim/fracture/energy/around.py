@@ -78,6 +78,11 @@ def pairs_within(tree: cKDTree, places: Values, radius: Values) -> Pairs:
     return Pairs(place, other, apart, np.sqrt(np.einsum("ni,ni->n", apart, apart)), len(places))
 
 
+def over(sums: Values, weight: Values) -> Values:
+    """Sums over their weights; 0 where there is none."""
+    return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)
+
+
 class Around:
     """The cells of this rank and those of others that are near them, in the order of the input mesh.
 

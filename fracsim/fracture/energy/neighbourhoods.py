@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 from ...mesh.edges import EdgeGraph
 from ..brittle.principal import largest, tensors
 from . import branching, mixed
-from .around import Around, Pairs, pairs_within
+from .along import Alone, Along
+from .around import Around, Pairs, over, pairs_within
 from .crack import Crack
 from .force import plateau, plateau_gradient
 from .front import Front, advance
@@ -83,14 +84,15 @@ class Neighbourhoods:
 
     Attributes:
         tips: as they were when `update` was called last.    asked: the cells around them.
+        along: in space, what G their fronts have there.
     """
 
     def __init__(
-        self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach, *, forks: bool
+        self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach, *, forks: bool, shares: bool
     ) -> None:
-        """`forks`: whether cracks branch."""
+        """`forks`: whether cracks branch; `shares`: whether tips of a front take their shares of a force (along)."""
         self._around, self._crack, self._graph, self._front, self._reach = around, crack, graph, front, reach
-        self._forks = forks
+        self._forks, self.along = forks, (Along if shares else Alone)(graph.domain.comm)
         none, nowhere, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
         self.tips = Tips(none, none.astype(np.uint8), nowhere, nowhere, no, nowhere, nowhere, nowhere, no, no, nowhere)
         self._split = np.zeros(len(around.number), bool)
@@ -116,6 +118,9 @@ class Neighbourhoods:
         ends = np.concatenate([[0], np.cumsum(np.bincount(self._place, minlength=len(self.tips)))])
         self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._cell], ends
         self._matrices.clear()
+        if self.tips.point.shape[1] == 3:
+            cell, domain = self.tips.cell, self._graph.domain
+            self.along.update(domain.cell_input[cell], self.tips.point, self.tips.ahead, self._reach.disc[cell])
 
     # --- sums ---
 
@@ -284,8 +289,3 @@ def along_the_surface(ahead: Values, surface: Values, radius: Values) -> Values:
     along = ahead - np.einsum("nk,nk->n", ahead, normal)[:, None] * normal
     turned = np.einsum("nk,nk->n", along, along) >= np.einsum("nk,nk->n", ahead, ahead) / 2
     return np.where(turned[:, None], along, ahead)
-
-
-def over(sums: Values, weight: Values) -> Values:
-    """Sums over their weights; 0 where there is none."""
-    return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)

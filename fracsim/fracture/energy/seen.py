@@ -14,19 +14,17 @@ from ...mesh.edges import EdgeGraph
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..brittle.principal import tensors
-from .around import Around
+from .around import Around, over
 from .asked import Asked
 from .crack import Crack
 from .force import across, eshelby, first_piola, springs
 from .front import Front
-from .neighbourhoods import Neighbourhoods, Reach, Tips, over
+from .neighbourhoods import Neighbourhoods, Reach, Tips
 from .patch import Patch
 
 Cells = npt.NDArray[np.integer]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-
-LEAST = 0.05  # of R: a shorter advance is that of no front
 
 
 @dataclass(frozen=True)
@@ -62,16 +60,10 @@ class Seen:
 
         g = - sum V Sigma grad q + sum V q rho (H^T a - (grad v)^T v)
 
-        In space that along the advance of a crack, over the area it makes: (g . a) a / |a|^3, a of `front`.
+        In space that along the advance of a crack, over the area it makes (along) (collective).
         """
         force = self.around.forces(self.sigma, self.inertia)
-        if force.shape[1] == 2:
-            return force
-        ahead = self.tips.ahead
-        length = np.linalg.norm(ahead, axis=1)
-        along = np.einsum("nk,nk->n", force, ahead)
-        share = np.divide(along, length**3, out=np.zeros(len(along)), where=length > LEAST * self.disc)
-        return np.asarray(share[:, None] * ahead)
+        return force if force.shape[1] == 2 else self.around.along(force)
 
     def means(self, rows: Ints) -> Values:
         """(m, d, d) mean stress around tips `rows` (m,), Pa."""
@@ -97,8 +89,11 @@ class Sight:
         motion: (owned dofs,) velocity in m/s and acceleration in m/s^2; None where nothing moves.
     """
 
-    def __init__(self, stress: Stress, graph: EdgeGraph, reach: Reach, *, forks: bool = False) -> None:
-        """`forks`: whether cracks branch (collective)."""
+    def __init__(
+        self, stress: Stress, graph: EdgeGraph, reach: Reach, *, forks: bool = False, shares: bool = False
+    ) -> None:
+        """`forks`: whether cracks branch; `shares`: whether the force on a tip in space is that on the front nearby
+        (collective)."""
         self._stress, self._graph, self._reach = stress, graph, reach
         domain = self._domain = stress.domain
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
@@ -106,7 +101,7 @@ class Sight:
         farthest = domain.comm.allreduce(float(np.max(reach.disc, initial=0.0)), op=MPI.MAX)
         self._near, self._front = Around(domain, farthest), Front(domain, graph)
         self.crack = Crack(graph, self._front, self.centres)
-        self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks)
+        self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks, shares=shares)
         # of the coordinates of cells, NaN until somebody looks there
         self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
         self._patch: tuple[Asked, Patch] | None = None

@@ -86,10 +86,11 @@ class CrackTips:
         cut: (edges,) where cracks cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
         toughness: G_c in J/m^2, a number or (cells,).    strength: of each edge in each cell.
         cells: (n,) of this rank that were chosen last.    barred: (cells,) not to be cut (joined).
-        pairs: whether tips in the plane go through two cells in a pass without inertia.
+        onwards: whether tips go on for more than a cell in a pass without inertia.    course: numbers that say whither.
+        shares: whether tips of a front in space share its force (along).
     """
 
-    pairs = True
+    onwards, shares, course = True, False, 2
 
     def __init__(
         self,
@@ -109,7 +110,7 @@ class CrackTips:
         self._h = local_size(domain)
         self.disc = DISC[domain.dim]
         reach = Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h)
-        self.sight = Sight(stress, graph, reach, forks=branching)
+        self.sight = Sight(stress, graph, reach, forks=branching, shares=self.shares)
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
@@ -186,7 +187,7 @@ class CrackTips:
                 branches &= self._rate[tips.cell] * self._dt <= 1  # a Rayleigh wave stays in the disc within a step
                 ahead = np.where(branches[:, None], tips.course, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
-        may = np.flatnonzero((~mature | (size >= toughness)) & ~(tips.waits | self.barred[tips.cell]))
+        may = np.flatnonzero((~mature | self._enough(size, toughness, tips)) & ~(tips.waits | self.barred[tips.cell]))
         if not len(may):
             return self._none(0)
         mean = seen.means(may)
@@ -196,9 +197,13 @@ class CrackTips:
         strained = np.sqrt(NEAR_TIP[d] * self._modulus[tips.cell] * toughness / (AVERAGE * h))[may[weak]]
         active[weak] = np.sqrt(seen.squares(may[weak])) >= strained
         rows = may[active]
-        rank = self._ranked(0, sigma[active], tips.point[rows], apart[rows])
+        rank = self._ranked(0, sigma[active], self._numbers(tips.cell[rows]), tips.point[rows], apart[rows])
         entry = np.argmax(~self._graph.intact(tips.cell[rows]), axis=1)
         return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows], branches[rows])
+
+    def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
+        """(n,) which tips, on which a force of `size` (n,) acts, reach their G_c (collective)."""
+        return size >= toughness
 
     @staticmethod
     def _turned(psi: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
@@ -232,7 +237,8 @@ class CrackTips:
         over = sigma >= self._strength_of(weak)
         cells = weak[over]
         radius = self.disc * self._h[cells]
-        return Proposal(self._ranked(1, sigma[over], self.sight.centres[cells], radius), cells, mean[over])
+        centres = self.sight.centres[cells]
+        return Proposal(self._ranked(1, sigma[over], centres, centres, radius), cells, mean[over])
 
     def _none(self, kind: int) -> Proposal:
         """Nothing of a kind."""
@@ -261,8 +267,13 @@ class CrackTips:
     # --- what is chosen, and cut ---
 
     @staticmethod
-    def _ranked(kind: int, sigma: Values, places: Values, apart: Values) -> Values:
-        return np.column_stack([np.full(len(sigma), float(kind)), -sigma, hashed(places), places, apart])
+    def _ranked(kind: int, sigma: Values, key: Values, places: Values, apart: Values) -> Values:
+        """Rows of `Proposal.rank`; `key`: (n, ...) of which the hash is, alike on any number of ranks."""
+        return np.column_stack([np.full(len(sigma), float(kind)), -sigma, hashed(key), places, apart])
+
+    def _numbers(self, cells: Ints) -> Values:
+        """(n, 1) of cells in the input mesh: tips that came in by one edge are at one place."""
+        return np.asarray(self._domain.cell_input[cells, None], float)
 
     def _chosen(self, *proposals: Proposal) -> list[Proposal]:
         """The first of those too near to one another: tips before new cracks, then by sigma_1 (collective)."""
@@ -286,14 +297,12 @@ class CrackTips:
         if self._idle:
             return np.empty(0, np.int64)
         grows, begins = self._rows(grown, self._way_out(grown)), self._rows(begun, self._through(begun))
-        edges, ahead = self._remembered(np.concatenate([grows, begins]))
-        if not self.pairs or self._domain.dim == 3 or self.sight.motion is not None:
-            return edges
-        return np.concatenate([edges, self._further(edges, ahead)])
+        edges, courses = self._remembered(np.concatenate([grows, begins]))
+        return self._beyond(edges, courses) if self.onwards and self.sight.motion is None else edges
 
     def _remembered(self, rows: Values) -> tuple[Edges, Values]:
-        """Where edges are cut, from all ranks: (n,) local edges of this one, and (n, d) whither cracks go on from there
-        (collective)."""
+        """Where edges are cut, from all ranks: (n,) local edges of this one, and (n, course) whither cracks go on from
+        there (collective)."""
         every = np.concatenate(self._domain.comm.allgather(rows))
         every = every[np.lexsort(every[:, 5:2:-1].T)]  # neighbours cut the same edge where the first of them does
         keys, first = np.unique(every[:, :2].astype(np.int64), axis=0, return_index=True)
@@ -303,14 +312,17 @@ class CrackTips:
         self.cut[local[new]] = chosen[:, 2]
         return local[new], chosen[:, 6:]
 
-    def _further(self, edges: Edges, ahead: Values) -> Edges:
-        """Whole cells beyond edges (n,) that were cut just now are cut straight `ahead` (n, d); 0: not (collective).
+    def _beyond(self, edges: Edges, courses: Values) -> Edges:
+        """Edges (n,) that were cut just now, and in the plane those of whole cells beyond them, which are cut straight
+        on (n, 2); 0: not (collective).
 
         A tip that turned by K_I and K_II knows where it goes for more than a cell; g, of a disc of 5 h, is the same in
         the next to some per cent. Looked at anew there without a solve it would be that of a body out of balance.
         """
-        graph, way = self._graph, np.zeros((len(self._graph.broken), ahead.shape[1]))
-        way[edges] = ahead
+        if self._domain.dim == 3:
+            return edges
+        graph, way = self._graph, np.zeros((len(self._graph.broken), 2))
+        way[edges] = courses
         entered = np.any(way[graph.cell_edges], axis=2)
         cells = np.flatnonzero((entered.sum(axis=1) == 1) & ~(graph.damaged | self.barred)).astype(np.int64)
         entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
@@ -318,9 +330,9 @@ class CrackTips:
         place, torn, ahead = self.sight.places(came, self.cut), self._torn()[graph.cell_edges[cells]], way[came]
         cuts = leave(self._corners(cells), entry, place, rotated(ahead, np.pi / 2), ahead, torn)
         self.cells = np.concatenate([self.cells, cells])
-        rank = self._ranked(0, np.zeros(len(cells)), place, np.zeros(len(cells)))
-        none = np.empty((len(cells), 2, 2))
-        return self._remembered(self._rows(Proposal(rank, cells, none, entry, ahead, turns, ~turns), cuts))[0]
+        rank = self._ranked(0, np.zeros(len(cells)), place, place, np.zeros(len(cells)))
+        further = Proposal(rank, cells, np.empty((len(cells), 2, 2)), entry, ahead, turns, ~turns)
+        return np.concatenate([edges, self._remembered(self._rows(further, cuts))[0]])
 
     def _way_out(self, grown: Proposal) -> Cuts:
         """Where the cells of tips are left (collective)."""
@@ -340,14 +352,14 @@ class CrackTips:
         return self._domain.nodes[self._domain.cell_nodes[cells]]
 
     def _rows(self, cracks: Proposal, cuts: Cuts) -> Values:
-        """(n, 6 + d) key of each edge that is cut, where, from the end that comes first in the input mesh, its rank,
-        and whither the crack goes straight on; 0 where it does not."""
+        """(n, 6 + course) key of each edge that is cut, where, from the end that comes first in the input mesh, its
+        rank, and whither the crack goes straight on; 0 where it does not."""
         cells = cracks.cells[cuts.row]
         ends = self._domain.node_input[
             self._domain.cell_nodes[cells[:, None], local_edges(self._domain.dim)[cuts.edge]]
         ]
         share = np.where(ends[:, 0] > ends[:, 1], 1 - cuts.share, cuts.share)
-        straight = np.zeros((len(cells), self._domain.dim))
-        if cracks.turns is not None and cracks.ahead is not None:
+        straight = np.zeros((len(cells), self.course))
+        if cracks.turns is not None and cracks.ahead is not None and cracks.ahead.shape[1] == self.course:
             straight[:] = np.where(cracks.turns[:, None], cracks.ahead, 0.0)[cuts.row]
         return np.column_stack([np.sort(ends, axis=1), share, cracks.rank[cuts.row, :3], straight])
