@@ -126,6 +126,7 @@ ENTRIES = (
          ("izod-A516", "izod"), ("izod-NVE36", f"izod {NVE36}")), "--size 1400x600",
     ),
     one("kalthoff", "A plate of steel struck below its notch: stress upwards.", "--field stress:yy --zoom 0.8"),
+    one("l-panel", "What a cracked panel of concrete still holds.", "--field chi --magnify 40 --zoom 0.85"),
     one("branching", "A pane of glass whose crack branches.", "--view top --field piece --zoom 0.9"),
 )  # fmt: skip
 
