@@ -31,9 +31,26 @@ def test_the_page_says_where_it_is_not_installed(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_table_has_both_programs() -> None:
-    figures = {name: {"peak": 645.0, "at": 5e-6, "seconds": 1.0, "solves": 9.0} for name in ("ours", "theirs")}
-    record = {"case": "notched-plate", "figures": figures | {"cells": 8}, "message": ""}
+    one = {"peak": 645.0, "at": 5e-6, "turn": 0.0, "seconds": 1.0, "solves": 9.0}
+    figures = {"ours": one, "theirs": one, "cells": 8, "pull": "tension"}
+    record = {"case": "notched-plate", "figures": figures, "message": ""}
     (section,) = phase_field.sections([record])
     (table,) = section.tables
-    assert [row[:3] for row in table.rows] == [(8, "PhaseFieldX", 645.0), (8, "fracsim", 645.0)]
+    assert [row[1:4] for row in table.rows] == [(8, "PhaseFieldX", 645.0), (8, "fracsim", 645.0)]
     assert all(len(row) == len(phase_field.COLUMNS) for row in table.rows)
+
+
+def test_the_direction_of_a_crack() -> None:
+    """Of points along a line at 60 degrees below straight ahead, and of none behind the notch or near it."""
+    along = np.linspace(0, 0.5e-3, 60)[:, None] * [0.5, -np.sqrt(3) / 2]
+    behind = np.linspace(-0.5e-3, 0, 60)[:, None] * [1.0, 0.0]
+    assert phase_field.direction(np.concatenate([along, behind])) == pytest.approx(60.0)
+    assert np.isnan(phase_field.direction(behind))
+
+
+def test_the_plate_is_pulled_as_it_is_said() -> None:
+    """The last place of the grip's course is where the study moves it."""
+    for name, pull in phase_field.PULLS.items():
+        moved = phase_field.study(8, pull)["boundary"][1]["displacement"]["value"][1]
+        assert moved[{"tension": 1, "shear": 0}[name]] == pytest.approx(pull.course[-1])
+        assert np.count_nonzero(moved) == 1
