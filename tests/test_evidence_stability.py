@@ -406,6 +406,21 @@ def test_the_branches_of_a_crack() -> None:
     where, upper, lower = experiments.branches(np.concatenate([*arms, aside]), 2e-3) or (0.0, 0.0, 0.0)
     assert (where, upper, lower) == (pytest.approx(0.02, abs=1e-3), pytest.approx(20, abs=1), pytest.approx(30, abs=1))
     assert experiments.branches(arms[0], 2e-3) is None
+    stopped = np.concatenate([arms[0], arms[1][x < 0.03]])
+    assert experiments.branches(stopped, 2e-3) is None
+    first = experiments.branches(stopped, 2e-3, experiments.FIRST)
+    assert first is not None and first[0] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_only_branches_that_run_on_from_the_first_fork_count() -> None:
+    """A pane whose first two branches part by 3 degrees holds; one that is measured at a later fork does not."""
+    figures = {"first": 0.063, "fork": 0.064, "upper": 30.0, "lower": 27.0, "peak": 645.0, "angle": 70.0}
+    records = [{"case": case, "outcome": "done", "figures": dict(figures)} for case in ("branching",) * 3]
+    (claim,) = (each for each in experiments._of_notches(records) if "branches" in each.text)
+    assert claim.holds is True
+    records[1]["figures"]["fork"] = 0.079  # type: ignore[index]
+    (claim,) = (each for each in experiments._of_notches(records) if "branches" in each.text)
+    assert claim.holds is False
 
 
 def test_a_curve_that_begins_late_is_read_from_where_its_line_does() -> None:
