@@ -4,8 +4,9 @@
 
 A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
 steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
-solver options, the same assembly of the tangent (mechanics.tangent) and the same policy for the preconditioner (made
-once: nothing in the body changes), so that the machine's moods hit both. Figures are medians over the steps.
+solver options, the same assembly of the tangent (mechanics.tangent, the bare one by single entries) and the same policy
+for the preconditioner (made once: nothing in the body changes), so that the machine's moods hit both. Figures are
+medians over the steps.
 """
 
 from __future__ import annotations

@@ -10,6 +10,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from cases import BAR, study
+from fracsim.mechanics.balance import Balance
+from fracsim.mechanics.tangent import Assembly
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping import blocks, loose_parts, preconditioner
 from fracsim.stepping.newton import Solver
@@ -135,23 +137,40 @@ def test_a_rank_on_which_nothing_hangs_has_a_share_of_the_motions() -> None:
     assert Z.getSize() == (6, 6) and Z.getInfo()["nz_used"] == 0
 
 
-def test_products_in_blocks_are_those_of_single_entries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bar in pieces, whose matrices are made anew on the way and have entries between pieces beside those of cells:
-    CG and the finest level of multigrid multiply with blocks, to the last digits as with the tangent."""
+@pytest.mark.parametrize("first", [True, False])
+def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar in pieces, whose matrices are made anew on the way: CG and the finest level of multigrid multiply with
+    blocks, to the last digits as with the tangent, be they assembled first or copied from single entries."""
     monkeypatch.setattr(blocks, "SMALL", 0)
+    if not first:
+        monkeypatch.setattr(Balance, "tangent_in_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
-    assert isinstance(solver, Solver) and solver._blocks is not None
+    assert isinstance(solver, Solver) and solver._blocks is not None and solver._blocks.first is first
     pc = solver.snes.ksp.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
     tangent = scene.balance.tangent
     x, alone = tangent.createVecs()
     x.setRandom()
-    by_blocks = alone.duplicate()
+    by_blocks, u = alone.duplicate(), scene.balance.u.x.array.copy()
     for factor in (1.0, 3.0):
-        tangent.scale(factor)
+        if first:
+            scene.balance.displace(factor * u)
+            scene.balance.assemble_tangent(scene.balance.tangent, blocks_alone=True)
+            tangent = single_entries(scene)
+        else:
+            tangent.scale(factor)
         solver._blocks.follow()
         tangent.mult(x, alone)
         solver._blocks.mult(tangent, x, by_blocks)
         by_blocks.axpy(-1.0, alone)
         assert by_blocks.norm() < 1e-13 * alone.norm()
+
+
+def single_entries(scene: Scene) -> PETSc.Mat:
+    """The tangent at the present displacement, assembled without blocks."""
+    balance = scene.balance
+    other = Assembly(balance._tangent.form)
+    other(balance.motion.bcs)
+    balance.mass.add_to(other.matrix, balance.level.c_a)
+    return other.matrix

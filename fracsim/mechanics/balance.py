@@ -260,14 +260,30 @@ class Balance:
         """The matrix of K, until `shrink_tangent` makes another."""
         return self._tangent.matrix
 
-    def assemble_tangent(self, K: PETSc.Mat, *, small: float | None = None) -> None:
+    def tangent_in_blocks(self) -> PETSc.Mat | None:
+        """The same in blocks of a node's dofs, which are assembled first from here on; None where terms, or a mass that
+        couples nodes, add to single entries (collective)."""
+        own = (Term.add_stiffness, Term.coupling, Term.low_rank)
+        adds = any(getattr(type(term), each.__name__) is not each for term in self.terms for each in own)
+        return None if adds or not self.mass.diagonal else self._tangent.use_blocks()
+
+    def bring_entries(self) -> None:
+        """Bring `tangent` to where its blocks are (collective)."""
+        self._tangent.bring()
+
+    def assemble_tangent(self, K: PETSc.Mat, *, small: float | None = None, blocks_alone: bool = False) -> None:
         """K at the current u, rows and columns of prescribed dofs replaced by the identity's; `small`: with moduli
-        made positive to within that share of them (collective).
+        made positive to within that share of them; `blocks_alone`: where it has blocks, single entries are left for
+        `bring_entries` (collective).
 
         A linear one is kept while damage and rates are what they were.
         """
-        if self.linear and self._is_assembled(K, small):
-            return
+        if not (self.linear and self._is_assembled(K, small)):
+            self._assemble_all(K, small)
+        if not blocks_alone:
+            self._tangent.bring()
+
+    def _assemble_all(self, K: PETSc.Mat, small: float | None) -> None:
         served = self._serves(small)
         if not served:
             self._assemble_body(K, small)
@@ -284,9 +300,13 @@ class Balance:
         """What K has without terms that add to it."""
         if self._coupled:
             K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
-        self._tangent(self.motion.bcs, None if small is None else self._positive_moduli(small))
-        if factor := sum(term.mass_factor for term in self.terms):
-            self.mass.add_to(K, factor)
+        more, factor = None if small is None else self._positive_moduli(small), sum(t.mass_factor for t in self.terms)
+        if self._tangent.blocks is not None:
+            self._tangent(self.motion.bcs, more, factor * self.mass.lumped)
+        else:
+            self._tangent(self.motion.bcs, more)
+            if factor:
+                self.mass.add_to(K, factor)
         self._body_at = (small, self.u.x.array[: self.owned].copy()) if self._alone else None
 
     def _serves(self, small: float | None) -> bool:

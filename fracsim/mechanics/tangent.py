@@ -3,6 +3,9 @@
 PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell, takes twice as long as the kernels and
 DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values.
 
+It can be summed in blocks of the d dofs of a node instead, which go into PETSc's matrix of blocks. Products are made
+with that one; the matrix of single entries, which multigrid is set up from, follows where it is asked for.
+
 Where a body falls apart, the entries of its dead cells are zeros that every product with the matrix still reads. They
 are given up from time to time: the matrix shrinks, the unknowns stay.
 """
@@ -14,10 +17,11 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from ..mesh.dolfinx_calls import create_matrix, expanded_csr
+from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr
 from ..mesh.ranks import total
 
 Flags = npt.NDArray[np.bool_]
+Values = npt.NDArray[np.float64]
 
 
 class Assembly:
@@ -25,29 +29,50 @@ class Assembly:
 
     Attributes:
         form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
+        blocks: the same in blocks, where it is assembled into those; kept as long.
     """
 
     matrix: PETSc.Mat
 
     def __init__(self, form: fem.Form) -> None:
         self.form = form
+        self.blocks: PETSc.Mat | None = None
+        self._behind = False  # whether the blocks have been assembled since the matrix
         self._dead: Flags | None = None
         self._make()
 
-    def _make(self) -> None:
+    def use_blocks(self) -> PETSc.Mat:
+        """Assemble into blocks from here on; returns their matrix (collective)."""
+        if self.blocks is None:
+            self.matrix.destroy()
+            self._make(by_blocks=True)
+            assert self.blocks is not None
+        return self.blocks
+
+    def _make(self, *, by_blocks: bool = False) -> None:
         """Matrices with the pattern of the cells that the form is integrated over, and a full diagonal."""
         pattern = fem.create_sparsity_pattern(self.form)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._sum = expanded_csr(pattern)
+        self._sum = block_csr(pattern) if by_blocks else expanded_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
-        self._own = slice(int(starts[-1]))  # entries of owned rows; those of ghosts come after
+        self._own = slice(int(starts[-1]))  # entries or blocks of owned rows; those of ghosts come after
         names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
         self._starts = starts.astype(PETSc.IntType)
         self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
+        if by_blocks:
+            self._make_blocks()
+
+    def _make_blocks(self) -> None:
+        """The matrix of blocks, and where the blocks on the diagonal are."""
+        size, comm = self.matrix.getBlockSize(), self.matrix.comm
+        csr = self._starts, self._columns
+        self.blocks = PETSc.Mat().createBAIJ(self.matrix.getSizes(), size, csr=csr, comm=comm)
+        rows = np.repeat(np.arange(len(self._starts) - 1), np.diff(self._starts))
+        self._on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
 
     def fit(self, dead: Flags, share: float) -> bool:
         """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
@@ -60,20 +85,45 @@ class Assembly:
         if not back and (alive == room or alive > share * room):
             return False
         self._dead = dead.copy()
-        self.matrix.destroy()
-        self._make()
+        by_blocks = self.blocks is not None
+        self.destroy()
+        self._make(by_blocks=by_blocks)
         return True
 
-    def __call__(self, bcs: list[fem.DirichletBC], more: fem.Form | None = None) -> None:
-        """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's
-        (collective)."""
+    def __call__(
+        self, bcs: list[fem.DirichletBC], more: fem.Form | None = None, diagonal: Values | None = None
+    ) -> None:
+        """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's.
+        `diagonal`: of owned dofs, is added to blocks, which `bring` makes the matrix of (collective)."""
         self._sum.data[:] = 0.0
         for form in (self.form, more) if more is not None else (self.form,):
             fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         self._sum.scatter_reverse()
-        self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
-        self.matrix.assemble()
+        if self.blocks is None:
+            self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
+            self.matrix.assemble()
+            return
+        if diagonal is not None:
+            d = self.blocks.getBlockSize()
+            at, axes = self._on_diagonal[:, None], np.arange(d)
+            self._sum.data.reshape(-1, d, d)[at, axes, axes] += diagonal.reshape(-1, d)
+        self._set(self.blocks)
+        self._behind = True
+
+    def bring(self) -> None:
+        """Bring the matrix to where the blocks are, if there are any (collective)."""
+        if self._behind:
+            self._set(self.matrix)
+            self._behind = False
+
+    def _set(self, matrix: PETSc.Mat) -> None:
+        d = matrix.getBlockSize()
+        matrix.setValuesBlockedIJV(self._starts, self._columns, self._sum.data[: d * d * self._own.stop])
+        matrix.assemble()
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's matrix back."""
+        """Give the memory of PETSc's matrices back."""
         self.matrix.destroy()
+        if self.blocks is not None:
+            self.blocks.destroy()
+            self.blocks, self._behind = None, False

@@ -161,6 +161,11 @@ def expanded_csr(pattern: SparsityPattern) -> la.MatrixCSR:
     return la.matrix_csr(pattern, block_mode=la.BlockMode.expanded)  # type: ignore[attr-defined]
 
 
+def block_csr(pattern: SparsityPattern) -> la.MatrixCSR:
+    """The same with a block for every two nodes, the entries of a block one after another."""
+    return la.matrix_csr(pattern)
+
+
 def create_matrix(comm: MPI.Comm, pattern: SparsityPattern) -> PETSc.Mat:
     """PETSc's matrix of a pattern, empty (collective)."""
     return create_petsc_matrix(comm, pattern)

@@ -1,8 +1,10 @@
-"""The tangent once more, in blocks of the d dofs of a node: what products are made with.
+"""The tangent in blocks of the d dofs of a node: what products are made with.
 
 A product takes half the time, for an index is read for d^2 values instead of for d, and CG with multigrid makes some
-six an iteration on the finest level. Smoothed aggregation cannot set itself up from blocks, so that the matrix of
-single entries stays: the copy costs what two iterations gain. Small bodies have no use for it: their matrices stay in
+six an iteration on the finest level. Where nothing but cells and a lumped mass add to the tangent it is assembled in
+blocks. Smoothed aggregation cannot set itself up from those, so that there is a matrix of single entries, too, which is
+brought to where the blocks are when multigrid is set up. Where terms add to single entries the blocks are a copy of
+them, which costs what two iterations gain. Small bodies have no use for it: their matrices stay in
 the cache, and each product is called from here.
 """
 
@@ -20,16 +22,19 @@ class Blocks:
 
     Attributes:
         tangent: the matrix of single entries that it is a copy of.
+        first: whether blocks are assembled first.
     """
 
-    def __init__(self, tangent: PETSc.Mat) -> None:
+    def __init__(self, tangent: PETSc.Mat, assembled: PETSc.Mat | None) -> None:
+        """`assembled`: the blocks, where they are assembled first."""
         self.tangent = tangent
-        self._copy: PETSc.Mat | None = None
+        self.first = assembled is not None
+        self._copy = assembled
         self._entries, self._state = 0.0, -1
 
     def follow(self) -> None:
         """Be the tangent as it is now (collective)."""
-        if self._state == (state := self.tangent.stateGet()):
+        if self.first or self._state == (state := self.tangent.stateGet()):
             return
         entries = self.tangent.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
         if self._copy is not None and entries != self._entries:  # it has entries at more places
@@ -50,9 +55,9 @@ class Blocks:
 
     def forget(self) -> None:
         """Give the memory of PETSc's objects back."""
-        if self._copy is not None:
+        if self._copy is not None and not self.first:
             self._copy.destroy()
-            self._copy = None
+        self._copy = None
 
 
 def worth_it(tangent: PETSc.Mat) -> bool:

@@ -101,7 +101,7 @@ class Solver:
         self._iterative = snes.ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self._preconditioner = Preconditioner(
             snes.ksp, self._options, keep=self._iterative, may_change=_may_change(balance, given),
-            loosen=self._loosen, nodes=balance.domain.space.dofmap.index_map.size_global,
+            loosen=self._loosen, bring=balance.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self._linearly = is_linear(balance, given, snes.ksp.getType())
@@ -123,8 +123,9 @@ class Solver:
 
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
-        tangent = self._operator = self.balance.tangent
         self._use_blocks()
+        tangent = self.balance.tangent
+        self._operator = self._products or tangent
         if self.balance.is_incomplete:
             from .condensed import Condensed
 
@@ -136,13 +137,14 @@ class Solver:
             tangent.setNearNullSpace(self._near_null)
 
     def _use_blocks(self) -> None:
-        """Multiply with a copy of the tangent in blocks, where that is quicker."""
+        """Multiply with the tangent in blocks, where that is quicker."""
         if self._blocks is not None:
             self._blocks.forget()
             self._blocks = self._products = None
         if self._by_blocks and worth_it(self.balance.tangent):
-            self._blocks = Blocks(self.balance.tangent)
-            self._operator = self._products = self._blocks.matrix()
+            blocks = self.balance.tangent_in_blocks()
+            self._blocks = Blocks(self.balance.tangent, blocks)
+            self._products = self._blocks.matrix()
 
     def _shrink(self) -> None:
         """Where the body was damaged, see whether a smaller tangent does (collective)."""
@@ -164,6 +166,7 @@ class Solver:
 
     def _set_up_at_rest(self) -> None:
         self._assemble(self.balance.tangent)
+        self.balance.bring_entries()
         self.snes.ksp.setOperators(self.balance.tangent)
         self.snes.ksp.setUp()
 
@@ -419,7 +422,7 @@ class Solver:
 
     def _assemble(self, tangent: PETSc.Mat) -> None:
         self._small = self._smallness
-        self.balance.assemble_tangent(tangent, small=self._small)
+        self.balance.assemble_tangent(tangent, small=self._small, blocks_alone=True)
 
     @property
     def _smallness(self) -> float | None:

@@ -78,12 +78,21 @@ class Preconditioner:
     """
 
     def __init__(
-        self, ksp: PETSc.KSP, options: OptionSet, *, keep: bool, may_change: bool, loosen: Loosen, nodes: int
+        self,
+        ksp: PETSc.KSP,
+        options: OptionSet,
+        *,
+        keep: bool,
+        may_change: bool,
+        loosen: Loosen,
+        bring: Callable[[], None],
+        nodes: int,
     ) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
-        that sees to loose parts out of `pc`, None where that would be no use; `nodes`: of the body."""
+        that sees to loose parts out of `pc`, None where that would be no use; `bring`: brings the entries of the
+        tangent to what they are; `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
-        self.serving, self._loosen, self._nodes = self.pc, loosen, nodes
+        self.serving, self._loosen, self._bring, self._nodes = self.pc, loosen, bring, nodes
         self._loose: LooseParts | None = None
         self._sees_to_parts = False
         self._broke = self._extra = 0  # edges and iterations since it was set up
@@ -115,6 +124,7 @@ class Preconditioner:
         if self.due == Due.REBUILD:
             self.pc.reset()
             self._fresh_its = 0
+        self._bring()
         ksp.setPC(self.pc)
         self.pc.setReusePreconditioner(False)
         self.pc.setUseAmat(products is not None)
@@ -129,7 +139,10 @@ class Preconditioner:
     def _follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None) -> None:
         """What serves is brought to a tangent that is solved with next."""
         self.serving, loose = self.pc, self._loose
-        if loose is not None and loose.body is self.pc and loose.follow(tangent, products):
+        if loose is None or loose.body is not self.pc:
+            return
+        self._bring()
+        if loose.follow(tangent, products):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
 

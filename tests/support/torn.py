@@ -177,8 +177,8 @@ def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
 
 
 def dead_cells() -> Found:
-    """Residual and tangent of the damped block with its dead cells, without, and without their entries, and how many
-    cells those are."""
+    """Residual and tangent of the damped block with its dead cells, without, without their entries, and assembled in
+    blocks, and how many cells those are."""
     scene, state = make_scene(**RUNS["block"])
     domain, balance = scene.domain, scene.balance
     balance.begin(0.05, 0.05, state.u, state.v, state.a)
@@ -187,11 +187,12 @@ def dead_cells() -> Found:
     x, y = balance.vector.duplicate(), balance.vector.duplicate()
     x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
     found: Found = {}
-    for name in ("with", "without", "fitted-without"):
+    for name in ("with", "without", "fitted-without", "blocks-without", "brought-without"):
         if name.startswith("fitted"):
             assert balance.shrink_tangent(0.7)
-        balance.assemble_tangent(balance.tangent)
-        balance.tangent.mult(x, y)
+        blocks = balance.tangent_in_blocks() if name.startswith(("blocks", "brought")) else None
+        balance.assemble_tangent(balance.tangent, blocks_alone=name.startswith("blocks"))
+        (balance.tangent if blocks is None or name.startswith("brought") else blocks).mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
         found[f"residual-{name}-dead"] = domain.gather_nodes(balance.forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
