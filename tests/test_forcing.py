@@ -62,16 +62,6 @@ def test_no_correction_is_rougher_than_may_be() -> None:
     assert sparing.iterations(2) == 0  # too few to tell
 
 
-def test_rough_solves_do_not_tell_what_a_fresh_preconditioner_takes() -> None:
-    sparing = Sparing(RTOL)
-    sparing.reach(1.0, 1e-6)
-    sparing.tolerance(1e-6, kept=False)
-    assert sparing.tells
-    sparing.reach(0.9, 1e-6)
-    sparing.tolerance(1e-6, kept=False)
-    assert not sparing.tells
-
-
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A number for each tangent that is assembled."""

@@ -30,8 +30,6 @@ class Forcing:
         self._rtol = self._used = rtol
         self._last = 0.0
 
-    tells = True  # of the whole residual, however rough
-
     def begin(self) -> None:
         """An attempt begins: no residual is known."""
         self._last = 0.0
@@ -58,7 +56,6 @@ SHARE = 0.1  # of what the tangent leaves, which CG may leave
 SMALL, LEFT = 1e-2, 0.3
 ROUGHEST, LOOSEST = 1e-2, 0.1  # no correction is rougher, and no last one: of a slender body it might not go down
 ENOUGH = 3  # iterations that tell how quickly CG converges
-TELLING = 1e-3  # tolerance below which they do so of all that a residual consists of
 
 
 class Sparing:
@@ -101,11 +98,6 @@ class Sparing:
     def _left(self) -> float:
         """Share of r that the last iteration has left."""
         return self._norms[-1] / self._norms[-2] if self._norms[-2] else 1.0
-
-    @property
-    def tells(self) -> bool:
-        """Whether the last solve went on for long enough to tell how many iterations an exact one takes."""
-        return self._used <= TELLING
 
     def iterations(self, its: int) -> int:
         """How many a solve to the exact tolerance would have taken, which took `its`; 0: too few to tell."""

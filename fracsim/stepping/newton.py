@@ -413,7 +413,7 @@ class Solver:
         """K correction = balance.vector at the present u; whether it was solved."""
         tangent, ksp = self.balance.tangent, self.snes.ksp
         self._assemble_tangent(tangent)
-        self._preconditioner.its, self._preconditioner.tells = None, True
+        self._preconditioner.its = None
         if self._forcing is not None:
             ksp.setTolerances(rtol=self._forcing.exact())
         ksp.setOperators(self._operator, tangent)
@@ -434,7 +434,7 @@ class Solver:
         if forcing is None:
             self._assemble_tangent(tangent)
             return
-        self._preconditioner.its, self._preconditioner.tells = forcing.iterations(ksp.its), forcing.tells
+        self._preconditioner.its = forcing.iterations(ksp.its)
         norm, little = self.snes.getFunctionNorm(), self._last_little
         if isinstance(forcing, Sparing):
             kept = forcing.reach(norm, little) and self._small == self._smallness

@@ -74,7 +74,6 @@ class Preconditioner:
         pc: that of the body alone, also where the KSP uses one that is made of it.
         serving: that, or one made of it that sees to loose parts.
         its: iterations of the last solve, where the KSP does not know; 0: nothing is known; None: it does.
-        tells: whether they tell what a fresh one takes: rough solves see to what broke last, which is quickly done.
     """
 
     def __init__(
@@ -99,7 +98,6 @@ class Preconditioner:
         self.due, self.keep = Due.REBUILD, keep
         self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
         self.its: int | None = None
-        self.tells = True
         # of aggregates of all links, where strong ones are on trial; 0: nothing is known; None: it is settled
         self._all_links_its: int | None = 0 if may_change else None
         self._fresh_its = self._whole_its = 0
@@ -167,14 +165,14 @@ class Preconditioner:
 
     def _count(self) -> None:
         """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due."""
-        if self._broke and self._fresh_its:
+        if self._broke:
             self._extra += max(self._last_its - self._fresh_its, 0)
         if self._extra > REFRESH_ITS:
             self.due = max(self.due, Due.REFRESH)
 
     def _look_at(self, its: int) -> None:
         """Iterations of a solve since it was set up."""
-        if not self._fresh_its and self.tells:
+        if not self._fresh_its:
             self._fresh_its = its
             if not self._broken and self._tries_links(its):
                 return
