@@ -7,6 +7,8 @@ again, for there Newton's method gains its digits; where they are not positive e
 
 from __future__ import annotations
 
+import math
+
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
@@ -15,6 +17,7 @@ from .descent import Descent
 # attempts with positive moduli: below which share of their residual tangents are exact, and negative eigenvalues that
 # are let be, in mean moduli of a cell
 POSITIVE = (1e-2, 1e-2), (0.0, 0.0)
+PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
 
 
 class Downhill:
@@ -35,6 +38,7 @@ class Downhill:
     def made_positive(self, how: tuple[float, float] | None) -> None:
         """An attempt begins: tangents are those of one of POSITIVE, or exact."""
         self._how, self._highest = how, 0.0
+        self._least, self._least_at = math.inf, 0
 
     @property
     def small(self) -> float | None:
@@ -45,6 +49,13 @@ class Downhill:
         norm = self.snes.getFunctionNorm()
         self._highest = max(self._highest, norm)
         return None if norm < exact_below * self._highest else small
+
+    def stalls(self, norm: float, its: int) -> bool:
+        """Whether it goes about in circles: exact tangents that are not positive, though CG does not notice, lead past
+        the solution for as long as they may. |r| is `norm`, N, after `its` iterations."""
+        if norm < self._least or not its:
+            self._least, self._least_at = norm, its
+        return self._how is not None and self.small is None and its - self._least_at >= PATIENCE
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

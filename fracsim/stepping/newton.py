@@ -506,6 +506,8 @@ class Solver:
             return int(reason.CONVERGED_FNORM_RELATIVE)
         if self._choice.gets_dear(snes.getLinearSolveIterations(), its, positively=self._positively):
             return int(reason.DIVERGED_INNER)
+        if self._down is not None and self.balance.scheme.inertia and self._down.stalls(norms[2], its):
+            return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
         return int(reason.ITERATING)
 
     def _is_small(self, norm: float, its: int) -> bool:
