@@ -75,10 +75,10 @@ class Crowd:
         spent, done = 0, False
         while spent < most:
             now = min(max(LOOK, spent), most - spent)
-            through = given[0] + self._closing(self._level(p)) < -enough
-            if done and not np.any(through & (p[0] == 0)):
+            parting = given[0] + self._parting(self._level(p))
+            if done and not np.any((parting < -enough) & (p[0] == 0)):
                 break
-            rows = np.flatnonzero((p[0] > 0) | through)
+            rows = np.flatnonzero((p[0] > 0) | (parting < enough))
             course = _Course(self.rows[:, rows], self.things[:, rows], self.friction[rows], len(self.levels))
             p[:, rows], change[:, rows], pace[rows], done = course(
                 given[:, rows], enough, now, p[:, rows], change[:, rows], pace[rows]
@@ -93,8 +93,8 @@ class Crowd:
         of = self.things[:, some].T.ravel()
         return np.stack([np.bincount(of, values, n + 1) for values in each], axis=1)
 
-    def _closing(self, level: Values) -> Values:
-        """(k,) m/s by which things part along the normals of contacts."""
+    def _parting(self, level: Values) -> Values:
+        """(k,) m/s at which things part along the normals of contacts, of what impulses give them."""
         return np.asarray(np.einsum("ski,ski->k", self.rows[:, :, 0], level[self.things]))
 
     def gained(self, impulses: Values) -> Values:
