@@ -404,6 +404,8 @@ class Solver:
     def _extend(self) -> int:
         """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
         self.balance.extension_residual(self._x, self.balance.vector)
+        if not self.balance.vector.norm():  # nothing is free that it could go to, nor anything to set up multigrid for
+            return 0
         if not self._solve_linear():
             self.linear_failures += 1
         self._x.axpy(-1.0, self._correction)

@@ -4,7 +4,7 @@ solved for again.
 A ball of 4 h cannot tell tips apart by less than some per cent (along). So where a tip reaches G_c, those in its ball
 that lack 3 % go with it, and each leads on: cells that its cut enters are cut by its plane, as far as 0.65 h from it,
 one by one, no nearer than half of h to one another, in rounds without a solve: neighbours cut at once would not meet.
-A tip that was looked at and has less stays, wherever the others go. A front gets on by h in 1.1 to 1.7 solves, where
+A tip that was looked at and has less stays, wherever the others go. A front gets on by h in 1.3 to 1.9 solves, where
 it took five. Tips that are not mature go by stress, which a cell changes, and do not lead.
 """
 
