@@ -39,13 +39,13 @@ class Newton:
     """Of the bodies of a model, and what is driven in it."""
 
     def __init__(self, model: Model, rules: Rules) -> None:
-        self._count, self._driven = len(model.mass), model.driven
+        n = self._count = len(model.mass)
         self._made = _dynamics(model, rules)
         self._data, self._alike = mujoco.MjData(self._made), _contact(rules)
-        self._geom = np.zeros(int(max(model.thing.max(initial=0), model.driven.max(initial=0) + self._count)) + 1, int)
-        self._geom[np.concatenate([np.arange(self._count), self._count + model.driven])] = 1 + np.arange(
-            self._count + len(model.driven)
-        )
+        moving = np.concatenate([np.arange(n), n + model.driven])
+        things = int(np.concatenate([model.thing, moving]).max(initial=0)) + 1
+        self._geom = np.zeros(things, int)  # all that stands still is one
+        self._geom[moving] = 1 + np.arange(len(moving))
         self._jammed = False  # whether contacts of this step were too many to be solved at once
 
     def begin(self, bodies: Bodies, ways: Values, rates: Values, contacts: Contacts) -> None:

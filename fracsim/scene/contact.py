@@ -103,8 +103,7 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     contact = _contact(study)
     law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     of_speed = 0.0 if contact.creep else OF_SPEED
-    straight = domain.order == 2 and study.fracture is not None
-    how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed, straight=straight)
+    how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed, straight=_straight(study))
     if not any(each.free for each in entries.values()):
         return Solids(domain, u, entries, how)
     from ..mechanics.contact.solids.free_term import FreeSolids
@@ -173,8 +172,8 @@ def _self_contact(
     distance = contact.distance or share * domain.mean_edge
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
-    straight = domain.order == 2 and study.fracture is not None
-    law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, contact.itself == "pieces", straight)
+    pieces, straight = contact.itself == "pieces", _straight(study)
+    law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, pieces, straight)
     term = made(law)
     if (gap := term.least_gap()) == np.inf:
         return term
@@ -228,6 +227,11 @@ def _free_obstacle(entry: Placing, loose: Loose, shape: Shape) -> Obstacle:
 
 def _contact(study: Study) -> Contact:
     return study.contact or Contact()
+
+
+def _straight(study: Study) -> bool:
+    """Whether cells are quadratic and walls of cracks may touch, which follow corners."""
+    return study.mesh.order == 2 and study.fracture is not None
 
 
 def _law(contact: Contact, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier) -> Law:

@@ -20,7 +20,7 @@ from ...mesh.split.identity import found_again
 from ...mesh.split.skeleton import Skeleton
 from ..term import Level
 from .crowd import Law, Surface
-from .itself import SelfContact
+from .itself import SelfContact, gathering
 from .pairs import areas
 from .pushing import NONE, Pushing, rates
 from .sticking import Sticking
@@ -102,7 +102,7 @@ class ExplicitSelfContact(SelfContact):
 
         InputError where the surface at rest cuts itself (collective).
         """
-        gathered = (domain.gather_corners if law.straight else domain.gather_nodes)(mass.reshape(-1, domain.dim))
+        gathered = gathering(domain, law)(mass.reshape(-1, domain.dim))
         self._mass, self._most = None if gathered is None else gathered[:, 0].copy(), most
         self._friction, self._lost = law.friction, 0.0
         super().__init__(domain, u, replace(law, friction=0.0))  # that of implicit steps

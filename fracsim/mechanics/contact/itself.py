@@ -17,7 +17,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from ...mesh.domain import Domain
-from ...mesh.ranks import from_root, on_root, total
+from ...mesh.ranks import Gather, from_root, on_root, total
 from ...mesh.split.places import Places
 from ...mesh.split.skeleton import Skeleton
 from ..coupling import Coupling
@@ -53,7 +53,7 @@ class SelfContact(Term):
         self._stiff = STIFF * law.stiffness * domain.mean_edge ** (domain.dim - 2)
         mesh = _refined(domain) if self._is_refined(law) else domain.source
         self._skeleton = None if mesh is None else Skeleton(mesh)
-        self._gather = domain.gather_corners if law.straight else domain.gather_nodes
+        self._gather = gathering(domain, law)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = self._gather(first + np.arange(domain.node_count))  # of input nodes, on rank 0
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
@@ -305,6 +305,11 @@ class SelfContact(Term):
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self._coupling.destroy()
+
+
+def gathering(domain: Domain, law: Law) -> Gather:
+    """Of the nodes that the surface follows."""
+    return domain.gather_corners if law.straight else domain.gather_nodes
 
 
 def _refined(domain: Domain) -> MeshData | None:

@@ -3,11 +3,7 @@ installed, and the page says so."""
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from ..section import Section
@@ -32,12 +28,3 @@ def trials() -> list[Trial]:
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """A section for each program, also where it is not installed."""
     return [section for family in _families() for section in family.sections(records)]
-
-
-def write_of_size(words: str | None, n: int, beside: Callable[[int], dict[str, Any]]) -> None:
-    """What a script of a peer does: `beside` of --n (or `n`) cells a side goes to --out; `words` are its help."""
-    parser = argparse.ArgumentParser(description=words)
-    parser.add_argument("--n", type=int, default=n)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    given = parser.parse_args()
-    given.out.write_text(json.dumps(beside(given.n), indent=1) + "\n")

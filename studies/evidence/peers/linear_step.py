@@ -9,6 +9,8 @@ machine's moods hit both; the first ones, in which Akantu factorises and we set 
 
 from __future__ import annotations
 
+import argparse
+import json
 import tempfile
 import time
 from pathlib import Path
@@ -19,7 +21,6 @@ import numpy as np
 
 from ..section import Claim, Section, Table, again
 from ..trial import Trial
-from . import write_of_size
 from .akantu import ABSENT, Akantu, interpreter, problem_of
 
 SIZES = (10, 20)  # 24k and 192k tetrahedra
@@ -100,7 +101,11 @@ def _of(pairs: list[tuple[float, float]]) -> dict[str, float]:
 
 
 def main() -> None:
-    write_of_size(__doc__, SIZES[0], beside)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=SIZES[0])
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    given.out.write_text(json.dumps(beside(given.n), indent=1) + "\n")
 
 
 # --- the section ----------------------------------------------------------------------------------------------------
