@@ -282,6 +282,23 @@ def test_shapes_of_pieces_lie_where_the_split_surface_is() -> None:
     assert all(a is b for a, b in zip(again.parts, halves.parts, strict=True))
 
 
+def test_shapes_are_the_same_to_the_last_digit_however_the_cracks_got_there() -> None:
+    """A block in halves of which one edge more breaks, cut a hair elsewhere: hulls, outermost points and moments are
+    those of a geometry that has not seen the halves before, as after a restart."""
+    mesh = lattice(4, 2, 2)
+    skeleton = Skeleton(mesh)
+    broken = separated(skeleton, (mesh.points[:, 0] > 1.5).astype(int))
+    geometry = Geometry(mesh)
+    geometry.shapes({0: (patterns(skeleton, broken), np.where(broken, 0.5, np.nan))})
+    broken[np.flatnonzero(~broken)[-1]] = True
+    damage = {0: (patterns(skeleton, broken), np.where(broken, 0.5 + 1e-12, np.nan))}
+    found, expected = geometry.shapes(damage), Geometry(mesh).shapes(damage)
+    assert len(found.parts) == 2
+    for mine, other in zip((*found.parts, found.outer), (*expected.parts, expected.outer), strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(mine, other, strict=True))
+    assert np.array_equal(found.moments.second, expected.moments.second)
+
+
 def nodes_in_others(stepper: RigidStepper, state: RigidState, depth: float) -> float:
     """Share of the nodes that lie in a whole cell of another piece, farther than a depth (m) from all of its faces: by
     barycentric coordinates, which share nothing with the engine."""

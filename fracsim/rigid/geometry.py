@@ -19,7 +19,7 @@ from .placing import Poses
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-_Kept = tuple[tuple[int, int, float], list[Values], Values]
+_Kept = tuple[int, list[Values], Values]
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Geometry:
         self.skeleton, self.poses = Skeleton(mesh), poses or Poses.at_rest(1)
         self._shell = mesh.shell
         self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
-        # of each copy, by lowest node: nodes, triangles and volume, and the hulls; cells that others share change as
-        # these break
+        # of each copy, by lowest node: the key of its surface to the last digit, or a restart would come to other hulls
+        # (cells that others share change as these break); convex parts and outermost points
         self._hulls: dict[int, dict[int, _Kept]] = {}
         self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0, mesh.points)
         self._placed = [self._at(number, self._whole) for number in range(len(self.poses))]
@@ -101,26 +101,23 @@ class Geometry:
         made = split(self.skeleton.moved(at), pattern, cut)
         piece = made.piece_of_point[made.elements[:, 0]]
         of = moments(made.points, made.elements, piece, made.pieces)
-        names, size = np.unique(made.piece_of_node, return_index=True)[1], np.bincount(made.piece_of_node)
+        names = np.unique(made.piece_of_node, return_index=True)[1]
+        solids = _solids(made, piece)
         before = self._hulls.get(number, {})
-        elements = np.bincount(piece, minlength=made.pieces)
-        keys = [(int(size[each]), int(elements[each]), float(f"{of.volume[each]:.9e}")) for each in range(made.pieces)]
         same = [before.get(name) for name in map(int, names)]
-        new = [at for at, (kept, key) in enumerate(zip(same, keys, strict=True)) if kept is None or kept[0] != key]
-        for each, hulls in zip(new, self._parts(made, piece, np.array(new, np.int64)), strict=True):
-            points = made.points[np.unique(made.elements[piece == each])] if self._in_clusters(made) else None
-            far = outermost(np.concatenate(hulls) if points is None else points)
-            same[each] = keys[each], [corners - of.centre[each] for corners in hulls], far - of.centre[each]
+        new = [each for each, kept in enumerate(same) if kept is None or kept[0] != solids[each].key]
+        for each, hulls in zip(new, self._parts(made, piece, solids, np.array(new, np.int64)), strict=True):
+            far = outermost(solids[each].points if self._in_clusters(made) else np.concatenate(hulls))
+            same[each] = solids[each].key, [corners - of.centre[each] for corners in hulls], far - of.centre[each]
         found = [kept for kept in same if kept is not None]
         self._hulls[number] = dict(zip(map(int, names), found, strict=True))
         parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
         return _Copy(at, pattern, names, of, made.piece_of_node, parts, outer)
 
-    def _parts(self, made: Split, piece: Ints, chosen: Ints) -> list[list[Values]]:
+    def _parts(self, made: Split, piece: Ints, solids: list[Solid], chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
         if not self._in_clusters(made):
-            solids = (Solid.of(made.points, made.elements[piece == each]).filled for each in chosen)
-            return [convex_parts(each, self.mean_edge) for each in solids]
+            return [convex_parts(solids[each].filled, self.mean_edge) for each in chosen]
         place = np.full(made.pieces, -1)
         place[chosen] = np.arange(len(chosen))
         of = place[piece]
@@ -138,3 +135,10 @@ class Geometry:
         of = Moments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
         names, turns = copy.names + number * len(copy.piece_of_node), np.tile(turn, (len(copy.names), 1, 1))
         return Shapes(names, of, copy.piece_of_node, copy.parts, turns, copy.outer)
+
+
+def _solids(made: Split, piece: Ints) -> list[Solid]:
+    """What each piece of a split surface, whose elements are of pieces (m,), encloses."""
+    order = np.argsort(piece, kind="stable")
+    ends = np.cumsum(np.bincount(piece, minlength=made.pieces))[:-1]
+    return [Solid.of(made.points, elements) for elements in np.split(made.elements[order], ends)]
