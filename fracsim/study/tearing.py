@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ..errors import InputError
+from ..forms.waves import rayleigh_speed
 from . import Study
 from .body import Region
 
@@ -51,7 +52,7 @@ def _branching(study: Study, h: float) -> Iterator[str]:
     yield "tips branch to which 2 G_c flows"
     material, step = study.material, study.time.breaking_step or study.time.longest
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
-    wave = RADIUS * h / (shear * (0.862 + 1.14 * material.poisson) / (1 + material.poisson))  # Viktorov (1967)
+    wave = RADIUS * h / rayleigh_speed(shear, material.poisson)
     if step > wave:
         yield f"note: in steps of {step:.2g} s none does: a Rayleigh wave leaves the disc of a tip in {wave:.2g} s;"
         yield f"breaking_step = {wave / 2:.1g} s would do"

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ...forms.waves import rayleigh_speed
 from ...mechanics.material import PerCell
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
@@ -155,9 +156,7 @@ class CrackTips:
         mu, lmbda = np.asarray(self._stress.material.mu), np.asarray(self._stress.material.lmbda)
         poisson = lmbda / (2 * (lmbda + mu))
         shear = np.sqrt(mu / np.asarray(self._stress.material.density))
-        return np.asarray(
-            shear * (0.862 + 1.14 * poisson) / (1 + poisson) / (self.disc * self._h)
-        )  # c_R: Viktorov (1967)
+        return np.asarray(rayleigh_speed(shear, poisson) / (self.disc * self._h))
 
     @cached_property
     def _rate(self) -> Values:
