@@ -143,7 +143,7 @@ class Bare:
         from ..forms.energies import NeoHookean, lame
         from ..mechanics.kernels import jit_options
         from ..mechanics.tangent import Assembly
-        from ..stepping.newton import rigid_body_modes
+        from ..stepping.linear import rigid_body_modes
         from ..stepping.preconditioner import MULTIGRID
 
         scene = study(n)

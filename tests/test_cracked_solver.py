@@ -146,7 +146,7 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
         monkeypatch.setattr(Balance, "tangent_in_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
-    assert isinstance(solver, Solver) and solver._blocks is not None and solver._blocks.first is first
+    assert isinstance(solver, Solver) and solver.linear._blocks is not None and solver.linear._blocks.first is first
     pc = solver.snes.ksp.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
     tangent = scene.balance.tangent
@@ -160,9 +160,9 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
             tangent = single_entries(scene)
         else:
             tangent.scale(factor)
-        solver._blocks.follow()
+        solver.linear._blocks.follow()
         tangent.mult(x, alone)
-        solver._blocks.mult(tangent, x, by_blocks)
+        solver.linear._blocks.mult(tangent, x, by_blocks)
         by_blocks.axpy(-1.0, alone)
         assert by_blocks.norm() < 1e-13 * alone.norm()
 

@@ -391,7 +391,7 @@ def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
 
 
 def test_the_tolerances_called_default_are() -> None:
-    from fracsim.stepping.newton import DEFAULTS
+    from fracsim.stepping.linear import DEFAULTS
     from fracsim.studies.evidence.precision import finite
 
     assert (DEFAULTS["snes_rtol"], DEFAULTS["ksp_rtol"]) == finite.DEFAULT

@@ -74,11 +74,11 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
     X = scene.domain.nodes
     straight = np.stack([0.0 * X[:, 0], shift * X[:, 1]], axis=1).reshape(-1)
     balance.displace(straight)
-    with solver._factors.of(solver.snes.ksp):
+    with solver.linear.factors.of(solver.snes.ksp):
         balance.vector.array_w[:] = 1.0
-        assert solver._solve_linear()
-        solver._factors.learn(solver.snes.ksp)
+        assert solver.linear.solve()
+        solver.linear.factors.learn(solver.snes.ksp)
     free = np.flatnonzero(balance.motion.free)
     least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
-    assert (least > 0) == positive == solver._factors.positive
-    assert 1 < solver._factors.worth < 100
+    assert (least > 0) == positive == solver.linear.factors.positive
+    assert 1 < solver.linear.factors.worth < 100

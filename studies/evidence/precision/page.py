@@ -211,7 +211,7 @@ def cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
 
 def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
-    from ....stepping.newton import DEFAULTS
+    from ....stepping.linear import DEFAULTS
     from ....stepping.preconditioner import MULTIGRID
     from ....study import Plasticity, Time
 

@@ -1,0 +1,297 @@
+"""K of a balance at the present u, and solving with it: one KSP, what it is preconditioned with, and factors.
+
+Newton's method (newton) asks for K at its iterates; solves by themselves are made here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from ..mechanics.balance import Balance
+from ..mesh.domain import Domain
+from .blocks import Blocks, worth_it
+from .factors import FACTORISED, Factors
+from .forcing import Forcing, Sparing
+from .one_solve import Ending, is_linear
+from .petsc_options import Options, OptionSet, refusing
+from .preconditioner import MULTIGRID, Due, Preconditioner
+from .rigid_modes import rigid_modes
+
+if TYPE_CHECKING:
+    from .loose_parts import LooseParts
+
+Values = npt.NDArray[np.float64]
+
+DEFAULTS: Options = {
+    "snes_type": "newtonls",
+    "snes_linesearch_type": "bt",
+    "snes_max_it": 50,  # near a limit it would be the last digits that decide whether a step is halved
+    "snes_rtol": 1e-6,  # 1e-4 takes the first guess for the answer where cells are slivers
+    "snes_stol": 0.0,
+    "snes_lag_preconditioner": -2,  # made at the first tangent, then kept
+    "snes_lag_preconditioner_persists": True,
+    "ksp_type": "cg",
+    "ksp_rtol": 1e-5,  # 1e-3 is no descent of the residual where a body is badly conditioned: a cantilever fails
+    "ksp_max_it": 500,
+}
+
+# A smaller tangent, and with it a new preconditioner, where at most this share of its cells are alive. Where the
+# preconditioner is made anew anyhow, every dead cell goes.
+SHRINK_BELOW = 0.9
+
+
+class Linear:
+    """K, and solving with it.
+
+    Attributes:
+        ksp, preconditioner, factors: what it is solved with.
+        operator: what K is multiplied with.    forcing: how exactly; None: always as exactly.
+        linearly: whether a step is one solve.    iterative: whether one preconditioner serves more than one tangent.
+        correction: of the last solve by itself.
+        failures: solves that failed outright and were taken as no correction.
+    """
+
+    def __init__(
+        self,
+        balance: Balance,
+        ksp: PETSc.KSP,
+        options: OptionSet,
+        given: Options,
+        chosen: Options,
+        small: Callable[[], float | None],
+    ) -> None:
+        """`given`: of the study, `chosen`: with the defaults; `small`: how positive K is made at the present u
+        (Balance.assemble_tangent). InputError where PETSc does not take an option (collective)."""
+        self.balance, self.ksp, self._smallness, self.failures = balance, ksp, small, 0
+        self._small: float | None = None  # of the last tangent
+        self._blocks: Blocks | None = None  # of the tangent
+        self._products: PETSc.Mat | None = None  # a matrix of them
+        self.correction = balance.vector.duplicate()
+        self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
+        self._by_blocks = chosen["pc_type"] == "gamg"
+        self._take_tangent()
+        refusing(ksp.setFromOptions)
+        options.check(given, self._set_up_at_rest)
+        self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
+        self.preconditioner = Preconditioner(
+            ksp, options, keep=self.iterative, may_change=_may_change(balance, given), loosen=self._loosen,
+            bring=balance.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
+        )  # fmt: skip
+        self._asked = float(given.get("ksp_rtol", 0.0))
+        self.linearly = is_linear(balance, given, ksp.getType())
+        self._ending = Ending(ksp.comm, int(ksp.max_it)) if self.linearly and self.iterative else None
+        self.forcing = None if self._asked else _forcing(balance, chosen)
+        self.factors = Factors(
+            self.preconditioner, symmetric=balance.symmetric, dofs=balance.vector.getSize(), dim=balance.domain.dim
+        )
+
+    def _set_up_at_rest(self) -> None:
+        self._assemble(self.balance.tangent)
+        self.balance.bring_entries()
+        self.ksp.setOperators(self.balance.tangent)
+        self.ksp.setUp()
+
+    # --- what K is kept in ---
+
+    def _take_tangent(self) -> None:
+        """Solve with the matrix that the balance has now."""
+        self._use_blocks()
+        self.operator = self._products or self.balance.tangent
+        if self.balance.is_incomplete:
+            from .condensed import Condensed
+
+            parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
+            self.operator = Condensed(self.operator, parts, springs).matrix()
+        if self._near_null is not None:
+            self.balance.tangent.setNearNullSpace(self._near_null)
+
+    def _use_blocks(self) -> None:
+        """Multiply with the tangent in blocks, where that is quicker."""
+        if self._blocks is not None:
+            self._blocks.forget()
+            self._blocks = self._products = None
+        if self._by_blocks and worth_it(self.balance.tangent):
+            blocks = self.balance.tangent_in_blocks()
+            self._blocks = Blocks(self.balance.tangent, blocks)
+            self._products = self._blocks.matrix()
+
+    def shrink(self) -> bool:
+        """Where the body was damaged, see whether a smaller tangent does; whether there is a new one (collective)."""
+        preconditioner = self.preconditioner
+        preconditioner.look()
+        everything = preconditioner.due == Due.REBUILD
+        if preconditioner.due == Due.NOTHING or not self.balance.shrink_tangent(1.0 if everything else SHRINK_BELOW):
+            return False
+        self._take_tangent()
+        preconditioner.due = Due.REBUILD
+        return True
+
+    # --- K at the present u ---
+
+    def _assemble(self, tangent: PETSc.Mat) -> None:
+        self._small = self._smallness()
+        self.balance.assemble_tangent(tangent, small=self._small, blocks_alone=True)
+
+    def linearise(self, norm: float, little: float) -> None:
+        """K at an iterate of Newton's method, and how exactly it is solved with: |r| there is `norm`, N, that of a
+        solution `little` (collective)."""
+        forcing, tangent = self.forcing, self.balance.tangent
+        if forcing is None:
+            self._assemble_tangent(tangent)
+            return
+        self.preconditioner.its = forcing.iterations(self.ksp.its)
+        if isinstance(forcing, Sparing):
+            kept = forcing.reach(norm, little) and self._small == self._smallness()
+            if not kept:
+                self._assemble_tangent(tangent)
+            self.ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
+            return
+        self._assemble_tangent(tangent)
+        self.ksp.setTolerances(rtol=forcing.rough(norm, little) if self.balance.couples else forcing.exact())
+
+    def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
+        """K and what its preconditioner is due."""
+        self._assemble(tangent)
+        if self._blocks is not None:
+            self._blocks.follow()
+        if (self.balance.low_rank or self.balance.springs) and self.ksp.getType() == "preonly":
+            self.ksp.setType("gmres")  # factors are of the rest
+        if self.balance.pattern_changed:
+            self.preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
+        self.preconditioner.refresh(tangent, self._products)
+        self._hold()
+
+    def _hold(self) -> None:
+        """Precondition with the body's springs as well, where there are any."""
+        body = self.preconditioner.serving
+        springs = [each for each in self.balance.springs if len(each.stiffness)]
+        if not springs:
+            self.ksp.setPC(body)
+            return
+        from .woodbury import Woodbury
+
+        body.setReusePreconditioner(True)
+        pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.vector), comm=self.ksp.comm)
+        self.ksp.setPC(pc)
+        pc.destroy()
+
+    def _loosen(self, body: PETSc.PC) -> LooseParts | None:
+        from .loose_parts import loose_parts
+
+        return loose_parts(self.balance, body)
+
+    @contextmanager
+    def set_up_anew(self) -> Iterator[None]:
+        """With a preconditioner that is made anew at every tangent."""
+        self.preconditioner.due, self.preconditioner.keep = Due.REBUILD, False
+        yield
+        self.preconditioner.keep = self.iterative
+
+    # --- solves by themselves ---
+
+    def may_factorise(self, most: int = FACTORISED) -> bool:
+        """Whether a system of no more than so many dofs may be factorised."""
+        dofs = self.balance.vector.getSize()
+        return self.iterative and dofs <= most and bool(PETSc.Sys.hasExternalPackage("mumps"))
+
+    def response(self, force: Values, *, directly: bool) -> Values:
+        """(owned dofs,) displacement that a force on free dofs causes in a step at the present u, linearly, m, where
+        nothing else touches the body.
+
+        Near incompressibility tangents may be indefinite: factors where iterations fail; `directly`: these at once. 0
+        where nothing helps, which is counted.
+        """
+        with_factors = [False, True] if self.may_factorise() else [False]
+        for factors in with_factors[1:] if directly else with_factors:
+            self.balance.vector.array_w[:] = force
+            with self.balance.untouched(), self.factors.of(self.ksp) if factors else nullcontext():
+                solved = self.solve()
+            if solved:
+                return np.asarray(self.correction.array_r.copy())
+        self.failures += 1
+        return np.zeros_like(force)
+
+    def extend(self, x: PETSc.Vec) -> int:
+        """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
+        self.balance.extension_residual(x, self.balance.vector)
+        if not self.balance.vector.norm():  # nothing is free that it could go to, nor anything to set up multigrid for
+            return 0
+        if not self.solve():
+            self.failures += 1
+        x.axpy(-1.0, self.correction)
+        return int(self.ksp.its)
+
+    def solve(self) -> bool:
+        """K correction = balance.vector at the present u; whether it was solved."""
+        tangent, ksp = self.balance.tangent, self.ksp
+        self._assemble_tangent(tangent)
+        self.preconditioner.its = None
+        if self.forcing is not None:
+            ksp.setTolerances(rtol=self.forcing.exact())
+        ksp.setOperators(self.operator, tangent)
+        ksp.solve(self.balance.vector, self.correction)
+        return bool(ksp.reason > 0)
+
+    def correct(self, little: float) -> tuple[float, int] | None:
+        """K correction = balance.vector, by CG down to what is `little`, N, and to what the study asks of it, or as the
+        KSP does it: |r| that is left, infinite where nothing is known, and iterations; None: it was not solved."""
+        if self._ending is None or self.ksp.getType() != "cg":
+            return (np.inf, self.ksp.its) if self.solve() else None
+        ending, tangent, preconditioner = self._ending, self.balance.tangent, self.preconditioner
+        if self._asked:
+            little = min(little, self._asked * self.balance.vector.norm())
+        self._assemble_tangent(tangent)
+        products = self._products or tangent
+        solved = ending.solve(products, tangent, preconditioner.serving, self.balance.vector, self.correction, little)
+        preconditioner.its = ending.to_share(float(self.ksp.rtol))
+        return (ending.left, ending.its) if solved else None
+
+    def destroy(self) -> None:
+        """Give back PETSc's objects."""
+        self.factors.forget()
+        self.preconditioner.forget_parts()
+        self.correction.destroy()
+        if self._ending is not None:
+            self._ending.destroy()
+        if self._blocks is not None:
+            self._blocks.forget()
+        if self._near_null is not None:
+            self._near_null.destroy()
+
+
+def chosen_options(balance: Balance, given: Options) -> Options:
+    """The study's options over the defaults."""
+    multigrid = given.get("pc_type", "gamg") == "gamg"
+    chosen = DEFAULTS | (MULTIGRID if multigrid else {})
+    if multigrid and balance.scheme.inertia:
+        # no aggregates across edges that carry nothing; without inertia every edge keeps RESIDUAL_STIFFNESS
+        chosen |= {"pc_gamg_threshold": 0.0}
+    if not balance.symmetric:
+        chosen |= {"ksp_type": "gmres"}
+    return chosen | given
+
+
+def _forcing(balance: Balance, chosen: Options) -> Forcing | Sparing | None:
+    """How exactly Newton's method solves; None: always as exactly. (Without inertia a piece hangs by next to nothing: a
+    residual that is small leaves its place open.)"""
+    rtol = float(chosen["ksp_rtol"])
+    if balance.limits_steps:
+        return Forcing(rtol) if balance.conservative else None
+    return Sparing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
+
+
+def _may_change(balance: Balance, given: Options) -> bool:
+    """Whether multigrid of another kind may take over: nobody asked for this one, and inertia holds what hangs."""
+    own = not any(key.startswith(("pc_", "mg_")) for key in given)
+    return own and balance.scheme.inertia
+
+
+def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
+    """The rigid motions of the whole body, about its centre (stepping.rigid_modes)."""
+    return rigid_modes(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)
