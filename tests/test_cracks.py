@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.spatial import ConvexHull
 
 from fracsim.errors import InputError
 from fracsim.mesh.cracks import plane, polygon, segment
@@ -59,21 +60,34 @@ def test_a_segment_cuts_what_it_crosses() -> None:
     assert np.all(scene.balance.stress.chi.x.array[: scene.domain.cell_count] == ~graph.split)
 
 
-def test_a_polygon_in_space_is_a_hole_of_its_area() -> None:
-    """Cuts lie in the polygon's plane and within it, and no edge that crosses it is left whole."""
-    corners = [[0.2, 0.2, 0.41], [0.8, 0.2, 0.41], [0.8, 0.7, 0.41], [0.2, 0.7, 0.41]]
-    scene = cracked([{"polygon": corners}], dim=3, h=0.2)
-    places = cut_points(scene)
-    assert len(places) > 10
-    assert np.all((places[:, :2] > 0.2 - 0.02) & (places[:, :2] < [0.82, 0.72]))
-    assert np.median(np.abs(places[:, 2] - 0.41)) < 1e-15
-    nodes, graph = scene.domain.nodes, scene.fracture.graph
-    a, b = (nodes[graph.edge_nodes[:, k]] for k in range(2))
-    rise = b[:, 2] - a[:, 2]
-    share = np.where(rise == 0, -1.0, (0.41 - a[:, 2]) / np.where(rise == 0, 1.0, rise))
-    through = a + share[:, None] * (b - a)
-    inside = (share > 0) & (share < 1) & np.all((through[:, :2] > 0.2) & (through[:, :2] < [0.8, 0.7]), axis=1)
-    np.testing.assert_array_equal(graph.broken, inside)
+@pytest.mark.parametrize("seed", (1, 2, 3))
+def test_a_polygon_in_space_is_a_hole_of_its_area(seed: int) -> None:
+    """Cuts lie in its plane; cells of which it has all that the plane cuts have come apart, those at a distance from it
+    are whole; and what is cut through is as large as the polygon to 4 % (of cells with all of it inside: 17 % less)."""
+    corners = np.array([[0.2, 0.2, 0.41], [0.8, 0.2, 0.41], [0.8, 0.7, 0.41], [0.2, 0.7, 0.41]])
+    mesh = {"builder": "box", "size": [1.0] * 3, "h": 0.08, "pattern": "unstructured", "seed": seed}
+    scene = cracked([{"polygon": corners.tolist()}], dim=3, mesh=mesh)
+    assert np.median(np.abs(cut_points(scene)[:, 2] - 0.41)) < 1e-15
+    domain, graph = scene.domain, scene.fracture.graph
+    sections = [section(domain.nodes[cell], 0.41) for cell in domain.cell_nodes]
+    crossed = np.array([len(each) > 2 for each in sections])
+    inside = np.array([bool(len(each)) and in_rectangle(each, 0.0).all() for each in sections])
+    outside = np.array([not len(each) or not in_rectangle(each, 0.1).any() for each in sections])
+    assert graph.split[crossed & inside].all() and not graph.split[outside].any()
+    held = sum(ConvexHull(sections[k]).volume for k in np.flatnonzero(graph.split))
+    assert held == pytest.approx(0.3, rel=0.04)
+
+
+def section(corners: np.ndarray, z: float) -> np.ndarray:
+    """(n, 2) where the edges of a tetrahedron cross a height."""
+    low, high = (corners[list(side)] for side in ((0, 0, 0, 1, 1, 2), (1, 2, 3, 2, 3, 3)))
+    crosses = (low[:, 2] < z) != (high[:, 2] < z)
+    low, high = low[crosses], high[crosses]
+    return np.asarray(low + ((z - low[:, 2]) / (high[:, 2] - low[:, 2]))[:, None] * (high - low))[:, :2]
+
+
+def in_rectangle(points: np.ndarray, margin: float) -> np.ndarray:
+    return np.all((points > 0.2 - margin) & (points < np.array([0.8, 0.7]) + margin), axis=1)
 
 
 def test_a_plane_along_nodes_cuts_one_row_of_edges() -> None:

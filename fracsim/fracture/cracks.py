@@ -13,6 +13,8 @@ from ..mesh.edges import EdgeGraph
 from ..mesh.pieces import find_pieces
 from ..mesh.ranks import total
 
+Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
 
 CLOSEST = 0.02  # share of an edge that is left at either end of a cut: no slivers of surface
@@ -20,19 +22,36 @@ ON = 1e-9  # of the body's size: nodes as near as this to a crack lie on one sid
 
 
 def cut_edges(graph: EdgeGraph, crack: Crack) -> Values:
-    """(edges,) where the crack cuts local edges, from the end that comes first in the input mesh; NaN elsewhere."""
-    domain, ends = graph.domain, ends_in_order(graph)
-    slack = ON * domain.size
-    height = (domain.nodes[ends] - crack.point) @ crack.normal
+    """(edges,) where the crack cuts local edges, from the end that comes first in the input mesh; NaN elsewhere
+    (collective).
+
+    In the plane edges that it crosses: it ends where it enters the cell in which its end lies. In space by cells, since
+    one whose edges it crosses in part only does not come apart, and a crack would be some 0.4 h short all around.
+    """
+    domain, slack = graph.domain, ON * graph.domain.size
+    corners = domain.nodes[ends_in_order(graph)]
+    height = (corners - crack.point) @ crack.normal
     height[np.abs(height) <= slack] = 0.0
-    crossed = np.flatnonzero((height[:, 0] >= 0) != (height[:, 1] >= 0))
-    low, high = height[crossed].T
-    share = low / (low - high)
-    corners = domain.nodes[ends[crossed]]
-    held = crack.holds(corners[:, 0] + share[:, None] * (corners[:, 1] - corners[:, 0]), slack)
-    cut = np.full(len(graph.broken), np.nan)
-    cut[crossed[held]] = np.clip(share[held], CLOSEST, 1 - CLOSEST)
-    return cut
+    crossed = (height[:, 0] >= 0) != (height[:, 1] >= 0)
+    share = np.divide(height[:, 0], height[:, 0] - height[:, 1], out=np.zeros(len(height)), where=crossed)
+    places = corners[:, 0] + share[:, None] * (corners[:, 1] - corners[:, 0])
+    if domain.dim == 2:
+        crossed[crossed] = crack.holds(places[crossed], slack)
+    else:
+        crossed = graph.on_any_rank(_through(graph.cell_edges, crossed, places, crack, slack))
+    return np.where(crossed, np.clip(share, CLOSEST, 1 - CLOSEST), np.nan)
+
+
+def _through(cell_edges: Ints, crossed: Flags, places: Values, crack: Crack, slack: float) -> Flags:
+    """(edges,) those of `crossed`, at `places` (edges, 3), of the cells that a crack cuts through: those in which the
+    middle of what its plane cuts belongs to it."""
+    edges = cell_edges[crossed[cell_edges].any(axis=1)]
+    through = crossed[edges]
+    middle = np.einsum("nk,nki->ni", through, places[edges]) / through.sum(axis=1, keepdims=True)
+    cut = through & crack.holds(middle, slack)[:, None]
+    flags = np.zeros_like(crossed)
+    flags[edges[cut]] = True
+    return flags
 
 
 def ends_in_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
