@@ -183,6 +183,52 @@ def test_the_force_of_a_known_field(kind: str) -> None:
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_force_of_waves_that_pass(kind: str) -> None:
+    """Standing waves of pressure and shear, in a body one of whose edges is broken: no cell has come apart, so nothing
+    is released, whatever passes the disc: g = 0 where the waves stand farthest out, and where they go fastest.
+
+    Beside what the energy alone makes there, and beside - int rho v^2 / 2 grad q, summed over the disc; what is left
+    is that cells count by their middles.
+    """
+    scene = scene_on(distribute(MPI.COMM_SELF, square(kind, 24)), make_study(**plate_tables()))
+    graph, criterion, nodes = scene.fracture.graph, criterion_of(scene), scene.domain.nodes
+    flags = np.zeros(len(graph.broken), bool)
+    flags[np.argmin(np.linalg.norm(nodes[graph.edge_nodes].mean(axis=1) - 0.5, axis=1))] = True
+    graph.break_edges(flags)
+    criterion.cut[flags] = 0.5
+    (point, *_) = tips(scene)
+    shape, push = waves(nodes)
+    scene.balance.displace(shape.ravel())
+    still = float(np.linalg.norm(seen(scene).forces(), axis=1).min())
+    criterion.moving(np.zeros(shape.size), push.ravel(), 1e-9)
+    assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * still
+
+    r = DISC[2] / 24 * (np.arange(40) + 0.5) / 40
+    t = 2 * np.pi * np.arange(80) / 80
+    apart = (r[:, None, None] * np.column_stack([np.cos(t), np.sin(t)])).reshape(-1, 2)
+    area = np.repeat(r, len(t)) * (DISC[2] / 24 / 40) * (2 * np.pi / 80)
+    velocity = np.sqrt(YOUNG / 7800.0) * 3.0
+    kinetic = 7800.0 / 2 * velocity**2 * np.sum(waves(point + apart)[0] ** 2, axis=1)
+    slope = plateau_gradient(apart, np.full(len(apart), DISC[2] / 24))
+    carried = float(np.linalg.norm((area * kinetic) @ slope))
+    assert carried > 0.3 * still
+    scene.balance.displace(np.zeros(shape.size))
+    criterion.moving(velocity * shape.ravel(), np.zeros(shape.size), 1e-9)
+    assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * carried
+
+
+def waves(places: Values) -> tuple[Values, Values]:
+    """(n, 2) displacement in m of a wave of pressure and one of shear that stand, and their acceleration, m/s^2."""
+    modulus = YOUNG / 2 / (1 + POISSON)
+    whole, push = np.zeros((2, *places.shape))
+    for angle, turn, stiff in ((0.3, 0.0, modulus * 2 * (1 - POISSON) / (1 - 2 * POISSON)), (1.1, np.pi / 2, modulus)):
+        s = np.sin(3.0 * places @ [np.cos(angle), np.sin(angle)] + 0.4)
+        each = s[:, None] * [[np.cos(angle + turn), np.sin(angle + turn)]]
+        whole, push = whole + each, push - 9.0 * stiff / 7800.0 * each
+    return whole, push
+
+
 def test_where_a_crack_turns_in_closed_form() -> None:
     """The greatest hoop stress over all angles, by looking at them (Erdogan and Sih 1963): 70.5 degrees in pure
     sliding, where its K^2 is 4/3, and where the sides press on each other, too."""
