@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.fracture.edge_stress import carried_by, edge_vectors, normal_stress
+from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
+from fracsim.fracture.edge_stress import carried_by, edge_vectors, frobenius_norm, greatest_pull, normal_stress
 from fracsim.mesh.simplices import local_edges
 from fracsim.mesh.small_matrices import barycentric_gradients
 from support.laws import T_stress, Tensor, rotation
@@ -99,6 +100,23 @@ def test_barycentric_gradients(dim: int) -> None:
     values = (corners[:, None] - corners[None]) @ gradients.T  # lambda_k(x_i) - lambda_k(x_j)
     identity = np.eye(dim + 1)
     np.testing.assert_allclose(values, identity[:, None] - identity[None], atol=100 * EPS)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_no_direction_is_pulled_harder(dim: int) -> None:
+    """Against the eigenvalues: a bound of the largest, which it is in 2D and where a stress has one direction, below
+    the norm; that of an average is at most the average of theirs."""
+    stress = np.array([stress_components(dim, seed) for seed in range(200)])
+    pull, largest = greatest_pull(stress, dim), np.linalg.eigvalsh([as_matrix(each) for each in stress])[:, -1]
+    assert np.all(pull >= largest - 8 * EPS) and np.all(pull >= 0)
+    assert np.all(pull <= frobenius_norm(stress, dim) * (1 + 8 * EPS))
+    if dim == 2:
+        np.testing.assert_allclose(pull, np.maximum(largest, 0), rtol=0, atol=8 * EPS)
+    n = rotation(dim, 3)[0]
+    single = [3.0 * n[i] * n[j] for i, j in SYMMETRIC_COMPONENTS[dim]]
+    np.testing.assert_allclose(greatest_pull(np.array([single]), dim), 3.0, rtol=8 * EPS)
+    shares = np.random.default_rng(5).dirichlet(np.ones(len(stress)), 50)
+    assert np.all(greatest_pull(shares @ stress, dim) <= shares @ pull + 8 * EPS)
 
 
 def test_flat_cells_carry_nothing() -> None:

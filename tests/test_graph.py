@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from itertools import combinations
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from fracsim.mesh import parting
 from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.pieces import find_pieces, hold_together
+from fracsim.mesh.incidence import Incidence
+from fracsim.mesh.parting import Parting
+from fracsim.mesh.pieces import find_pieces
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from fracsim.meshes.components import components
+from support.ranks import OnRanks
 from support.scenes import make_scene
 
 DIMS = (2, 3)
@@ -122,24 +129,42 @@ def test_keys_name_edges(graph: EdgeGraph) -> None:
 
 
 @pytest.mark.parametrize("dim", DIMS)
-def test_what_parts_nothing_is_seen(dim: int) -> None:
-    """Edges break in random order until all are dust: where it is said that pieces are those of before, they are, also
-    for edges that break together. It is said of the first few and not of the last, nor of what is whole again."""
+def test_pieces_are_followed(dim: int) -> None:
+    """Single edges break in random order until all are dust, and are whole again at the end: always the pieces of a
+    search of all nodes, which is seldom needed."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.34}, fracture={"strength": 1.0})
     graph = scene.fracture.graph
-    said, pieces, before = [], find_pieces(graph), graph.broken.copy()
-    order = np.random.default_rng(6).permutation(len(graph.broken))
-    for edges in np.split(order, np.arange(1, len(order), 2)):
-        flags = np.zeros(len(graph.broken), bool)
-        flags[edges] = True
-        graph.break_edges(flags)
-        now, same = find_pieces(graph), hold_together(graph, before)
-        assert not same or np.array_equal(now.of_node, pieces.of_node)
-        said.append(same)
-        pieces, before = now, graph.broken.copy()
-    assert pieces.count == (4**dim) and all(said[:4]) and np.mean(said) > 0.3 and not said[-1]
-    graph.set_integrity(np.ones(len(graph.broken)))
-    assert not hold_together(graph, before)
+    follow, counts = Parting(graph), []
+    with patch.object(parting, "find_pieces", wraps=find_pieces) as searched:
+        for edge in np.random.default_rng(6).permutation(len(graph.broken)):
+            graph.break_edges(np.arange(len(graph.broken)) == edge)
+            pieces, expected = follow.look(), find_pieces(graph)
+            assert np.array_equal(pieces.of_node, expected.of_node) and np.array_equal(pieces.lowest, expected.lowest)
+            counts.append(pieces.count)
+        assert searched.call_count == 0 and counts[0] == 1 and counts[-1] == 4**dim
+        graph.set_integrity(np.ones(len(graph.broken)))
+        assert follow.look().count == 1 and searched.called
+
+
+@pytest.mark.parametrize("ranks", (1, 2, 3))
+@pytest.mark.parametrize("case", ("2d", "3d", "quadratic"))
+def test_pieces_are_those_of_scipy(on_ranks: OnRanks, case: str, ranks: int) -> None:
+    """Some edges at a time, blocks first and at last all dust: SciPy's components of the input mesh each time, their
+    numbers alike on any number of ranks, without a search of all nodes at one look in two or more."""
+    same, count, searched = on_ranks(ranks)[0][f"parting-{case}"].T
+    assert same.all() and count[0] < 5 and count[-1] > 100
+    assert np.array_equal(count, on_ranks(1)[0][f"parting-{case}"][:, 1])
+    assert 0 < searched.sum() < 0.7 * len(searched)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rows_are_found_by_what_is_in_them(seed: int) -> None:
+    """Against a search of the whole table."""
+    random = np.random.default_rng(seed)
+    table, wanted = random.integers(0, 30, (40, 3)), random.choice(30, random.integers(0, 5), replace=False)
+    incidence = Incidence(table, 30)
+    assert np.array_equal(incidence(wanted), np.flatnonzero(np.isin(table, wanted).any(axis=1)))
+    assert len(incidence.each(wanted)) == np.isin(table, wanted).sum()
 
 
 def test_components_are_numbered_by_their_lowest_node() -> None:

@@ -10,12 +10,13 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from .edge_stress import carried_by, edge_vectors, frobenius_norm, normal_stress
+from .edge_stress import carried_by, edge_vectors, greatest_pull, normal_stress
 from .strength import Strength
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Edges = npt.NDArray[np.integer]
+ROUND_OFF = 1e-12  # of a stress, by which a bound of it may be too low
 
 
 class Criterion(Protocol):
@@ -67,7 +68,8 @@ class CarriedStress:
         if not self._comm.allreduce(len(damaged)):
             return stress, None
         active = ~graph.split
-        carried = np.where(active[:, None], stress, 0.0)
+        carried = stress.copy()
+        carried[np.flatnonzero(graph.split)] = 0.0
         if self._leaves_out:
             whole = damaged[active[damaged]]
             carried[whole] = carried_by(stress[whole], self._stress.corners(whole), graph.intact(whole))
@@ -76,10 +78,9 @@ class CarriedStress:
     def reaching(self, carried: Values, active: Flags | None, bound: float) -> tuple[npt.NDArray[np.int64], Values]:
         """Cells whose averaged stress may reach a bound in Pa along some direction, and that stress (collective).
 
-        No normal stress exceeds the Frobenius norm of its tensor, and no average exceeds the average of the norms:
-        most cells are passed over after one product.
+        No average pulls harder than the average of the pulls: most cells are passed over after one product.
         """
-        size = frobenius_norm(carried, self._dim)
+        size, bound = greatest_pull(carried, self._dim), bound * (1 - ROUND_OFF)
         if self._average is not None:
             return self._average.reaching(carried, size, bound, active)
         cells = np.flatnonzero(size >= bound)
@@ -113,9 +114,8 @@ class OverloadedEdges:
 
     def overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[Edges, Values]:
         """Intact local edges of some cells whose normal stress in their stress (n, 3 or 6) reaches the strength."""
-        # no stress along an edge is above the norm, but for round-off: most cells are passed over
-        size = frobenius_norm(averaged, self._stress.domain.dim)
-        may = size >= self.strength.weakest_of(cells) * (1 - 1e-12)
+        size = greatest_pull(averaged, self._stress.domain.dim)  # most cells are passed over
+        may = size >= self.strength.weakest_of(cells) * (1 - ROUND_OFF)
         cells, averaged = cells[may], averaged[may]
         edges = self._graph.cell_edges[cells]
         along = normal_stress(averaged, edge_vectors(self._stress.corners(cells)))

@@ -45,6 +45,18 @@ def frobenius_norm(components: Values, dim: int) -> Values:
     return np.asarray(np.sqrt(square))
 
 
+def greatest_pull(components: Values, dim: int) -> Values:
+    """(n,) tr s / d + sqrt(1 - 1/d) |dev s|, or 0: no normal stress is larger, and in 2D one is as large.
+
+    A convex function of s that grows in proportion to it: that of an average is at most the average of it.
+    """
+    mean = components[:, :dim].sum(axis=1) / dim
+    square = np.zeros(len(components))
+    for column in range(components.shape[1]):
+        square += (components[:, column] - mean) ** 2 if column < dim else 2 * components[:, column] ** 2
+    return np.maximum(mean + np.sqrt((1 - 1 / dim) * square), 0.0)
+
+
 def normal_stress(components: Values, vectors: Values) -> Values:
     """(n, k) normal stress n . s . n along each edge, in the unit of s; n is the unit vector of the edge."""
     length2 = np.einsum("nki,nki->nk", vectors, vectors)

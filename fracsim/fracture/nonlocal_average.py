@@ -43,10 +43,8 @@ class NonlocalAverage:
         self._exchange = Halo(domain.comm, centroids, radius)
         near = self._exchange(centroids)
         volumes = self._exchange(domain.volumes[:, None])[:, 0]
-        # the same order of summation at any rank count
         order = np.argsort(self._exchange(domain.cell_input[:, None].astype(float))[:, 0], kind="stable")
-        self._order = order
-        self._rows = _Rows(centroids, near[order], volumes[order], radius, kernel)
+        self._rows = _Rows(centroids, near[order], volumes[order], order, radius, kernel)
 
     def __call__(self, values: Values, active: npt.NDArray[np.bool_] | None = None) -> Values:
         """Averages (cells, n) of cell values (cells, n); cells not `active` enter none. 0 where none is left."""
@@ -54,7 +52,7 @@ class NonlocalAverage:
         n = values.shape[1]
         if active is not None:
             values = np.column_stack([np.where(active[:, None], values, 0.0), active])
-        near = self._exchange(values)[self._order]
+        near = self._exchange(values)
         averages = np.zeros((len(values), n))
         for cells, weights, full in self._rows.made:
             sums = weights @ near
@@ -73,35 +71,42 @@ class NonlocalAverage:
         n = values.shape[1]
         if self._comm.allreduce(float(np.max(size, initial=0.0)), op=MPI.MAX) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
-        columns = [values, size[:, None]] + ([active[:, None]] if active is not None else [])
-        near = self._exchange(np.hstack(columns))[self._order]
+        near, pull = self._exchange(values), self._exchange(size[:, None])[:, 0]
         # hairs below the bound: the sums are rounded
-        self._rows.make(near[:, n] >= bound * (1 - 1e-9))
+        self._rows.make(pull >= bound * (1 - 1e-9))
+        weighing = self._rows.sums(None if active is None else self._exchange(active[:, None].astype(float))[:, 0])
         found: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
         averages: list[Values] = [np.empty((0, n))]
-        for cells, weights, full in self._rows.made:
-            weight = full if active is None else weights @ near[:, -1]
-            rows = np.flatnonzero((weights @ near[:, n] >= bound * (1 - 1e-12) * weight) & (weight > 0))
+        for (cells, weights, _), weight in zip(self._rows.made, weighing, strict=True):
+            rows = np.flatnonzero((weights @ pull >= bound * (1 - 1e-12) * weight) & (weight > 0))
             found.append(cells[rows])
-            averages.append(np.asarray(weights[rows] @ near[:, :n]) / weight[rows, None])
-        every = np.concatenate(found)
-        order = np.argsort(every)
-        return every[order], np.concatenate(averages)[order]
+            averages.append(np.asarray(weights[rows] @ near) / weight[rows, None])
+        order = np.argsort(np.concatenate(found))
+        return np.concatenate(found)[order], np.concatenate(averages)[order]
 
 
 class _Rows:
-    """Weights of `near` cells around `centres`: all of them at once, or row by row where they would be too many.
+    """Weights of near cells around `centres`: all of them at once, or row by row where they would be too many.
+
+    Each row has its weights in the order of the input mesh: the same order of summation at any rank count.
 
     Attributes:
         made: (centres, their rows, sums of those), one block after the other. They are never joined: that would take
             their memory once more.
     """
 
-    def __init__(self, centres: Values, near: Values, volumes: Values, radius: float, kernel: str) -> None:
+    def __init__(
+        self, centres: Values, near: Values, volumes: Values, places: npt.NDArray[np.int64], radius: float, kernel: str
+    ) -> None:
+        """`near`, `volumes`: centroids and volumes of near cells in that order, `places` (near,) where values have
+        them."""
+        self._places = places
         self._centres, self._near, self._volumes, self._radius, self._kernel = centres, near, volumes, radius, kernel
         self._tree = cKDTree(near)
         self._missing = np.ones(len(centres), bool)
         self.made: list[tuple[npt.NDArray[np.int64], csr_matrix, Values]] = []
+        self._active: Values = np.empty(0)
+        self._sums: list[Values] = []
         if self._expected() <= AT_ONCE:
             self.make_all()
 
@@ -113,9 +118,9 @@ class _Rows:
 
     def make(self, hot: npt.NDArray[np.bool_]) -> None:
         """See that there are rows of all centres with a `hot` near cell within the radius."""
-        if not hot.any() or not self._missing.any():
+        if not self._missing.any() or not hot.any():
             return
-        centres, points, reach = self._centres, self._near[hot], self._radius * (1 + 1e-9)
+        centres, points, reach = self._centres, self._near[hot[self._places]], self._radius * (1 + 1e-9)
         close = np.all((centres >= points.min(axis=0) - reach) & (centres <= points.max(axis=0) + reach), axis=1)
         cells = np.flatnonzero(self._missing & close)
         distance, _ = cKDTree(points).query(centres[cells], distance_upper_bound=reach)
@@ -124,6 +129,16 @@ class _Rows:
     def make_all(self) -> None:
         """See that there are rows of all centres."""
         self._add(np.flatnonzero(self._missing))
+
+    def sums(self, active: Values | None) -> list[Values]:
+        """Sums of the weights of near cells with 1 in `active` (near,), of each block `made`; None: of all. They are
+        kept until others are active."""
+        if active is None:
+            return [full for *_, full in self.made]
+        if not np.array_equal(active, self._active):
+            self._active, self._sums = active, []
+        self._sums += [weights @ self._active for _, weights, _ in self.made[len(self._sums) :]]
+        return self._sums
 
     def _add(self, cells: npt.NDArray[np.int64]) -> None:
         for start in range(0, len(cells), CHUNK):
@@ -134,5 +149,7 @@ class _Rows:
             weights = self._volumes[pairs.col] * KERNELS[self._kernel](pairs.data / self._radius)
             rows = csr_matrix((weights, (pairs.row, pairs.col)), shape=(len(part), len(self._near)))
             rows.sort_indices()
+            rows.indices = self._places[rows.indices].astype(rows.indices.dtype)
+            rows.has_sorted_indices = False
             self.made.append((part, rows, np.asarray(rows.sum(axis=1))[:, 0]))
         self._missing[cells] = False

@@ -76,11 +76,19 @@ class Strength:
         return least if self._factor is None else least * self._factor[self._graph.cell_edges].min(axis=1)
 
     def noise(self, edges: npt.NDArray[np.int32]) -> Values:
-        """Numbers in [-1, 1) hashed from the mid-points of local edges; worked out only for those asked for."""
+        """Numbers in [-1, 1) hashed from the mid-points of local edges; worked out for those asked for, once."""
         if not self._tie_break:
             return np.zeros(edges.shape)
-        unique, inverse = np.unique(edges, return_inverse=True)
-        return hashed(self._twice_middle(unique))[inverse.reshape(edges.shape)]
+        result = self._noise[edges]
+        if len(unknown := edges[np.isnan(result)]):
+            self._noise[unknown] = hashed(self._twice_middle(unknown))
+            result = self._noise[edges]
+        return result
+
+    @cached_property
+    def _noise(self) -> Values:
+        """(edges,) those that have been worked out; NaN elsewhere."""
+        return np.full(len(self._graph.broken), np.nan)
 
     def _twice_middle(self, edges: npt.NDArray[np.integer]) -> Values:
         ends = self._graph.domain.nodes[self._graph.edge_nodes[edges]]

@@ -7,6 +7,8 @@ names, places   groups and regions by name; boxes and planes
 simplices       edges of a triangle or tetrahedron, and what every pattern of broken ones means
 small_matrices  arrays of 2 x 2 and 3 x 3 matrices
 edges           the edges of the mesh and their integrity
+incidence       the cells at an edge, the edges at a node
+parting         pieces as edges break, looked for around those
 pieces, bodies  connected components under intact edges; of the mesh as it was built
 overlap         nodes of one piece in cells of another
 dolfinx_calls   calls of DOLFINx that a newer version touches

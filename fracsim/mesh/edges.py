@@ -13,6 +13,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
+from .incidence import Incidence
 from .ranks import total
 from .simplices import is_split, local_edges
 
@@ -28,6 +29,7 @@ class EdgeGraph:
         broken: (edges,) bool, integrity is 0.
         pattern: (cells,) uint8, bit k set where local edge k is broken.
         damaged: (cells,) bool, whether any edge is less than whole.
+        split: (cells,) bool, whether the cell has come apart; another array once any has.
         kept: (edges,) bool, those that join their ends though all their cells have come apart; None: there are none.
     """
 
@@ -48,6 +50,8 @@ class EdgeGraph:
         self.broken = np.zeros(len(self.integrity), bool)
         self.pattern = np.zeros(domain.cell_count, np.uint8)
         self.damaged = np.zeros(domain.cell_count, bool)
+        self.split = np.zeros(domain.cell_count, bool)
+        self._idle_looked_for = self.split  # among the edges of these cells
         self._shared = la.vector(self.index_map, 1, np.int32)
 
     @cached_property
@@ -56,6 +60,16 @@ class EdgeGraph:
         result = np.full((len(self.broken), 2), -1, np.int32)
         result[self.cell_edges] = self.cell_nodes[:, local_edges(self.domain.dim)]
         return result
+
+    @cached_property
+    def cells_at(self) -> Incidence:
+        """Cells that have any of some edges."""
+        return Incidence(self.cell_edges, len(self.broken))
+
+    @cached_property
+    def edges_at(self) -> Incidence:
+        """Edges, owned and ghost, that have any of some nodes as an end."""
+        return Incidence(self.edge_nodes, len(self.domain.nodes))
 
     def on_any_rank(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """(edges,) flags raised on any rank that has the edge (collective)."""
@@ -93,16 +107,19 @@ class EdgeGraph:
         """Be as an earlier time left it: (edges,), owned and ghost."""
         self.integrity[:] = integrity
         self.broken[:], self.pattern[:] = False, 0
+        self.split = self._idle_looked_for = np.zeros(len(self.pattern), bool)
         self._note_broken(self.integrity == 0)
         self.damaged[:] = (self.integrity[self.cell_edges] < 1).any(axis=1)
 
     def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
         """Edges (edges,) are broken from here on."""
         self.broken |= new
-        touched = np.flatnonzero(new[self.cell_edges].any(axis=1))
+        touched = self.cells_at(np.flatnonzero(new))
         bits = 1 << np.arange(self.cell_edges.shape[1])
         self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
         self.damaged[touched] = True
+        self.split = self.split.copy()  # whoever has asked for it has what was
+        self.split[touched] = is_split(self.domain.dim)[self.pattern[touched]]
 
     def least(self, values: npt.NDArray[np.float64], of: IndexMap | None = None) -> npt.NDArray[np.float64]:
         """(n,) the least value that any rank gives an edge, or an entity of another index map (collective)."""
@@ -124,22 +141,20 @@ class EdgeGraph:
         Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
         apart. Mechanics do not change: chi of its cells is 0 and they enter no average. What is `kept` is not broken.
         """
+        looked_for = self._idle_looked_for if self.kept is None else np.zeros(len(self.split), bool)
+        self._idle_looked_for = self.split
         apart = np.zeros(len(self.broken), bool)
-        apart[self.cell_edges[self.split]] = True
+        apart[self.cell_edges[self.split & ~looked_for]] = True
         may = self.on_any_rank(apart & ~self.broken)
         carried = np.zeros(len(self.broken), bool) if self.kept is None else self.kept.copy()
-        carried[self.cell_edges[may[self.cell_edges].any(axis=1) & ~self.split]] = True
+        cells = self.cells_at(np.flatnonzero(may))
+        carried[self.cell_edges[cells[~self.split[cells]]]] = True
         return self.break_edges(may & ~self.on_any_rank(carried))
 
     @property
     def broken_count(self) -> int:
         """Broken edges that this rank owns."""
         return int(np.count_nonzero(self.broken[: self.edge_count]))
-
-    @property
-    def split(self) -> npt.NDArray[np.bool_]:
-        """(cells,) whether the cell has come apart."""
-        return is_split(self.domain.dim)[self.pattern]
 
     def intact(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
         """(n, k) whether each local edge of the cells is intact."""

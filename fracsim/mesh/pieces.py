@@ -11,8 +11,7 @@ from dolfinx import la
 from ..meshes.components import components
 from .domain import Domain
 from .edges import EdgeGraph
-from .ranks import offset, total
-from .simplices import local_edges, node_groups
+from .ranks import offset
 
 
 @dataclass(frozen=True)
@@ -22,10 +21,12 @@ class Pieces:
     Attributes:
         count: how many there are, numbered from 0 by their lowest node in the input mesh.
         of_node: (nodes,) piece of every owned and ghost node.
+        lowest: (count,) the input node that each is numbered by.
     """
 
     count: int
     of_node: npt.NDArray[np.int64]
+    lowest: npt.NDArray[np.int64]
 
 
 def find_pieces(graph: EdgeGraph) -> Pieces:
@@ -41,31 +42,25 @@ def find_pieces(graph: EdgeGraph) -> Pieces:
     np.minimum.at(lowest, local, domain.node_input)
     lowest = np.concatenate(domain.comm.allgather(lowest))
     count, joined = components(every, len(lowest))
-    return Pieces(count, _by_lowest(joined, lowest, count)[label])
+    least = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(least, joined, lowest)
+    order = np.argsort(least)
+    rank = np.empty(count, np.int64)
+    rank[order] = np.arange(count)
+    return Pieces(count, rank[joined][label], least[order])
 
 
-def hold_together(graph: EdgeGraph, before: npt.NDArray[np.bool_]) -> bool:
-    """Whether pieces are those of `before`, flags (edges,) of what was broken then: nothing is whole again, and the
-    ends of what has broken since are still joined by a cell of some rank, as behind the tip of a crack (collective)."""
-    new = graph.broken & ~before
-    cells = np.flatnonzero(new[graph.cell_edges].any(axis=1))
-    group = node_groups(graph.domain.dim)[graph.pattern[cells]]
-    first, second = local_edges(graph.domain.dim).T
-    joined = np.zeros(len(new), bool)
-    joined[graph.cell_edges[cells][group[:, first] == group[:, second]]] = True
-    other = (before & ~graph.broken) | (new & ~graph.on_any_rank(joined))
-    return not total(graph.domain.comm, np.count_nonzero(other))[0]
+def followed(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """(m,) middles of edges and (m,) the ends that they go with, those that come first in the input mesh: where an edge
+    is broken its middle is anywhere between its ends, and a piece is known by its corners."""
+    between, ends = domain.middle_ends
+    return between, ends[np.arange(len(ends)), np.argmin(domain.node_input[ends], axis=1)]
 
 
 def _joined(graph: EdgeGraph) -> npt.NDArray[np.int32]:
-    """(n, 2) nodes of intact edges. A middle goes with the end of its edge that comes first in the input mesh: where
-    the edge is broken it is anywhere between them, and a piece is known by its corners."""
-    domain, edges = graph.domain, graph.edge_nodes[~graph.broken]
-    if domain.order == 1:
-        return edges
-    between, ends = domain.middle_ends
-    first = np.argmin(domain.node_input[ends], axis=1)
-    return np.concatenate([edges, np.stack([between, ends[np.arange(len(ends)), first]], axis=1)])
+    """(n, 2) nodes of intact edges, and middles with what they follow."""
+    edges = graph.edge_nodes[~graph.broken]
+    return edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(followed(graph.domain), axis=1)])
 
 
 def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -74,12 +69,3 @@ def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[n
     vector.array[:] = label
     vector.scatter_forward()
     return vector.array.copy()
-
-
-def _by_lowest(joined: npt.NDArray[np.int64], lowest: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
-    """Renumber joined components by the lowest input node that each of them has."""
-    least = np.full(count, np.iinfo(np.int64).max)
-    np.minimum.at(least, joined, lowest)
-    rank = np.empty(count, np.int64)
-    rank[np.argsort(least)] = np.arange(count)
-    return rank[joined]

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
     from ..fracture.brittle.surfaces import BrittleSurfaces
     from ..fracture.record import EdgeRecord
-    from ..mesh.edges import EdgeGraph
     from ..mesh.pieces import Pieces
 
 
@@ -39,11 +38,11 @@ class Breaks:
         self.pieces: Pieces | None = None
         self.figures = (0, 0, _bodies(self._domain))
         self._cut_by: npt.NDArray[np.float64] | None = None
-        self._broken = np.zeros(0, bool)  # (edges,) when `pieces` were looked for last
         if breaking is not None:
             from ..fracture.record import EdgeRecord
+            from ..mesh.parting import Parting
 
-            self.record = EdgeRecord(breaking.graph)
+            self.record, self._parting = EdgeRecord(breaking.graph), Parting(breaking.graph)
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
             self._cut_by = getattr(breaking.criterion, "cut", None)
@@ -78,17 +77,8 @@ class Breaks:
             return
         graph = self.record.graph
         broken, split = total(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
-        self.pieces = self._pieces(graph)
+        self.pieces = self._parting.look()
         self.figures = int(broken), int(split), self.pieces.count
-
-    def _pieces(self, graph: EdgeGraph) -> Pieces:
-        """Those of now: of the last time where what has broken since parts nothing (collective)."""
-        from ..mesh.pieces import find_pieces, hold_together
-
-        before, self._broken = self._broken, graph.broken.copy()
-        if self.pieces is not None and hold_together(graph, before):
-            return self.pieces
-        return find_pieces(graph)
 
     def dust(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:
         """Pieces of a single corner of cells, and their mass, kg; `mass` (cells,) of cells, kg (collective)."""

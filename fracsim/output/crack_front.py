@@ -28,6 +28,8 @@ class CrackFront:
         self.names = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
         self._ends = ends_in_order(graph)
         self._figures = np.full(1 + d, np.nan)
+        self._pattern = np.zeros_like(graph.pattern)  # at the last look
+        self._size = np.zeros(len(self._pattern))  # of the cut through each cell
         self.look()
 
     def __call__(self) -> Values:
@@ -36,7 +38,10 @@ class CrackFront:
 
     def look(self) -> None:
         """Edges have broken (collective)."""
-        self._figures[0] = total(self._domain.comm, self._cut())[0]
+        changed = np.flatnonzero(self._graph.pattern != self._pattern)
+        self._pattern = self._graph.pattern.copy()
+        self._size[changed] = self._cut(changed)
+        self._figures[0] = total(self._domain.comm, float(self._size.sum()))[0]
         tips = np.concatenate(self._domain.comm.allgather(self._tips()))
         if len(tips):  # a crack that has run through has none: its last one stays
             first = np.lexsort([tips[:, 2], tips[:, 1], -tips[:, 0]])[0]
@@ -50,19 +55,20 @@ class CrackFront:
         at = ends[:, :, 0] + share * (ends[:, :, 1] - ends[:, :, 0])
         return np.where(self._graph.broken[edges][..., None], at, np.nan)
 
-    def _cut(self) -> float:
-        """Length or area of the cuts through this rank's split cells."""
+    def _cut(self, cells: npt.NDArray[np.integer]) -> Values:
+        """(n,) length or area of the cuts through cells, 0 of those that hold together."""
+        result, split = np.zeros(len(cells)), self._graph.split[cells]
         if self._domain.dim == 2:
             # to the middle of the cuts: two of them are a segment, three a branch
-            points = self._points(np.flatnonzero(self._graph.split))
-            if not len(points):
-                return 0.0
+            points = self._points(cells[split])
             middle = np.nanmean(points, axis=1, keepdims=True)
-            return float(np.nansum(np.linalg.norm(points - middle, axis=2)))
-        many = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern]
-        split = self._graph.split
-        corners = [self._corners(np.flatnonzero(split & (many == count)), count) for count in (3, 4)]
-        return float(_triangles(corners[0]).sum() + _quadrangles(corners[1]).sum())
+            result[split] = np.nansum(np.linalg.norm(points - middle, axis=2), axis=1)
+            return result
+        many = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern[cells]]
+        for count, area in ((3, _triangles), (4, _quadrangles)):
+            some = np.flatnonzero(split & (many == count))
+            result[some] = area(self._corners(cells[some], count))
+        return result
 
     def _corners(self, cells: npt.NDArray[np.integer], count: int) -> Values:
         """(n, count, d) places of the cuts of cells with so many."""
@@ -70,14 +76,24 @@ class CrackFront:
         return points[~np.isnan(points[..., 0])].reshape(len(cells), count, points.shape[-1])
 
     def _tips(self) -> Values:
-        """(n, 3 + d) of this rank's cells that cracks have come into and not left: when, which edge (two input nodes),
-        and where, m."""
-        graph, domain = self._graph, self._domain
-        cells = np.flatnonzero((graph.pattern > 0) & ~graph.split)
-        entry = np.argmin(graph.intact(cells), axis=1)
+        """(n, 3 + d) of this rank's cells that cracks have come into last and not left: when, which edge (two input
+        nodes), and where, m."""
+        graph, at = self._graph, self._record.at
+        cells, entry = self._entered(graph.cells_at(np.flatnonzero(at == np.nanmax(at, initial=-np.inf))))
+        if not len(cells):
+            cells, entry = self._entered(np.flatnonzero((graph.pattern > 0) & ~graph.split))
         edges = graph.cell_edges[cells, entry]
-        keys = domain.node_input[self._ends[edges]]
-        return np.column_stack([self._record.at[edges], keys, self._points(cells)[np.arange(len(cells)), entry]])
+        keys = self._domain.node_input[self._ends[edges]]
+        return np.column_stack([at[edges], keys, self._points(cells)[np.arange(len(cells)), entry]])
+
+    def _entered(self, cells: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
+        """Of cells with broken edges those that hold together and were entered last, and by which local edge."""
+        graph, at = self._graph, self._record.at
+        cells = cells[~graph.split[cells]]
+        entry = np.argmin(graph.intact(cells), axis=1)
+        when = at[graph.cell_edges[cells, entry]]
+        last = when == np.max(when, initial=-np.inf)
+        return cells[last], entry[last]
 
 
 def _triangles(corners: Values) -> Values:

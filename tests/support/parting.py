@@ -1,0 +1,73 @@
+"""Edges break some at a time, in an order that no partition changes, until all is dust: the pieces after each time."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from fracsim.mesh import parting
+from fracsim.mesh.edges import EdgeGraph
+
+from .scenes import make_scene
+
+CASES = {"2d": (2, 0.06, 1), "3d": (3, 0.2, 1), "quadratic": (2, 0.1, 2)}  # dim, h and order
+AT_ONCE = 12
+NEAR = (1, 3)  # edges that one goes: bodies are small
+
+
+def compared() -> dict[str, npt.NDArray[np.generic]]:
+    """For each case whether pieces were those of SciPy each time, how many there were, and at how many looks the whole
+    body was searched."""
+    return {f"parting-{name}": broken_bit_by_bit(*case) for name, case in CASES.items()}
+
+
+def broken_bit_by_bit(dim: int, h: float, order: int) -> npt.NDArray[np.int64]:
+    """(looks, 3) on rank 0: whether pieces are SciPy's, their count, and whether all was searched."""
+    scene, _ = make_scene(
+        mesh={"builder": "box", "size": [1] * dim, "h": h, "pattern": "unstructured", "order": order},
+        fracture={"strength": 1.0},
+    )
+    graph, rows = scene.fracture.graph, []
+    follow, turn = parting.Parting(graph), _turns(graph)
+    for last in np.arange(0, turn[-1] + AT_ONCE, AT_ONCE):
+        graph.break_edges(turn[:-1] <= last)
+        everywhere = patch.object(parting, "find_pieces", wraps=parting.find_pieces)
+        with patch.object(parting, "FAR", NEAR), everywhere as searched:
+            pieces = follow.look()
+        of_node = graph.domain.gather_nodes(pieces.of_node[: graph.domain.node_count])
+        keys = graph.broken_keys()
+        if keys is not None:
+            assert of_node is not None
+            same = np.array_equal(of_node[: len(graph.domain.source.points)], _by_scipy(graph, keys))
+            rows.append((same, pieces.count, searched.called))
+    return np.array(rows)
+
+
+def _turns(graph: EdgeGraph) -> npt.NDArray[np.int64]:
+    """(edges + 1,) when each breaks, and how many there are: those across the planes of a grid one after the other, so
+    that blocks come off, then all others as places are hashed."""
+    nodes, comm = graph.domain.nodes[graph.edge_nodes], graph.domain.comm
+    middle = nodes.mean(axis=1)
+    across = np.floor(3 * nodes[:, 0]) != np.floor(3 * nodes[:, 1])
+    hashed = 100 + np.sin(1e6 * middle.sum(axis=1))
+    key = np.round(np.where(across.any(axis=1), middle @ np.arange(1, middle.shape[1] + 1), hashed), 9)
+    every = np.unique(np.concatenate(comm.allgather(key)))
+    return np.append(np.searchsorted(every, key), len(every))
+
+
+def _by_scipy(graph: EdgeGraph, broken: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(points,) components of the input mesh without the edges `broken` (n, 2), numbered by their lowest point."""
+    source = graph.domain.source
+    assert source is not None
+    first, second = np.triu_indices(source.cells.shape[1], 1)
+    pairs = np.sort(np.stack([source.cells[:, first].ravel(), source.cells[:, second].ravel()], axis=1), axis=1)
+    gone = np.isin(pairs @ [1 << 32, 1], broken @ [1 << 32, 1])
+    links, count = pairs[~gone], len(source.points)
+    graph_of_links = coo_matrix((np.ones(len(links)), links.T), shape=(count, count))
+    _, label = connected_components(graph_of_links, directed=False)
+    lowest = np.unique(label, return_index=True)[1]
+    return np.asarray(np.argsort(np.argsort(lowest))[label])
