@@ -17,10 +17,12 @@ from fracsim.mesh.simplices import local_edges, node_groups
 from fracsim.meshes.builders.box import lattice
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.studies.evidence import __main__ as program
-from fracsim.studies.evidence import faces, growth, ladder, solvers
+from fracsim.studies.evidence import faces, growth, ladder, solvers, steps
 from fracsim.studies.evidence.section import Point, Section, fitted_order, pareto_front, recommended, timed
 from fracsim.studies.evidence.trial import Trial
 from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
+from fracsim.study.check import build_mesh
+from fracsim.study.file import validate
 
 POINTS = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
 
@@ -280,6 +282,29 @@ def test_a_section_that_cannot_be_made_says_so(tmp_path: Path) -> None:
     path = program.write_evidence(tmp_path, {"growth": [{"group": "growth"}]}, {"growth": broken})
     (section,) = json.loads(path.read_text())["groups"]["growth"]["sections"]
     assert "KeyError: 'step'" in section["text"]
+
+
+def test_hard_steps_are_held_against_their_bounds() -> None:
+    def record(name: str, **figures: float) -> dict[str, Any]:
+        return {"settings": {"of": name}, "figures": figures, "outcome": "done", "message": ""}
+
+    def pane(share: float) -> dict[str, Any]:
+        return record("explicit", cells=9000, steps=100, breaking=60, share=share, whole=2.0, all=2.0 * (1 + share))
+
+    quick, slow = (record(name, worst=worst) for name, worst in (("pulled", 1.5), ("bent", 2 * steps.WORST)))
+    collapse, breaking = steps.section([quick, pane(0.9)]).claims
+    assert collapse.holds and collapse.measured == "1.5 s (pulled)"
+    assert breaking.holds and breaking.measured.startswith("0.90 of it: 3.8 s beside 2.0 s of 100 steps")
+    collapse, breaking = steps.section([quick, slow, pane(1.1)]).claims
+    assert collapse.holds is False and "bent" in collapse.measured and breaking.holds is False
+    assert [claim.holds for claim in steps.section([]).claims] == [None, None]
+
+
+def test_scenes_of_hard_steps_are_what_they_are_called() -> None:
+    """Lattices of 5,280 triangles with a notch in one, and as many trials as scenes."""
+    for name, data in steps.COLLAPSES.items():
+        assert len(build_mesh(validate(data, name).mesh).cells) == 5280
+    assert len({trial.name for trial in steps.trials()}) == len(steps.COLLAPSES) + 1
 
 
 def test_the_default_solver_is_held_against_the_better_of_two() -> None:

@@ -387,6 +387,11 @@ def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
     assert row["cheapest setting for 5%"] == "scheme = generalized-alpha, dt = 0.2"
     assert row["DOLFINx alone, quadratic: s for 5%"] == 1.0 and row["DOLFINx alone, quadratic: s for 1%"] is None
     assert found.plots[0].series[0].x == (2.5, 5.0, 10.0)
+    exact = [
+        record(f"x{cost}", error, cost, scheme="newmark", dt=cost) for error, cost in ((1e-9, 20.0), (1e-12, 40.0))
+    ]
+    (found,) = short.summary([MADE], [*EULER, *exact])
+    assert found.plots[0].series[0].x == (2.5, 5.0, 10.0, 20.0) and found.plots[0].series[0].y[-1] == short.FINEST
     assert short.summary([MADE], []) == []
 
 

@@ -23,7 +23,7 @@ from typing import Any
 from ...study import Study
 from ..bench import study as bench_study
 from ..bench import timed
-from . import faces, solvers
+from . import faces, solvers, steps
 from .section import Cell, Claim, Plot, Section, Series, Table
 from .trial import Trial
 
@@ -36,7 +36,7 @@ DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never str
 FLOW: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
 FRACTURE_MODULES = (
     "fracture.breaking", "fracture.degradation", "fracture.strength", "fracture.edge_stress", "fracture.record",
-    "mesh.edges", "mesh.pieces",
+    "mesh.edges", "mesh.incidence", "mesh.parting", "mesh.pieces",
 )  # fmt: skip
 PLASTIC_MODULES = (
     "mechanics.plasticity", "mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum",
@@ -50,6 +50,7 @@ OPTIONAL = (
     "stepping.edge_frequencies", "report",
 )  # fmt: skip
 NEAR_NOTHING = 1.03  # what an obstacle that touches nothing may cost, at 192k tetrahedra
+PARTS = {"faces": faces, "solvers": solvers, "steps": steps}  # by their case: what touches flat, solvers, hard steps
 YIELDING = 1.30  # what flow everywhere may cost over the elastic bar
 
 
@@ -108,8 +109,9 @@ def rungs(n: int) -> dict[str, Rung]:
 
 
 def trials() -> list[Trial]:
-    """Every rung at 24k tetrahedra, and at 192k in full; what touches flat; and solvers."""
-    return [*(_trial(name, n) for n in (SHORT, LONG) for name in rungs(n)), *faces.trials(), *solvers.trials()]
+    """Every rung at 24k tetrahedra, and at 192k in full; and what stands by itself."""
+    rung_by_rung = (_trial(name, n) for n in (SHORT, LONG) for name in rungs(n))
+    return [*rung_by_rung, *(trial for part in PARTS.values() for trial in part.trials())]
 
 
 def _trial(name: str, n: int) -> Trial:
@@ -285,9 +287,9 @@ def _inside(module: str, part: str) -> bool:
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Table, bars of ratios, and the claims; what touches flat; and solvers."""
-    touching, solved = ([record for record in records if record["case"] == case] for case in ("faces", "solvers"))
-    records = [record for record in records if record["case"] not in ("faces", "solvers")]
+    """Table, bars of ratios, and the claims; and what stands by itself."""
+    by_itself = {case: [record for record in records if record["case"] == case] for case in PARTS}
+    records = [record for record in records if record["case"] not in PARTS]
     columns = (
         "cells along 1 m", "scene", "cells", "s a step", "±", "compared with", "ratio", "± ", "Newton", "frame s",
         "start-up s", "memory bytes/cell", "fields", "field bytes/cell", "modules",
@@ -314,8 +316,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     table = Table("ladder", "What each feature costs", columns, rows)
     title = "Ladder: the cost of what is used, and of what is not"
     first = Section(title, text, _claims(records), (table,), (plot,))
-    others = [part.section(found) for part, found in ((faces, touching), (solvers, solved)) if found]
-    return [first, *others]
+    return [first, *(PARTS[case].section(found) for case, found in by_itself.items() if found)]
 
 
 def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:

@@ -264,7 +264,7 @@ def _default_claims(case: Case, advice: list[Advice]) -> tuple[Claim, ...]:
 
 
 def _default_claim(case: Case, advice: Advice) -> Claim:
-    text = f"the setting recommended for {advice.limit:.0%} of {case.errors[0]} is the program's default"
+    text = f"{case.title}: what is recommended for {advice.limit:.0%} of {case.errors[0]} is the program's default"
     if advice.candidate is None:
         return Claim(text, "no setting reaches it", None)
     best = f"cheapest: {setting(advice.candidate)}, {advice.candidate.core_seconds:.3g} core-seconds"

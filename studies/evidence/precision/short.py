@@ -8,6 +8,7 @@ from ..peers.akantu import ABSENT, interpreter
 from ..section import Cell, Plot, Section, Series, Table, pareto_front
 from .page import LIMITS, Case, Records, Row, cheapest, counts, rows_of, setting
 
+FINEST = 1e-4  # of errors that are told apart in the plot
 PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` of their trials
 
 
@@ -24,7 +25,8 @@ def summary(cases: list[Case], records: Records) -> list[Section]:
         ("case", "error of", *own, *seconds), tuple(_line(case, rows, peers) for case, rows in found),
     )  # fmt: skip
     plot = Plot(
-        "Error against core-seconds: the best settings of each case.", "core-seconds in the steps", "relative error",
+        f"Error against core-seconds: the best settings of each case. Errors below {FINEST:g} count as that.",
+        "core-seconds in the steps", "relative error",
         tuple(_front(case, rows) for case, rows in found), "loglog", levels=LIMITS,
     )  # fmt: skip
     without = "" if peers else " No other program has run beside them here."
@@ -45,15 +47,21 @@ def _line(case: Case, rows: list[Row], peers: list[str]) -> tuple[Cell, ...]:
     cells: list[Cell] = [case.title, case.errors[0]]
     for limit in LIMITS:
         row = cheapest(case, ours, limit)
-        cells += [None, None] if row is None else [setting(row), row.core_seconds]
+        cells += [None, None] if row is None else [_name(row), row.core_seconds]
     for peer in peers:
         theirs = [row for row in rows if peer_of(row.record) == peer and case.errors[0] in row.errors]
         cells += [None if row is None else row.core_seconds for row in (cheapest(case, theirs, x) for x in LIMITS)]
     return tuple(cells)
 
 
+def _name(row: Row) -> str:
+    """The setting; a solver by its name alone: its options are where its case is."""
+    settings = row.record["settings"]
+    return f"solver = {settings['solver']}" if "solver" in settings else setting(row)
+
+
 def _front(case: Case, rows: list[Row]) -> Series:
     """Settings that no other beats in both, the cheapest first."""
-    points = [(row.core_seconds, max(row.errors[case.errors[0]], 1e-16)) for row in rows if counts(case, row)]
+    points = [(row.core_seconds, max(row.errors[case.errors[0]], FINEST)) for row in rows if counts(case, row)]
     best = sorted(points[place] for place in pareto_front(points))
     return Series(case.title, tuple(x for x, _ in best), tuple(y for _, y in best))

@@ -1,0 +1,188 @@
+"""Steps that are hard for what breaks in them: those of a quasi-static collapse, and explicit ones.
+
+    python -m fracsim.studies.evidence.steps NAME -o figures.json
+
+A collapse: processor seconds of every step of a lattice of 5,280 triangles that is loaded until it comes apart.
+Explicit: those of a pane of 9,000 triangles in as many steps, whole and with [fracture], in turn in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from .precision.common import QUIET
+from .section import Claim, Section, Table, again
+from .trial import Trial
+
+Data = dict[str, Any]
+WORST = 5.0  # s: what whole runs on random meshes took where a step of a lattice took 129
+TURNS, BLOCK = 10, 100  # explicit steps: so many in turn, so many times
+PULLED = {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [6e-4, 0.0]]}}
+SHEARED = {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [1e-3, 0.0]]}}
+BENT = {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, 2e-3]]}}
+HELD = {side: {"on": side, "fix": "xy"} for side in ("left", "bottom")}
+
+
+def collapse(energy: str, load: Data, held: str, fracture: Data) -> Data:
+    """A lattice of 66 x 40 squares of 1 mm in two triangles each, with a notch, under a load that grows in 20 steps."""
+    return {
+        "title": "a lattice that comes apart",
+        "mesh": {"builder": "box", "size": [0.066, 0.04], "h": 1e-3, "pattern": "structured"},
+        "material": {"energy": energy, "young": 3e9, "poisson": 0.35, "density": 1200.0},
+        "fracture": {"strength": 2e7, **fracture},
+        "crack": [{"segment": [[0.0332, -0.001], [0.0332, 0.0102]]}],
+        "boundary": [HELD[held], load],
+        "time": {"scheme": "quasi-static", "step": 0.05, "end": 1.0},
+        "output": QUIET,
+    }
+
+
+COLLAPSES = {
+    "pulled": collapse("linear", PULLED, "left", {}),
+    "pulled, averaged": collapse("linear", PULLED, "left", {"radius": 2e-3}),
+    "pulled, until nothing breaks": collapse("neo-hookean", PULLED, "left", {"passes": 40}),
+    "sheared": collapse("neo-hookean", SHEARED, "bottom", {}),
+    "bent": collapse("neo-hookean", BENT, "left", {}),
+}
+PANE: Data = {
+    "title": "a pane that breaks",
+    "mesh": {"builder": "box", "size": [0.1, 0.04], "h": 1.05e-3, "pattern": "unstructured"},
+    "material": {"energy": "neo-hookean", "young": 3.2e10, "poisson": 0.2, "density": 2450.0},
+    "boundary": [{"on": "top", "traction": [0.0, 1e6]}, {"on": "bottom", "traction": [0.0, -1e6]}],
+    "time": {"scheme": "explicit", "step": 1e-7, "end": 1.0},
+    "output": QUIET,
+}
+BREAKS: Data = {
+    "fracture": {"strength": 1.2e6, "radius": 2e-3},
+    "crack": [{"segment": [[-0.01, 0.02], [0.05, 0.02]]}],
+}
+EXPLICIT = "explicit"
+
+
+def trials() -> list[Trial]:
+    """One for each."""
+    script = "fracsim.studies.evidence.steps"
+    return [
+        Trial("ladder", "steps", name.replace(", ", "-").replace(" ", "-"), script=(script, name),
+              settings={"of": name}, limit=300.0)
+        for name in (*COLLAPSES, EXPLICIT)
+    ]  # fmt: skip
+
+
+def collapsed(name: str) -> Data:
+    """Processor seconds of the steps, and what broke."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = _run(COLLAPSES[name], name, Path(folder))
+        seconds, newton = [], 0
+        while not run.scene.ended(run.state):
+            spent, reports = _steps(run, 1)
+            seconds.append(spent)
+            newton += sum(report.solve.newton for report in reports)
+        cells, broken = run.scene.domain.cell_count, run.breaks.figures[0]
+        run.scene.destroy()
+    return {"cells": cells, "steps": len(seconds), "worst": max(seconds), "all": sum(seconds), "newton": newton,
+            "broken": broken}  # fmt: skip
+
+
+def explicit() -> Data:
+    """Processor seconds of as many steps of the whole pane and of the one that breaks, and in how many edges broke."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole, breaks = (
+            _run(study, EXPLICIT, Path(folder) / name) for name, study in (("whole", PANE), ("breaks", PANE | BREAKS))
+        )
+        seconds: dict[str, list[float]] = {"whole": [], "breaks": []}
+        reports = []
+        for _ in range(TURNS):
+            seconds["whole"].append(_steps(whole, BLOCK)[0])
+            spent, some = _steps(breaks, BLOCK)
+            seconds["breaks"].append(spent)
+            reports += some
+        cells, broken = whole.scene.domain.cell_count, breaks.breaks.figures[0]
+    share = median((b - w) / w for w, b in zip(seconds["whole"], seconds["breaks"], strict=True))
+    breaking = sum(report.broken > 0 for report in reports)
+    spent_whole, spent_breaking = map(sum, seconds.values())
+    return {"cells": cells, "steps": TURNS * BLOCK, "breaking": breaking, "share": share, "whole": spent_whole,
+            "all": spent_breaking, "broken": broken}  # fmt: skip
+
+
+def _run(study: Data, name: str, folder: Path) -> Any:
+    from mpi4py import MPI
+
+    from ...run import Run
+    from ...scene import build_scene
+    from ...study.file import validate
+
+    return Run(build_scene(MPI.COMM_WORLD, validate(study, name)), folder)
+
+
+def _steps(run: Any, count: int) -> tuple[float, list[Any]]:
+    """Processor seconds of steps, and their reports."""
+    began = time.process_time()
+    reports = [run.step() for _ in range(count)]
+    return time.process_time() - began, reports
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", choices=(*COLLAPSES, EXPLICIT))
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    figures = explicit() if given.name == EXPLICIT else collapsed(given.name)
+    given.out.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+# --- the section ----------------------------------------------------------------------------------------------------
+
+
+def section(records: list[Data]) -> Section:
+    """Tables and claims."""
+    done = {record["settings"]["of"]: record["figures"] for record in records if record["figures"]}
+    found = {name: figures for name, figures in done.items() if name in COLLAPSES}
+    text = (
+        "Processor seconds. A lattice of 5,280 triangles with a notch under a load that grows in 20 steps until it "
+        "comes apart: one step of such a collapse once took 129 s, whole runs on meshes of random points 5 s. "
+        f"And explicit steps of a pane, whole and where it breaks, in turn in one process.{again(records)}"
+    )
+    worst = max(found, key=lambda name: found[name]["worst"], default="")
+    told, quick = "nothing", None
+    if found:
+        told, quick = f"{found[worst]['worst']:.2g} s ({worst})", found[worst]["worst"] <= WORST
+    pane = done.get(EXPLICIT)
+    claims = (
+        Claim(f"No step of a collapse takes more than {WORST:g} s", told, quick),
+        Claim(
+            "In explicit steps in the plane breaking costs no more than mechanics",
+            _told(pane) if pane else "nothing",
+            pane["share"] <= 1 if pane else None,
+        ),
+    )
+    columns = (
+        "scene", "triangles", "steps", "worst step, s", "all steps, s", "of a body that does not break, s",
+        "Newton iterations", "broken edges", "outcome",
+    )  # fmt: skip
+    table = Table("ladder-steps", "Hard steps", columns, tuple(map(_row, records)))
+    return Section("Hard steps", text, claims, (table,))
+
+
+def _told(pane: Data) -> str:
+    return (
+        f"{pane['share']:.2f} of it: {pane['all']:.1f} s beside {pane['whole']:.1f} s of {pane['steps']:,} steps of "
+        f"{pane['cells']:,} triangles, edges breaking in {pane['breaking']}"
+    )
+
+
+def _row(record: Data) -> tuple[Any, ...]:
+    figures = record["figures"].get
+    words = record["outcome"] if record["outcome"] == "done" else f"{record['outcome']}: {record['message']}"
+    measured = (figures(key) for key in ("cells", "steps", "worst", "all", "whole", "newton", "broken"))
+    return (record["settings"]["of"], *measured, words)
+
+
+if __name__ == "__main__":
+    main()
