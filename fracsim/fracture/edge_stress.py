@@ -50,10 +50,11 @@ def greatest_pull(components: Values, dim: int) -> Values:
 
     A convex function of s that grows in proportion to it: that of an average is at most the average of it.
     """
-    mean = components[:, :dim].sum(axis=1) / dim
+    columns = list(components.T)  # one after the other: sums over short rows take several times as long
+    mean = sum(columns[1:dim], columns[0]) / dim
     square = np.zeros(len(components))
-    for column in range(components.shape[1]):
-        square += (components[:, column] - mean) ** 2 if column < dim else 2 * components[:, column] ** 2
+    for number, column in enumerate(columns):
+        square += (column - mean) ** 2 if number < dim else 2 * column**2
     return np.maximum(mean + np.sqrt((1 - 1 / dim) * square), 0.0)
 
 

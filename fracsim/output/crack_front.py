@@ -79,8 +79,9 @@ class CrackFront:
         """(n, 3 + d) of this rank's cells that cracks have come into last and not left: when, which edge (two input
         nodes), and where, m."""
         graph, at = self._graph, self._record.at
-        cells, entry = self._entered(graph.cells_at(np.flatnonzero(at == np.nanmax(at, initial=-np.inf))))
-        if not len(cells):
+        newest = at == np.nanmax(at, initial=-np.inf)
+        cells, entry = self._entered(graph.cells_at(np.flatnonzero(newest)))
+        if not newest[graph.cell_edges[cells, entry]].any():  # what broke last led nowhere
             cells, entry = self._entered(np.flatnonzero((graph.pattern > 0) & ~graph.split))
         edges = graph.cell_edges[cells, entry]
         keys = self._domain.node_input[self._ends[edges]]
