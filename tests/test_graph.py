@@ -150,11 +150,11 @@ def test_pieces_are_followed(dim: int) -> None:
 @pytest.mark.parametrize("case", ("2d", "3d", "quadratic"))
 def test_pieces_are_those_of_scipy(on_ranks: OnRanks, case: str, ranks: int) -> None:
     """Some edges at a time, blocks first and at last all dust: SciPy's components of the input mesh each time, their
-    numbers alike on any number of ranks, without a search of all nodes at one look in two or more."""
+    numbers alike on any number of ranks, with a search of all nodes now and then."""
     same, count, searched = on_ranks(ranks)[0][f"parting-{case}"].T
     assert same.all() and count[0] < 5 and count[-1] > 100
     assert np.array_equal(count, on_ranks(1)[0][f"parting-{case}"][:, 1])
-    assert 0 < searched.sum() < 0.7 * len(searched)
+    assert 0 < searched.sum() < 0.9 * len(searched)
 
 
 @given(st.integers(0, 2**32 - 1))
