@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from fracsim.fracture.energy.along import Along
+from fracsim.fracture.energy.along import Alone, Along
 from fracsim.fracture.energy.around import pairs_within
 from fracsim.fracture.energy.cutting import cleave, line_cuts
 from fracsim.fracture.energy.front import advance
@@ -140,7 +140,7 @@ def test_a_straight_front_starts_at_griffiths_load(n: int) -> None:
 def test_the_force_along_a_front_is_that_of_what_is_near() -> None:
     """Tips that all release 3 J/m^2 have that, each along its own advance, however these differ; where it rises along
     the front a tip has the mean by sums written out; a front that goes the other way does not count; nor does a tip
-    that makes no crack, which has nothing."""
+    that makes no crack, which has nothing; nor has one whose force goes back, alone or with others."""
     rng = np.random.default_rng(4)
     n = 40
     point = np.column_stack([0.1 * rng.standard_normal(n), np.linspace(0, 5, n), np.zeros(n)])
@@ -151,6 +151,12 @@ def test_the_force_along_a_front_is_that_of_what_is_near() -> None:
     length = np.linalg.norm(ahead, axis=1)
     alike = np.linalg.norm(along(3.0 * ahead), axis=1)
     np.testing.assert_allclose(alike, np.where(np.arange(n) == 7, 0.0, 3.0))
+    assert not along(-3.0 * ahead).any()
+    alone = Alone(MPI.COMM_SELF)
+    alone.update(np.arange(n), point, ahead, radius)
+    back = np.where(np.arange(n) % 3 == 0, -50.0, 3.0)
+    apiece = np.where((back < 0) | (np.arange(n) == 7), 0.0, 3.0)
+    np.testing.assert_allclose(np.linalg.norm(alone(back[:, None] * ahead), axis=1), apiece)
     weight = np.maximum(1 - np.linalg.norm(point[:, None] - point[None], axis=2) / 1.3, 0.0) * length**2
     weight[:, 7] = 0.0
     expected = (weight @ rate / weight.sum(axis=1))[:, None] * ahead / length[:, None]

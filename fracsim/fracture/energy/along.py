@@ -40,10 +40,11 @@ class Alone:
         self._way = np.divide(ahead, length[:, None], out=np.zeros_like(ahead), where=self._front[:, None])
 
     def __call__(self, force: Values) -> Values:
-        """(n, 3) G along the advance of each tip, J/m^2, of the forces g on tips (n, 3); 0 of those of no front
+        """(n, 3) G along the advance of each tip, J/m^2, of the forces g on tips (n, 3); 0 of those of no front, and of
+        those whose advance would take energy: the force in their ball is that of tips on the crack's other side
         (collective)."""
         released, made = self._sums(np.where(self._front, np.einsum("nk,nk->n", force, self._ahead), 0.0))
-        return np.asarray(over(released, made)[:, None] * self._way)
+        return np.asarray(np.maximum(over(released, made), 0.0)[:, None] * self._way)
 
     def _sums(self, released: Values) -> tuple[Values, Values]:
         """(n,) g . a and |a|^2."""
