@@ -244,6 +244,17 @@ def test_a_top_keeps_its_energy_over_a_hundred_turns() -> None:
     assert kept(100, 100) < 1e-3
 
 
+def test_what_whirls_beside_others_does_not_change_how_they_turn() -> None:
+    """Each as it would alone, slow and fast, and one too fast to be found in so many rounds."""
+    rng = np.random.default_rng(2)
+    turn, size = Rotation.random(20, random_state=1).as_matrix(), rng.uniform(1.0, 3.0, (20, 3))
+    inverse, momentum = size[:, :, None] * np.eye(3), np.geomspace(1e-3, 1e3, 20)[:, None] * rng.normal(size=(20, 3))
+    together = tumbled(turn, inverse, momentum, np.full(20, 0.01))
+    for k in range(20):
+        alone = tumbled(turn[[k]], inverse[[k]], momentum[[k]], np.full(1, 0.01))
+        assert np.allclose(alone[0], together[k], rtol=0.0, atol=1e-14)
+
+
 def test_a_top_turns_as_euler_says() -> None:
     """I dw/dt = (I w) x w in the axes of the body, by an adaptive Runge-Kutta method: of second order in the step."""
     main = np.diag(TOP[0])

@@ -26,11 +26,13 @@ def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Valu
     if not len(turn):
         return turn
     angle = dt[:, None] * rotated(turn, inverse, momentum)
+    rows = np.arange(len(turn))
     for _ in range(ROUNDS):
-        halfway = Rotation.from_rotvec(angle / 2).as_matrix() @ turn
-        found = dt[:, None] * rotated(halfway, inverse, momentum)
-        change, angle = float(np.abs(found - angle).max()), found
-        if change < SAME:
+        halfway = Rotation.from_rotvec(angle[rows] / 2).as_matrix() @ turn[rows]
+        found = dt[rows, None] * rotated(halfway, inverse[rows], momentum[rows])
+        change, angle[rows] = np.abs(found - angle[rows]).max(axis=1), found
+        rows = rows[change >= SAME]
+        if not len(rows):
             break
     return np.asarray((Rotation.from_rotvec(angle) * Rotation.from_matrix(turn)).as_matrix())
 
