@@ -15,7 +15,7 @@ from fracsim.mechanics.contact.shapes import Sphere
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.mesh.split.skeleton import Skeleton
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.blows import Blows, Strain
+from fracsim.rigid.blows import Blows, Strain, _rows
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.geometry import Geometry
 from fracsim.rigid.hertz import Hertz
@@ -54,6 +54,14 @@ def go(stepper: RigidStepper, state: RigidState, end: float) -> RigidState:
 
 
 # --- blows and loads ---
+
+
+def test_rows_of_each_body_are_those_that_name_it() -> None:
+    """Among numbers in any order: as looked for one by one, in their order, none of what is not there."""
+    of = np.random.default_rng(0).integers(0, 9, 50)
+    wanted = np.array([2, 5, 8, 11])
+    for number, rows in zip(wanted, _rows(of, wanted), strict=True):
+        assert np.array_equal(rows, np.flatnonzero(of == number))
 
 
 def tau(first: Ints, second: Ints, speed: Values) -> Values:

@@ -100,14 +100,17 @@ class Blows:
         known, n = self._known, len(names)
         known.quiet = np.where(speed > 0, 0, np.minimum(known.quiet + 1, NEVER))
         received = _at_rest(touches, bodies, self._spread)
-        body, impulses = received.body, received.impulses
-        due = [self._blow(received, int(each), int(names[each]), float(speed[each]), float(time[each]))
-               for each in np.flatnonzero(speed)]  # fmt: skip
-        size = np.linalg.norm(impulses, axis=1) / self._step
-        borne = np.bincount(body, size, n)
+        size = np.linalg.norm(received.impulses, axis=1) / self._step
+        borne = np.bincount(received.body, size, n)
         loaded = (known.quiet > SETTLED) & (borne > GROWN * known.borne)
         known.borne[loaded] = borne[loaded]
-        return due + [self._load(received, int(each)) for each in np.flatnonzero(loaded)]
+        struck, pressed = np.flatnonzero(speed), np.flatnonzero(loaded)
+        new, before, rows = (
+            _rows(received.body, struck), _rows(known.on, names[struck]), _rows(received.body, pressed)
+        )  # fmt: skip
+        due = [self._blow(received, int(each), new[k], before[k], float(speed[each]), float(time[each]))
+               for k, each in enumerate(struck)]  # fmt: skip
+        return due + [self._load(received, int(each), rows[k]) for k, each in enumerate(pressed)]
 
     def keep(self, touches: Touches, bodies: Bodies, names: Ints) -> None:
         """What a step came to in the end, for the next one to compare with."""
@@ -195,18 +198,25 @@ class Blows:
 
     # --- strains ---
 
-    def _blow(self, received: _Received, body: int, name: int, speed: float, time: float) -> Strain:
-        new, before = received.body == body, self._known.on == name
+    def _blow(self, received: _Received, body: int, new: Ints, before: Ints, speed: float, time: float) -> Strain:
+        """Of rows `new` of what was received, and rows `before` of what is known."""
         still = self._known.gave[before] * (1 / self._step - 1 / time)
         force = np.concatenate([received.impulses[new] / time, still])
         points = np.concatenate([received.points[new], self._known.where[before]])
         spread = np.concatenate([received.spread[new], self._known.spread[before]])
         return Strain(body, points, force, _radius(spread, force), speed, time)
 
-    def _load(self, received: _Received, body: int) -> Strain:
-        mine = received.body == body
+    def _load(self, received: _Received, body: int, mine: Ints) -> Strain:
         force = np.asarray(received.impulses[mine] / self._step)
         return Strain(body, received.points[mine], force, _radius(received.spread[mine], force))
+
+
+def _rows(of: Ints, wanted: Ints) -> list[Ints]:
+    """Of each that is wanted (w,), where it stands among so many (k,)."""
+    order = np.argsort(of, kind="stable")
+    first = np.searchsorted(of[order], wanted)
+    last = np.searchsorted(of[order], wanted, side="right")
+    return [order[a:b] for a, b in zip(first, last, strict=True)]
 
 
 def _radius(spread: Values, force: Values) -> Values:
