@@ -253,13 +253,6 @@ class Balance:
         b = self._add_nodal(self._assembler.into(self._kept, self._work_at_supports))
         self.reactions[self.motion.owned] = b.array_r[self.motion.owned]
 
-    @contextmanager
-    def within(self, cells: npt.NDArray[np.bool_]) -> Iterator[None]:
-        """With forms over flagged owned cells alone, for as long as it lasts: `forces` are those of the nodes whose
-        cells these all are, and `potential` tells what they change (not collective)."""
-        with self._work.only(cells), self.stress.within(cells):
-            yield
-
     # --- tangent ---
 
     @property

@@ -16,7 +16,7 @@ import ufl
 
 from ..forms.balance import points_of_stress
 from ..forms.kinematics import deformation_gradient
-from .kernels import CellExpression, CellForm, cells_measure, point_expression, point_field
+from .kernels import CellForm, cells_measure, point_expression, point_field
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
@@ -32,7 +32,9 @@ class Positive:
     def __init__(self, stress: Stress) -> None:
         """Compiles (collective)."""
         domain, d = stress.domain, stress.domain.dim
-        self._moduli = moduli(stress)
+        F = ufl.variable(deformation_gradient(stress.u))
+        P = stress.remaining_stiffness_of_energy * ufl.diff(stress.energy.psi(F, stress.R), F)
+        self._moduli = point_expression(domain, ufl.diff(P, F))
         self._field = point_field(domain, (d * d, d * d), "what makes moduli positive")
         self._size = d * d
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
@@ -52,13 +54,6 @@ class Positive:
         C = self._field.x.array.reshape(-1, self._size, self._size)
         C[:] = 0.0
         C[points] = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
-
-
-def moduli(stress: Stress) -> CellExpression:
-    """A at the points where stress is integrated, Pa; compiles (collective)."""
-    F = ufl.variable(deformation_gradient(stress.u))
-    P = stress.remaining_stiffness_of_energy * ufl.diff(stress.energy.psi(F, stress.R), F)
-    return point_expression(stress.domain, ufl.diff(P, F))
 
 
 def least_pivots(A: Values) -> Values:

@@ -9,7 +9,6 @@ forms.plasticity          the elastic part of F, and what flow within a step tak
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
@@ -23,7 +22,7 @@ from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.simplices import local_edges
-from .kernels import CellForm, cells_measure
+from .kernels import CellForm, cells_measure, compile_form
 from .material import MaterialFields
 from .rotation import RotationField
 from .term import Form, Level, Term
@@ -87,7 +86,7 @@ class Stress(Term):
         self.symmetric = material.plastic is None or not material.plastic.frobenius
         self.linear = self.energy.linear and not self.closes and material.plastic is None
         whole = cells_measure(domain)
-        self._energy_form = CellForm(self._stored_energy(whole))
+        self._energy_form = compile_form(self._stored_energy(whole))
         self._alone = CellForm(self.work(ufl.TestFunction(domain.space), whole))
 
     # --- the energy and its fields ---
@@ -218,10 +217,6 @@ class Stress(Term):
     def stored(self) -> float:
         """int psi dX at the current u, this rank's share, J."""
         return float(fem.assemble_scalar(self._energy_form))
-
-    def within(self, chosen: Flags) -> AbstractContextManager[None]:
-        """With the energy of flagged owned cells alone, for as long as it lasts (not collective)."""
-        return self._energy_form.only(chosen)
 
     def potential(self) -> float | None:
         """int psi dX at the current u, J; None where the tangent is not symmetric, or steps are solved with their own

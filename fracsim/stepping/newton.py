@@ -23,7 +23,6 @@ from .stepper import SolveResult
 
 if TYPE_CHECKING:
     from .downhill import Downhill
-    from .stragglers import Stragglers
 
 Values = npt.NDArray[np.float64]
 
@@ -77,9 +76,6 @@ class Solver:
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._first = self._last_little = 0.0
-        self._waits = _waits(balance, chosen)
-        self._stragglers: Stragglers | None = None
-        self._taken = 0  # iterations of the attempt, and stops for stragglers, before its SNES set out once more
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
         self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
@@ -156,9 +152,8 @@ class Solver:
         if self._misled(result):
             if self._sets_out_anew:
                 start = self.balance.level.u
-            if self.snes.ksp.reason != PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:  # which is K's own doing
-                # Smoothers of an older tangent need not be positive for this one.
-                self.linear.preconditioner.due = Due.REBUILD
+            # Smoothers of an older tangent need not be positive for this one.
+            self.linear.preconditioner.due = Due.REBUILD
             if self.balance.conservative:
                 result = self._attempt_positively(start)
             else:
@@ -264,30 +259,16 @@ class Solver:
             if leg >= LEAST_LEGS and left > (LEGS - leg) * (before - left):
                 break
             self._rtol = ON_THE_WAY if left else self._own_rtol
-            its, solved = self._solve_waiting()
-            newton, krylov = newton + its, krylov + solved
-            if self.snes.reason <= 0 or not left:
-                return newton, krylov, False
-            self.balance.go_on()
-        return newton, krylov, True
-
-    def _solve_waiting(self) -> tuple[int, int]:
-        """Newton's method from x; what few nodes hold up is solved for on the way. Returns all iterations."""
-        newton, krylov, self._taken, stragglers = 0, 0, 0, self._stragglers
-        if stragglers is not None:
-            stragglers.begin()
-        while True:
             if self._down is not None:
                 self._down.descent.begin()
             if self.linear.forcing is not None:
                 self.linear.forcing.begin()
             self.snes.solve(None, self._x)
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
-            if stragglers is None or not stragglers.wait:
-                return newton, krylov
-            self._taken += self.snes.its + 1
-            stragglers.solve(self._last_little)
-            self._x.array_w[:] = self.balance.u.x.array[: self.balance.owned]
+            if self.snes.reason <= 0 or not left:
+                return newton, krylov, False
+            self.balance.go_on()
+        return newton, krylov, True
 
     def _solve_as_linear(self) -> SolveResult | None:
         """From x, where the balance is linear; None: not in a few solves, and Newton's method takes over."""
@@ -316,10 +297,6 @@ class Solver:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh the
         preconditioner at the next tangent, where that pays."""
         self.linear.preconditioner.damage_changed(broke)
-        if self._waits and self._stragglers is None:
-            from .stragglers import Stragglers
-
-            self._stragglers = Stragglers(self.balance)
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
@@ -344,7 +321,7 @@ class Solver:
 
         PETSc's own test against |r_0| alone asks for more and more digits as the first guess gets better.
         """
-        reason, its = PETSc.SNES.ConvergedReason, its + self._taken
+        reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norms[2]):
             return int(reason.DIVERGED_FNORM_NAN)
         if self._is_small(norms[2], its):
@@ -353,10 +330,6 @@ class Solver:
             return int(reason.DIVERGED_INNER)
         if self._down is not None and self.balance.scheme.inertia and self._down.stalls(norms[2], its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
-        if its >= snes.max_it:
-            return int(reason.DIVERGED_MAX_IT)
-        if self._stragglers is not None and self._stragglers.look():
-            return int(reason.CONVERGED_ITS)  # for now
         return int(reason.ITERATING)
 
     def _is_small(self, norm: float, its: int) -> bool:
@@ -379,11 +352,3 @@ class Solver:
             kept.destroy()
         if self._downhill is not None:
             self._downhill.destroy()
-
-
-def _waits(balance: Balance, chosen: Options) -> bool:
-    """Whether Newton's method may wait for stragglers: there is a potential to go down, moduli are those of cells, and
-    inertia holds what hangs."""
-    whole = balance.domain.order == 1 and not balance.limits_steps and not balance.is_incomplete
-    newton = chosen["snes_type"] == "newtonls" and balance.scheme.inertia
-    return bool(whole and newton and balance.conservative and not balance.linear)
