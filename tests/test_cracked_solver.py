@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from cases import BAR, study
-from fracsim.mechanics.balance import Balance
+from fracsim.mechanics.stiffness import Stiffness
 from fracsim.mechanics.tangent import Assembly
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping import blocks, loose_parts, preconditioner
@@ -143,20 +143,20 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
     blocks, to the last digits as with the tangent, be they assembled first or copied from single entries."""
     monkeypatch.setattr(blocks, "SMALL", 0)
     if not first:
-        monkeypatch.setattr(Balance, "tangent_in_blocks", lambda _: None)
+        monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
     assert isinstance(solver, Solver) and solver.linear._blocks is not None and solver.linear._blocks.first is first
     pc = solver.snes.ksp.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
-    tangent = scene.balance.tangent
+    tangent = scene.balance.stiffness.matrix
     x, alone = tangent.createVecs()
     x.setRandom()
     by_blocks, u = alone.duplicate(), scene.balance.u.x.array.copy()
     for factor in (1.0, 3.0):
         if first:
             scene.balance.displace(factor * u)
-            scene.balance.assemble_tangent(scene.balance.tangent, blocks_alone=True)
+            scene.balance.stiffness.assemble(blocks_alone=True)
             tangent = single_entries(scene)
         else:
             tangent.scale(factor)
@@ -170,7 +170,7 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
 def single_entries(scene: Scene) -> PETSc.Mat:
     """The tangent at the present displacement, assembled without blocks."""
     balance = scene.balance
-    other = Assembly(balance._tangent.form)
+    other = Assembly(balance.stiffness.form)
     other(balance.motion.bcs)
     balance.mass.add_to(other.matrix, balance.level.c_a)
     return other.matrix

@@ -10,9 +10,9 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
-from fracsim.mechanics.balance import Balance
 from fracsim.mechanics.flow_prediction import Extrapolated
 from fracsim.mechanics.kernels import CellForm
+from fracsim.mechanics.stiffness import Stiffness
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping.state import State
@@ -95,14 +95,14 @@ def test_a_smaller_tangent_is_the_same_one(case: str, dim: int) -> None:
     what is left changes."""
     scene, _ = damaged(case, dim)
     balance, tangent = scene.balance, dense_tangent(scene)
-    entries = balance.tangent.getInfo()["nz_used"]
+    entries = balance.stiffness.matrix.getInfo()["nz_used"]
     balance.damage_changed()
     alive = len(integrated_cells(scene)) / scene.domain.cell_count
-    assert not balance.shrink_tangent(alive - 0.01)
-    assert balance.shrink_tangent(alive + 0.01)
+    assert not balance.stiffness.shrink(alive - 0.01)
+    assert balance.stiffness.shrink(alive + 0.01)
     np.testing.assert_array_equal(dense_tangent(scene), tangent)
-    assert balance.tangent.getInfo()["nz_used"] < entries
-    assert not balance.shrink_tangent(1.0), "nothing died since"
+    assert balance.stiffness.matrix.getInfo()["nz_used"] < entries
+    assert not balance.stiffness.shrink(1.0), "nothing died since"
 
 
 def test_cells_that_are_back_find_room() -> None:
@@ -113,19 +113,19 @@ def test_cells_that_are_back_find_room() -> None:
     whole = dense_tangent(scene)
     chi[::2] = 0.0
     balance.damage_changed()
-    assert balance.shrink_tangent(1.0)
+    assert balance.stiffness.shrink(1.0)
     chi[:] = 0.5
     balance.damage_changed()
-    assert balance.shrink_tangent(0.0)
+    assert balance.stiffness.shrink(0.0)
     np.testing.assert_array_equal(dense_tangent(scene), whole)
 
 
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
 def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     """Every edge that breaks and every displacement are those of a run whose matrix keeps its size."""
-    fit, fitted, found = Balance.shrink_tangent, [], []
-    for choice in (lambda balance, share: fitted.append(fit(balance, share)) or fitted[-1], lambda *_: False):
-        monkeypatch.setattr(Balance, "shrink_tangent", choice)
+    fit, fitted, found = Stiffness.shrink, [], []
+    for choice in (lambda stiffness, share: fitted.append(fit(stiffness, share)) or fitted[-1], lambda *_: False):
+        monkeypatch.setattr(Stiffness, "shrink", choice)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.05, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.0]}],
@@ -134,7 +134,8 @@ def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.Monkey
             solver={"ksp_rtol": 1e-10, "snes_rtol": 1e-10},
         )
         march(scene, state)
-        found.append((state.u.copy(), scene.fracture.graph.broken.copy(), scene.balance.tangent.getInfo()["nz_used"]))
+        entries = scene.balance.stiffness.matrix.getInfo()["nz_used"]
+        found.append((state.u.copy(), scene.fracture.graph.broken.copy(), entries))
     (small, torn, entries), (kept, same, all_entries) = found
     assert any(fitted) and entries < all_entries
     assert torn.any() and np.array_equal(torn, same)
@@ -151,7 +152,7 @@ def test_a_consistent_mass_keeps_its_pattern() -> None:
     )
     march(scene, state)
     assert len(integrated_cells(scene)) < scene.domain.cell_count
-    assert not scene.balance.shrink_tangent(1.0)
+    assert not scene.balance.stiffness.shrink(1.0)
 
 
 def test_no_entry_is_kept_for_nothing() -> None:
@@ -160,12 +161,12 @@ def test_no_entry_is_kept_for_nothing() -> None:
     domain, chi = scene.domain, scene.balance.stress.chi.x.array
     chi[: domain.cell_count] = np.random.default_rng(6).uniform(size=domain.cell_count) < 0.2
     scene.balance.damage_changed()
-    assert scene.balance.shrink_tangent(1.0)
+    assert scene.balance.stiffness.shrink(1.0)
     pairs = np.eye(domain.node_count, dtype=bool)
     for nodes in domain.cell_nodes[chi[: domain.cell_count] > 0]:
         pairs[np.ix_(nodes, nodes)] = True
-    scene.balance.assemble_tangent(scene.balance.tangent)
-    assert scene.balance.tangent.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
+    scene.balance.stiffness.assemble()
+    assert scene.balance.stiffness.matrix.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
 
 
 def test_every_death_counts_from_all_cells() -> None:

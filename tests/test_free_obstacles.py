@@ -232,12 +232,12 @@ def test_the_condensed_tangent_is_the_derivative_of_the_force(scheme: str, width
     balance.begin(5e-3, 5e-3, state.u, state.v, state.a)
     u = balance.reachable(1e-4 * np.sin(1e3 * positions(scene)).reshape(-1))
     balance.displace(u)
-    K, x, y = balance.tangent, balance.vector.duplicate(), balance.vector.duplicate()
-    balance.assemble_tangent(K)
+    K, x, y = balance.stiffness.matrix, balance.vector.duplicate(), balance.vector.duplicate()
+    balance.stiffness.assemble()
     change, h = 1 + np.cos(np.arange(n)), 1e-8
     x.array_w[:] = change
     K.mult(x, y)
-    ((U, C),) = balance.low_rank
+    ((U, C),) = balance.stiffness.low_rank
     found = y.array_r - U @ (C @ (U.T @ change))
     sides = []
     for sign in (1, -1):

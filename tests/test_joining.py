@@ -253,10 +253,10 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, state, tethers = tied(2)
     balance = scene.balance
     balance.begin(0.1, 0.1, state.u, state.v, state.a)
-    K = balance.tangent
-    balance.assemble_tangent(K)
+    K = balance.stiffness.matrix
+    balance.stiffness.assemble()
     once = K.convert("dense").getDenseArray().copy() if K.comm.size == 1 else None
-    assert once is not None and not balance.couples
+    assert once is not None and not balance.stiffness.couples
     added = tethers.coupling()
     assert added is not None
     # a node and a corner of its cell that share no cell: nothing but the tie is there
@@ -265,8 +265,8 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert apart
     for corner in apart:
         assert once[2 * node, 2 * corner] == added.getValue(2 * node, 2 * corner) != 0.0
-    monkeypatch.setattr(type(balance), "_serves", lambda self, small: True)
-    balance.assemble_tangent(K)
+    monkeypatch.setattr(type(balance.stiffness), "_serves", lambda self, small: True)
+    balance.stiffness.assemble()
     np.testing.assert_array_equal(K.convert("dense").getDenseArray(), once)
 
 

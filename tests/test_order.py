@@ -258,8 +258,8 @@ def spectrum(dim: int, cells: int, order: int, mass: str) -> tuple[Values, float
     balance.look_at(0.0, state.u, state.v, dt=1.0)
     free = np.flatnonzero(balance.motion.free)
     K, M = (np.zeros((len(free), len(free))) for _ in range(2))
-    balance.assemble_tangent(balance.tangent)
-    K[:] = dense(balance.tangent)[np.ix_(free, free)]
+    balance.stiffness.assemble()
+    K[:] = dense(balance.stiffness.matrix)[np.ix_(free, free)]
     for column, dof in enumerate(free):
         M[:, column] = balance.mass.times(np.eye(1, balance.owned, dof)[0])[free]
     K -= balance.c_a * M

@@ -1,15 +1,13 @@
-"""The balance of forces of a body: a sum of terms, its residual and its tangent.
+"""The balance of forces of a body: a sum of terms, its residual, and what belongs to it at a state.
 
 r(u) = sum of the terms' virtual works  +  M (sum of their accelerations)  +  sum of their nodal forces
-K(u) = d r / d u
+K(u) = d r / d u (mechanics.stiffness)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -27,21 +25,12 @@ from .blow import Blow, given
 from .inertia import Mass
 from .kernels import CellForm, cells_measure
 from .prescribed_motion import PrescribedMotion
-from .stiff import Stiff
+from .stiffness import Stiffness
 from .stress import Stress
-from .tangent import Assembly
-from .term import Cuts, Form, Level, Term
+from .term import Cuts, Form, Level, Term, sum_of_forms
 from .vectors import Assembler
 
-if TYPE_CHECKING:
-    from .positive import Positive
-
 Values = npt.NDArray[np.float64]
-
-# of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
-STILL = 0.01
-# of a correction: where contact leaves less of it, the next one, which is the rest of it, is found with the same share
-CUT_SHORT = 0.5
 
 
 class Balance:
@@ -53,13 +42,12 @@ class Balance:
         motion: dofs whose motion is prescribed.    mass: the mass matrix.
         scheme: where in a step forces balance, and the rates there.    c_a, c_v: those of the last step.
         blow: how contact enters a step of that scheme.
-        pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
-        low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
-        springs: the rest of what it lacks.
-        couples: whether terms coupled dofs of different cells in the last tangent otherwise than by constants.
+        stiffness: its tangent; of implicit schemes alone.
         moves: how often u has been put elsewhere.
         reactions: (owned dofs,) r before rows of prescribed dofs are replaced; on those rows it is the reaction, N.
     """
+
+    stiffness: Stiffness
 
     def __init__(
         self,
@@ -80,16 +68,7 @@ class Balance:
         self.stress = next(term for term in terms if isinstance(term, Stress))
         self.motion, self.mass, self.scheme, self.blow = motion, mass, scheme, Blow.of(scheme)
         self.c_a, self.c_v = scheme.rates(step)
-        self._assembler, self._coupled, self.pattern_changed = assembler, False, False
-        self._mixed = False  # whether what is no constant has ever been added to the tangent's own entries
-        self._touches = True  # whether the tangent has contact in it
-        self._positive: Positive | None = None
-        self.low_rank: list[tuple[Values, Values]] = []
-        self.springs: list[Stiff] = []
-        self.couples = False
-        self._body_at: tuple[float | None, Values] | None = None  # where K was assembled in this attempt
-        self._went = 1.0  # share of the last correction
-        self._assembled: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
+        self._assembler = assembler
         self.moves = 0
         self.vector = assembler.vector()
         self._kept = assembler.vector()
@@ -103,15 +82,11 @@ class Balance:
         w, dx = ufl.TestFunction(domain.space), cells_measure(domain)
         self._work = CellForm(self._sum_of_works(w, dx))
         self._work_at_supports = CellForm(self._sum_of_works(w, cells_measure(domain, self._cells_at_supports())))
-        self._forms = [self._work, self._work_at_supports]
         if self.scheme.implicit:
-            v = ufl.TrialFunction(domain.space)
-            tangent = CellForm(_sum([term.tangent(v, w, dx) for term in self.terms]))
-            self._forms.append(tangent)
-            self._tangent = Assembly(tangent)
+            self.stiffness = Stiffness(self.u, self.terms, self.stress, self.motion, self.mass)
 
     def _sum_of_works(self, w: Expr, dx: ufl.Measure) -> Form:
-        return _sum([term.work(w, dx) for term in self.terms])
+        return sum_of_forms([term.work(w, dx) for term in self.terms])
 
     def _cells_at_supports(self) -> npt.NDArray[np.int32]:
         """Owned cells with a prescribed dof."""
@@ -151,6 +126,8 @@ class Balance:
     def _tell(self, level: Level, where: Values) -> None:
         self.level = level
         self.motion.set(where)
+        if self.scheme.implicit:
+            self.stiffness.c_v = level.c_v
         for term in self.terms:
             term.begin(level)
 
@@ -239,7 +216,7 @@ class Balance:
         otherwise take all of it and may turn inside out.
         """
         self.displace_to(x, prescribed=False)
-        apply_lifting(self._assembler.into_unsummed(b, self._work), self._tangent.form, self.motion.bcs, self.u)
+        apply_lifting(self._assembler.into_unsummed(b, self._work), self.stiffness.form, self.motion.bcs, self.u)
         self._add_nodal(self._assembler.summed(b))
         b.array_w[self.motion.owned] = 0.0
 
@@ -253,158 +230,28 @@ class Balance:
         b = self._add_nodal(self._assembler.into(self._kept, self._work_at_supports))
         self.reactions[self.motion.owned] = b.array_r[self.motion.owned]
 
-    # --- tangent ---
-
-    @property
-    def tangent(self) -> PETSc.Mat:
-        """The matrix of K, until `shrink_tangent` makes another."""
-        return self._tangent.matrix
-
-    def tangent_in_blocks(self) -> PETSc.Mat | None:
-        """The same in blocks of a node's dofs, which are assembled first from here on; None where terms, or a mass that
-        couples nodes, add to single entries (collective)."""
-        own = (Term.add_stiffness, Term.coupling, Term.low_rank)
-        adds = any(getattr(type(term), each.__name__) is not each for term in self.terms for each in own)
-        return None if adds or not self.mass.diagonal else self._tangent.use_blocks()
-
-    def bring_entries(self) -> None:
-        """Bring `tangent` to where its blocks are (collective)."""
-        self._tangent.bring()
-
-    def assemble_tangent(self, K: PETSc.Mat, *, small: float | None = None, blocks_alone: bool = False) -> None:
-        """K at the current u, rows and columns of prescribed dofs replaced by the identity's; `small`: with moduli
-        made positive to within that share of them; `blocks_alone`: where it has blocks, single entries are left for
-        `bring_entries` (collective).
-
-        A linear one is kept while damage and rates are what they were.
-        """
-        if not (self.linear and self._is_assembled(K, small)):
-            self._assemble_all(K, small)
-        if not blocks_alone:
-            self._tangent.bring()
-
-    def _assemble_all(self, K: PETSc.Mat, small: float | None) -> None:
-        served = self._serves(small)
-        if not served:
-            self._assemble_body(K, small)
-        self.springs, self.couples = [], False
-        for term in self.terms:
-            term.add_stiffness(K)
-            if self._touches and (coupling := term.coupling()) is not None and not (served and term.linear):
-                self._couple(K, coupling, constant=term.linear)
-        self.low_rank = [part for term in self.terms for part in term.low_rank()] if self._touches else []
-        for U, _ in self.low_rank:
-            U[self.motion.owned] = 0.0
-
-    def _assemble_body(self, K: PETSc.Mat, small: float | None) -> None:
-        """What K has without terms that add to it."""
-        if self._coupled:
-            K.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
-        more, factor = None if small is None else self._positive_moduli(small), sum(t.mass_factor for t in self.terms)
-        if self._tangent.blocks is not None:
-            self._tangent(self.motion.bcs, more, factor * self.mass.lumped)
-        else:
-            self._tangent(self.motion.bcs, more)
-            if factor:
-                self.mass.add_to(K, factor)
-        self._body_at = (small, self.u.x.array[: self.owned].copy()) if self._alone else None
-
-    def _serves(self, small: float | None) -> bool:
-        """Whether the last K of this attempt is the body's own, and it has hardly moved since (collective).
-
-        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier. And
-        while they come into touch, one after another, a correction is found again and again.
-        """
-        if self._body_at is None or self._mixed or not self.couples or self._body_at[0] != small:
-            return False
-        if self._went < CUT_SHORT:
-            return True
-        moved = float(np.abs(self.u.x.array[: self.owned] - self._body_at[1]).max(initial=0.0))
-        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= STILL * self.domain.mean_edge)
-
-    @cached_property
-    def _alone(self) -> bool:
-        """Whether all that terms add to K is beside it, or a coupling, and the body's share follows from u alone."""
-        within = any(type(term).add_stiffness is not Term.add_stiffness for term in self.terms)
-        return self.limits_steps and self.conservative and not within
-
-    def _positive_moduli(self, small: float) -> fem.Form:
-        """What makes the moduli positive at the current u."""
-        if self._positive is None:
-            from .positive import Positive
-
-            self._positive = Positive(self.stress)
-            self._forms.append(self._positive.form)
-            self._leave_out_dead(self._positive.form)
-        self._positive.update(small)
-        return self._positive.form
-
-    def _is_assembled(self, K: PETSc.Mat, small: float | None) -> bool:
-        """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
-        fields = [field.x.array for field in self.stress.fields]
-        rates = K.handle, small, sum(term.mass_factor for term in self.terms), self.c_v
-        was = self._assembled
-        same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
-        if not same:
-            self._assembled = rates, [field.copy() for field in fields]
-        return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
-
-    @contextmanager
-    def untouched(self) -> Iterator[None]:
-        """The tangent of a body that touches nothing."""
-        self._touches = False
-        yield
-        self._touches = True
-
-    def _couple(self, K: PETSc.Mat, coupling: PETSc.Mat | Stiff, *, constant: bool) -> None:
-        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it. What is
-        `constant` stays in K while the body's share does (collective)."""
-        self.couples |= not constant
-        if isinstance(coupling, Stiff):
-            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-            coupling.directions[self.motion.owned] = 0.0
-            self.springs.append(coupling)
-            return
-        before = K.getInfo()["nz_used"]
-        part = coupling.copy()
-        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        part.destroy()
-        self._coupled, self._mixed = True, self._mixed or not constant
-        self.pattern_changed |= bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
-
-    @cached_property
-    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
-        """Global numbers of the prescribed dofs of this rank."""
-        first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
-        return np.asarray(self.motion.owned + first * d, PETSc.IntType)
-
-    @property
-    def is_incomplete(self) -> bool:
-        """Whether K may lack `low_rank` or `springs`."""
-        return any(term.beside for term in self.terms)
-
     @cached_property
     def limits_steps(self) -> bool:
         """Whether a term has a say in how long a step of Newton's method is."""
-        return any(type(term).longest_step is not Term.longest_step for term in self.terms)
+        return any(term.limits_steps for term in self.terms)
 
     def acts(self) -> bool:
         """Whether a term that limits steps has a potential at the current u (collective)."""
-        limiting = (term for term in self.terms if type(term).longest_step is not Term.longest_step)
+        limiting = (term for term in self.terms if term.limits_steps)
         return bool(total(self.domain.comm, sum(abs(term.potential() or 0.0) for term in limiting))[0] > 0)
 
     def set_out(self) -> None:
         """Newton's method sets out on the step, once more where it has failed before."""
-        self._body_at, self._went = None, 1.0
+        self.stiffness.set_out()
         for term in self.terms:
             term.set_out()
 
     def longest_step(self, change: Values) -> float:
         """Largest share of a change of u (owned dofs,) that all terms allow (collective)."""
         share = min(term.longest_step(change) for term in self.terms)
-        self._went = float(self.domain.comm.allreduce(share, op=MPI.MIN))
-        return self._went
+        share = float(self.domain.comm.allreduce(share, op=MPI.MIN))
+        self.stiffness.went(share)
+        return share
 
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that Newton's method may start from: the step's start where there is no
@@ -509,18 +356,11 @@ class Balance:
         """Cells lost stiffness: those without any stress are not integrated from here on (not collective)."""
         for term in self.terms:
             term.damage_changed()
-        for form in self._forms:
-            self._leave_out_dead(form)
-
-    def _leave_out_dead(self, form: CellForm) -> None:
         if (dead := self.stress.stressless) is not None:
-            form.leave_out(dead)
-
-    def shrink_tangent(self, share: float) -> bool:
-        """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a
-        new matrix (collective)."""
-        dead = self.stress.stressless
-        return dead is not None and self.mass.diagonal and self._tangent.fit(dead, share)
+            self._work.leave_out(dead)
+            self._work_at_supports.leave_out(dead)
+        if self.scheme.implicit:
+            self.stiffness.damage_changed()
 
     # --- figures ---
 
@@ -565,10 +405,4 @@ class Balance:
         for kept in (self.vector, self._kept, self._assembler, self.mass, *self.terms):
             kept.destroy()
         if self.scheme.implicit:
-            self._tangent.destroy()
-
-
-def _sum(forms: list[Form]) -> Form:
-    """The sum of those that are not 0, in their order."""
-    present = [form for form in forms if form != 0]
-    return sum(present[1:], present[0])
+            self.stiffness.destroy()

@@ -156,6 +156,11 @@ class Term:
         """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0
 
+    @property
+    def limits_steps(self) -> bool:
+        """Whether it has a say in how long a step of Newton's method is."""
+        return type(self).longest_step is not Term.longest_step
+
     def reachable(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u, m, changed to one that Newton's method may start from (collective)."""
         return u
@@ -244,3 +249,9 @@ class Term:
 
     def damage_changed(self) -> None:
         """Edges broke, or cells lost stiffness. Not collective."""
+
+
+def sum_of_forms(forms: list[Form]) -> Form:
+    """The sum of those that are not 0, in their order."""
+    present = [form for form in forms if form != 0]
+    return sum(present[1:], present[0])

@@ -42,7 +42,7 @@ class Downhill:
 
     @property
     def small(self) -> float | None:
-        """Of the tangent at the present iterate (Balance.assemble_tangent); None: it is exact."""
+        """Of the tangent at the present iterate (Stiffness.assemble); None: it is exact."""
         if self._how is None:
             return None
         exact_below, small = self._how

@@ -54,10 +54,12 @@ class Factors:
         preconditioner.pc = self._pc = self._pc or self._made(ksp)
         preconditioner.keep = False
         ksp.setType("preonly")
-        yield
-        ksp.setType(kind)
-        ksp.setPC(iterative)
-        preconditioner.pc, preconditioner.due, preconditioner.keep = iterative, Due.REBUILD, True
+        try:
+            yield
+        finally:
+            ksp.setType(kind)
+            ksp.setPC(iterative)
+            preconditioner.pc, preconditioner.due, preconditioner.keep = iterative, Due.REBUILD, True
 
     def forget(self) -> None:
         """Give their memory back (collective)."""

@@ -67,8 +67,9 @@ class Linear:
         small: Callable[[], float | None],
     ) -> None:
         """`given`: of the study, `chosen`: with the defaults; `small`: how positive K is made at the present u
-        (Balance.assemble_tangent). InputError where PETSc does not take an option (collective)."""
-        self.balance, self.ksp, self._smallness, self.failures = balance, ksp, small, 0
+        (Stiffness.assemble). InputError where PETSc does not take an option (collective)."""
+        self.balance, self.stiffness, self.ksp, self._smallness = balance, balance.stiffness, ksp, small
+        self.failures = 0
         self._small: float | None = None  # of the last tangent
         self._blocks: Blocks | None = None  # of the tangent
         self._products: PETSc.Mat | None = None  # a matrix of them
@@ -81,7 +82,7 @@ class Linear:
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given), loosen=self._loosen,
-            bring=balance.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
+            bring=self.stiffness.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self.linearly = is_linear(balance, given, ksp.getType())
@@ -92,9 +93,9 @@ class Linear:
         )
 
     def _set_up_at_rest(self) -> None:
-        self._assemble(self.balance.tangent)
-        self.balance.bring_entries()
-        self.ksp.setOperators(self.balance.tangent)
+        self._assemble()
+        self.stiffness.bring_entries()
+        self.ksp.setOperators(self.stiffness.matrix)
         self.ksp.setUp()
 
     # --- what K is kept in ---
@@ -102,23 +103,23 @@ class Linear:
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
         self._use_blocks()
-        self.operator = self._products or self.balance.tangent
-        if self.balance.is_incomplete:
+        self.operator = self._products or self.stiffness.matrix
+        if self.stiffness.is_incomplete:
             from .condensed import Condensed
 
-            parts, springs = (lambda: self.balance.low_rank), (lambda: self.balance.springs)
+            parts, springs = (lambda: self.stiffness.low_rank), (lambda: self.stiffness.springs)
             self.operator = Condensed(self.operator, parts, springs).matrix()
         if self._near_null is not None:
-            self.balance.tangent.setNearNullSpace(self._near_null)
+            self.stiffness.matrix.setNearNullSpace(self._near_null)
 
     def _use_blocks(self) -> None:
         """Multiply with the tangent in blocks, where that is quicker."""
         if self._blocks is not None:
             self._blocks.forget()
             self._blocks = self._products = None
-        if self._by_blocks and worth_it(self.balance.tangent):
-            blocks = self.balance.tangent_in_blocks()
-            self._blocks = Blocks(self.balance.tangent, blocks)
+        if self._by_blocks and worth_it(self.stiffness.matrix):
+            blocks = self.stiffness.in_blocks()
+            self._blocks = Blocks(self.stiffness.matrix, blocks)
             self._products = self._blocks.matrix()
 
     def shrink(self) -> bool:
@@ -126,7 +127,7 @@ class Linear:
         preconditioner = self.preconditioner
         preconditioner.look()
         everything = preconditioner.due == Due.REBUILD
-        if preconditioner.due == Due.NOTHING or not self.balance.shrink_tangent(1.0 if everything else SHRINK_BELOW):
+        if preconditioner.due == Due.NOTHING or not self.stiffness.shrink(1.0 if everything else SHRINK_BELOW):
             return False
         self._take_tangent()
         preconditioner.due = Due.REBUILD
@@ -134,43 +135,43 @@ class Linear:
 
     # --- K at the present u ---
 
-    def _assemble(self, tangent: PETSc.Mat) -> None:
+    def _assemble(self) -> None:
         self._small = self._smallness()
-        self.balance.assemble_tangent(tangent, small=self._small, blocks_alone=True)
+        self.stiffness.assemble(small=self._small, blocks_alone=True)
 
     def linearise(self, norm: float, little: float) -> None:
         """K at an iterate of Newton's method, and how exactly it is solved with: |r| there is `norm`, N, that of a
         solution `little` (collective)."""
-        forcing, tangent = self.forcing, self.balance.tangent
+        forcing = self.forcing
         if forcing is None:
-            self._assemble_tangent(tangent)
+            self._assemble_tangent()
             return
         self.preconditioner.its = forcing.iterations(self.ksp.its)
         if isinstance(forcing, Sparing):
             kept = forcing.reach(norm, little) and self._small == self._smallness()
             if not kept:
-                self._assemble_tangent(tangent)
+                self._assemble_tangent()
             self.ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
             return
-        self._assemble_tangent(tangent)
-        self.ksp.setTolerances(rtol=forcing.rough(norm, little) if self.balance.couples else forcing.exact())
+        self._assemble_tangent()
+        self.ksp.setTolerances(rtol=forcing.rough(norm, little) if self.stiffness.couples else forcing.exact())
 
-    def _assemble_tangent(self, tangent: PETSc.Mat) -> None:
+    def _assemble_tangent(self) -> None:
         """K and what its preconditioner is due."""
-        self._assemble(tangent)
+        self._assemble()
         if self._blocks is not None:
             self._blocks.follow()
-        if (self.balance.low_rank or self.balance.springs) and self.ksp.getType() == "preonly":
+        if (self.stiffness.low_rank or self.stiffness.springs) and self.ksp.getType() == "preonly":
             self.ksp.setType("gmres")  # factors are of the rest
-        if self.balance.pattern_changed:
-            self.preconditioner.due, self.balance.pattern_changed = Due.REBUILD, False
-        self.preconditioner.refresh(tangent, self._products)
+        if self.stiffness.pattern_changed:
+            self.preconditioner.due, self.stiffness.pattern_changed = Due.REBUILD, False
+        self.preconditioner.refresh(self.stiffness.matrix, self._products)
         self._hold()
 
     def _hold(self) -> None:
         """Precondition with the body's springs as well, where there are any."""
         body = self.preconditioner.serving
-        springs = [each for each in self.balance.springs if len(each.stiffness)]
+        springs = [each for each in self.stiffness.springs if len(each.stiffness)]
         if not springs:
             self.ksp.setPC(body)
             return
@@ -190,8 +191,10 @@ class Linear:
     def set_up_anew(self) -> Iterator[None]:
         """With a preconditioner that is made anew at every tangent."""
         self.preconditioner.due, self.preconditioner.keep = Due.REBUILD, False
-        yield
-        self.preconditioner.keep = self.iterative
+        try:
+            yield
+        finally:
+            self.preconditioner.keep = self.iterative
 
     # --- solves by themselves ---
 
@@ -210,7 +213,7 @@ class Linear:
         with_factors = [False, True] if self.may_factorise() else [False]
         for factors in with_factors[1:] if directly else with_factors:
             self.balance.vector.array_w[:] = force
-            with self.balance.untouched(), self.factors.of(self.ksp) if factors else nullcontext():
+            with self.stiffness.untouched(), self.factors.of(self.ksp) if factors else nullcontext():
                 solved = self.solve()
             if solved:
                 return np.asarray(self.correction.array_r.copy())
@@ -229,12 +232,12 @@ class Linear:
 
     def solve(self) -> bool:
         """K correction = balance.vector at the present u; whether it was solved."""
-        tangent, ksp = self.balance.tangent, self.ksp
-        self._assemble_tangent(tangent)
+        ksp = self.ksp
+        self._assemble_tangent()
         self.preconditioner.its = None
         if self.forcing is not None:
             ksp.setTolerances(rtol=self.forcing.exact())
-        ksp.setOperators(self.operator, tangent)
+        ksp.setOperators(self.operator, self.stiffness.matrix)
         ksp.solve(self.balance.vector, self.correction)
         return bool(ksp.reason > 0)
 
@@ -243,10 +246,10 @@ class Linear:
         KSP does it: |r| that is left, infinite where nothing is known, and iterations; None: it was not solved."""
         if self._ending is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve() else None
-        ending, tangent, preconditioner = self._ending, self.balance.tangent, self.preconditioner
+        ending, tangent, preconditioner = self._ending, self.stiffness.matrix, self.preconditioner
         if self._asked:
             little = min(little, self._asked * self.balance.vector.norm())
-        self._assemble_tangent(tangent)
+        self._assemble_tangent()
         products = self._products or tangent
         solved = ending.solve(products, tangent, preconditioner.serving, self.balance.vector, self.correction, little)
         preconditioner.its = ending.to_share(float(self.ksp.rtol))

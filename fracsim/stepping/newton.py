@@ -91,7 +91,7 @@ class Solver:
         for snes in self._made:
             snes.setJacobian(
                 lambda *_: linear.linearise(self.snes.getFunctionNorm(), self._last_little),
-                linear.operator, self.balance.tangent,
+                linear.operator, self.balance.stiffness.matrix,
             )  # fmt: skip
 
     @property
@@ -143,8 +143,10 @@ class Solver:
     def _to_the_end(self) -> Iterator[None]:
         """However dear iterations get."""
         watched, self._choice.watches = self._choice.watches, False
-        yield
-        self._choice.watches = watched
+        try:
+            yield
+        finally:
+            self._choice.watches = watched
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)

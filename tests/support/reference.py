@@ -52,8 +52,8 @@ def dense_tangent(scene: Scene, *, small: float | None = None) -> Values:
     balance = scene.balance
     x = balance.vector.duplicate()
     x.array_w[:] = balance.u.x.array
-    balance.assemble_tangent(balance.tangent, small=small)
-    matrix = balance.tangent.copy()
+    balance.stiffness.assemble(small=small)
+    matrix = balance.stiffness.matrix.copy()
     dense = matrix.convert(PETSc.Mat.Type.DENSE).getDenseArray().copy()
     x.destroy()
     return dense - (balance.c_a * np.diag(balance.mass.lumped) if balance.scheme.inertia else 0.0)

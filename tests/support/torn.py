@@ -189,10 +189,10 @@ def dead_cells() -> Found:
     found: Found = {}
     for name in ("with", "without", "fitted-without", "blocks-without", "brought-without"):
         if name.startswith("fitted"):
-            assert balance.shrink_tangent(0.7)
-        blocks = balance.tangent_in_blocks() if name.startswith(("blocks", "brought")) else None
-        balance.assemble_tangent(balance.tangent, blocks_alone=name.startswith("blocks"))
-        (balance.tangent if blocks is None or name.startswith("brought") else blocks).mult(x, y)
+            assert balance.stiffness.shrink(0.7)
+        blocks = balance.stiffness.in_blocks() if name.startswith(("blocks", "brought")) else None
+        balance.stiffness.assemble(blocks_alone=name.startswith("blocks"))
+        (balance.stiffness.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
         found[f"residual-{name}-dead"] = domain.gather_nodes(balance.forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
@@ -218,19 +218,19 @@ def hanging() -> Found:
     assert chi is not None
     chi.x.array[: domain.cell_count] = whole
     balance.begin(1e3, 1e3, state.u, state.v, state.a)
-    balance.assemble_tangent(balance.tangent)
+    balance.stiffness.assemble()
     jacobi = PETSc.PC().create(domain.comm)
     jacobi.setType("jacobi")
-    jacobi.setOperators(balance.tangent)
+    jacobi.setOperators(balance.stiffness.matrix)
     count, part = parts_of_nodes(domain, whole)
     loose = loose_parts(balance, jacobi)
-    assert loose is not None and loose.follow(balance.tangent)
+    assert loose is not None and loose.follow(balance.stiffness.matrix)
     x = domain.nodes[: domain.node_count]
     turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
     turned[~balance.motion.free.reshape(-1, 3)] = 0.0
     a, b = balance.vector.duplicate(), balance.vector.duplicate()
     a.array_w[:] = turned.reshape(-1)
-    balance.tangent.mult(a, b)
+    balance.stiffness.matrix.mult(a, b)
     loose.pc.apply(b, a)
     b.array_w[:] = np.cos(1e3 * x).reshape(-1)
     found = {"hanging-turned": turned, "hanging-found": a.array_r.reshape(-1, 3).copy(), "hanging-part": part}

@@ -1,0 +1,247 @@
+"""The tangent of a balance of forces, K(u) = d r / d u: when it is assembled, and what is kept beside its matrix.
+
+What terms give as forms is assembled cell by cell (mechanics.tangent). What couples nodes of different cells is added
+to that, or kept beside it as products of few vectors or as springs, where it would fill the matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..mesh.ranks import total
+from .inertia import Mass
+from .kernels import CellForm, cells_measure
+from .prescribed_motion import PrescribedMotion
+from .stiff import Stiff
+from .stress import Stress
+from .tangent import Assembly
+from .term import Term, sum_of_forms
+
+if TYPE_CHECKING:
+    from .positive import Positive
+
+Values = npt.NDArray[np.float64]
+
+# of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
+STILL = 0.01
+# of a correction: where contact leaves less of it, the next one, which is the rest of it, is found with the same share
+CUT_SHORT = 0.5
+
+
+class Stiffness:
+    """K of a balance, rows and columns of prescribed dofs replaced by the identity's.
+
+    Attributes:
+        form: of what K is the assembly of.    c_v: rate of the scheme that it is assembled with, 1/s.
+        pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
+        low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
+        springs: the rest of what it lacks.
+        couples: whether terms coupled dofs of different cells in the last tangent otherwise than by constants.
+    """
+
+    def __init__(
+        self, u: fem.Function, terms: Sequence[Term], stress: Stress, motion: PrescribedMotion, mass: Mass
+    ) -> None:
+        """Compiles what the forms of the terms add up to (collective)."""
+        self.domain, self.c_v = stress.domain, 0.0
+        self._u, self._terms, self._stress, self._motion, self._mass = u, terms, stress, motion, mass
+        self._owned = u.x.index_map.size_local * u.x.block_size
+        self.pattern_changed, self.couples = False, False
+        self.low_rank: list[tuple[Values, Values]] = []
+        self.springs: list[Stiff] = []
+        self._coupled = False  # whether a coupling has ever been added
+        self._mixed = False  # whether what is no constant has ever been added to the tangent's own entries
+        self._touches = True  # whether the tangent has contact in it
+        self._positive: Positive | None = None
+        self._body_at: tuple[float | None, Values] | None = None  # where K was assembled in this attempt
+        self._went = 1.0  # share of the last correction
+        self._last: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
+        v, w, dx = ufl.TrialFunction(self.domain.space), ufl.TestFunction(self.domain.space), cells_measure(self.domain)
+        self.form = CellForm(sum_of_forms([term.tangent(v, w, dx) for term in terms]))
+        self._assembly = Assembly(self.form)
+
+    # --- what K is kept in ---
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """That of K, until `shrink` makes another."""
+        return self._assembly.matrix
+
+    def in_blocks(self) -> PETSc.Mat | None:
+        """The same in blocks of a node's dofs, which are assembled first from here on; None where terms, or a mass that
+        couples nodes, add to single entries (collective)."""
+        own = (Term.add_stiffness, Term.coupling, Term.low_rank)
+        adds = any(getattr(type(term), each.__name__) is not each for term in self._terms for each in own)
+        return None if adds or not self._mass.diagonal else self._assembly.use_blocks()
+
+    def bring_entries(self) -> None:
+        """Bring `matrix` to where its blocks are (collective)."""
+        self._assembly.bring()
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether K may lack `low_rank` or `springs`."""
+        return any(term.beside for term in self._terms)
+
+    def damage_changed(self) -> None:
+        """Cells lost stiffness: those without any stress are not integrated from here on (not collective)."""
+        self._leave_out_dead(self.form)
+        if self._positive is not None:
+            self._leave_out_dead(self._positive.form)
+
+    def _leave_out_dead(self, form: CellForm) -> None:
+        if (dead := self._stress.stressless) is not None:
+            form.leave_out(dead)
+
+    def shrink(self, share: float) -> bool:
+        """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a
+        new matrix (collective)."""
+        dead = self._stress.stressless
+        return dead is not None and self._mass.diagonal and self._assembly.fit(dead, share)
+
+    # --- a solve ---
+
+    def set_out(self) -> None:
+        """Newton's method sets out on the step, once more where it has failed before."""
+        self._body_at, self._went = None, 1.0
+
+    def went(self, share: float) -> None:
+        """u went that share of a correction."""
+        self._went = share
+
+    @contextmanager
+    def untouched(self) -> Iterator[None]:
+        """That of a body that touches nothing."""
+        self._touches = False
+        try:
+            yield
+        finally:
+            self._touches = True
+
+    def assemble(self, *, small: float | None = None, blocks_alone: bool = False) -> None:
+        """K at the current u; `small`: with moduli made positive to within that share of them; `blocks_alone`: where it
+        has blocks, single entries are left for `bring_entries` (collective).
+
+        A linear one is kept while damage and rates are what they were.
+        """
+        if not (self._linear and self._is_assembled(small)):
+            self._assemble_all(small)
+        if not blocks_alone:
+            self._assembly.bring()
+
+    def _assemble_all(self, small: float | None) -> None:
+        served = self._serves(small)
+        if not served:
+            self._assemble_body(small)
+        self.springs, self.couples = [], False
+        for term in self._terms:
+            term.add_stiffness(self.matrix)
+            if self._touches and (coupling := term.coupling()) is not None and not (served and term.linear):
+                self._couple(coupling, constant=term.linear)
+        self.low_rank = [part for term in self._terms for part in term.low_rank()] if self._touches else []
+        for U, _ in self.low_rank:
+            U[self._motion.owned] = 0.0
+
+    # --- the body's share ---
+
+    def _assemble_body(self, small: float | None) -> None:
+        """What K has without terms that add to it."""
+        if self._coupled:
+            self.matrix.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
+        more = None if small is None else self._positive_moduli(small)
+        factor = sum(term.mass_factor for term in self._terms)
+        if self._assembly.blocks is not None:
+            self._assembly(self._motion.bcs, more, factor * self._mass.lumped)
+        else:
+            self._assembly(self._motion.bcs, more)
+            if factor:
+                self._mass.add_to(self.matrix, factor)
+        self._body_at = (small, self._displacement.copy()) if self._alone else None
+
+    @property
+    def _displacement(self) -> Values:
+        return np.asarray(self._u.x.array[: self._owned])
+
+    def _serves(self, small: float | None) -> bool:
+        """Whether the last K of this attempt is the body's own, and it has hardly moved since (collective).
+
+        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier. And
+        while they come into touch, one after another, a correction is found again and again.
+        """
+        if self._body_at is None or self._mixed or not self.couples or self._body_at[0] != small:
+            return False
+        if self._went < CUT_SHORT:
+            return True
+        moved = float(np.abs(self._displacement - self._body_at[1]).max(initial=0.0))
+        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= STILL * self.domain.mean_edge)
+
+    @cached_property
+    def _alone(self) -> bool:
+        """Whether all that terms add to K is beside it, or a coupling, and the body's share follows from u alone."""
+        within = any(type(term).add_stiffness is not Term.add_stiffness for term in self._terms)
+        limited = any(term.limits_steps for term in self._terms)
+        return limited and all([term.potential() is not None for term in self._terms]) and not within
+
+    def _positive_moduli(self, small: float) -> fem.Form:
+        """What makes the moduli positive at the current u."""
+        if self._positive is None:
+            from .positive import Positive
+
+            self._positive = Positive(self._stress)
+            self._leave_out_dead(self._positive.form)
+        self._positive.update(small)
+        return self._positive.form
+
+    @cached_property
+    def _linear(self) -> bool:
+        return all(term.linear for term in self._terms)
+
+    def _is_assembled(self, small: float | None) -> bool:
+        """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
+        fields = [field.x.array for field in self._stress.fields]
+        rates = self.matrix.handle, small, sum(term.mass_factor for term in self._terms), self.c_v
+        was = self._last
+        same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
+        if not same:
+            self._last = rates, [field.copy() for field in fields]
+        return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
+
+    # --- what couples nodes of different cells ---
+
+    def _couple(self, coupling: PETSc.Mat | Stiff, *, constant: bool) -> None:
+        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it. What is
+        `constant` stays in K while the body's share does (collective)."""
+        self.couples |= not constant
+        if isinstance(coupling, Stiff):
+            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            coupling.directions[self._motion.owned] = 0.0
+            self.springs.append(coupling)
+            return
+        K = self.matrix
+        before = K.getInfo()["nz_used"]
+        part = coupling.copy()
+        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        part.destroy()
+        self._coupled, self._mixed = True, self._mixed or not constant
+        self.pattern_changed |= bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+
+    @cached_property
+    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
+        """Global numbers of the prescribed dofs of this rank."""
+        first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
+        return np.asarray(self._motion.owned + first * d, PETSc.IntType)
+
+    def destroy(self) -> None:
+        """Give the memory of PETSc's objects back."""
+        self._assembly.destroy()
