@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.contacts import Contacts
-from fracsim.rigid.crowd import Crowd, _bound, projected
+from fracsim.rigid.crowd import Crowd, projected
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.model import Rules
 from support.falling import CUBE, DOWN, MASS, cubes
@@ -23,7 +23,7 @@ Values = npt.NDArray[np.float64]
 def test_the_nearest_of_a_cone_is_where_what_is_left_is_at_right_angles() -> None:
     """Moreau: p = a + b with a in the cone |a_t| <= mu a_n, b in its polar cone, mu |b_t| <= -b_n, and a . b = 0."""
     p, mu = np.random.default_rng(0).normal(size=(3, 500)), np.linspace(0.0, 2.0, 500)
-    near = projected(p, mu)
+    near = projected(p.T, mu).T
     left = p - near
     assert np.all(np.hypot(near[1], near[2]) <= mu * near[0] + 1e-12)
     assert np.all(mu * np.hypot(left[1], left[2]) <= -left[0] + 1e-12)
@@ -57,10 +57,10 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
     gives mu times its pressure against the slip; bodies get what contacts give, by sums that share no code with it."""
     contacts, bodies = pile(friction)
     aim = np.random.default_rng(4).uniform(0.0, 0.3, len(contacts))
-    crowd = Crowd.of(contacts, bodies.mass, np.linalg.inv(bodies.inertia))
     still = np.zeros((1, 3))
     free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
-    p = crowd.impulses(free, aim, 1e-7, 5000, np.zeros_like(free))
+    crowd = Crowd.of(contacts, free, aim, bodies.mass, np.linalg.inv(bodies.inertia))
+    p = crowd.impulses(1e-7, 5000, np.zeros_like(free))
     velocity, spin = np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still])
     for (first, second), at, axes, each in zip(contacts.things, contacts.point, contacts.axes, p, strict=True):
         for body, sign in ((first, -1.0), (second, 1.0)):
@@ -99,7 +99,8 @@ def test_no_step_of_a_crowd_is_too_long() -> None:
     """J M^-1 J^T <= D: by the eigenvalues of the dense matrix, its rows from moments of single forces; and D is not as
     many times too large as bodies have contacts."""
     contacts, bodies = pile(0.3)
-    crowd, k = Crowd.of(contacts, bodies.mass, np.linalg.inv(bodies.inertia)), len(contacts)
+    k = len(contacts)
+    crowd = Crowd.of(contacts, np.zeros((k, 3)), np.zeros(k), bodies.mass, np.linalg.inv(bodies.inertia))
     across = np.zeros((3, k, 36, 6))
     for number, (things, at, axes) in enumerate(zip(contacts.things, contacts.point, contacts.axes, strict=True)):
         for body, sign in zip(things, (-1.0, 1.0), strict=True):
@@ -107,7 +108,7 @@ def test_no_step_of_a_crowd_is_too_long() -> None:
                 turning = np.cross(at - bodies.place[body], axes)
                 across[:, number, body] = sign * np.concatenate([axes, turning], axis=1)
     weight = np.concatenate([np.tile(1 / bodies.mass, (3, 1)), np.tile(1 / bodies.inertia[:, 0, 0], (3, 1))]).T
-    scaled = (across * np.sqrt(weight)).reshape(3, k, -1) / np.sqrt(_bound(crowd.rows, crowd.things, 36))[:, None]
+    scaled = (across * np.sqrt(weight)).reshape(3, k, -1) / np.sqrt(crowd.bound())[:, None]
     most = np.linalg.svd(scaled.reshape(3 * k, -1), compute_uv=False)[0] ** 2
     assert 0.4 < most <= 1 + 1e-12
     assert np.bincount(contacts.things.ravel())[:36].max() == 8

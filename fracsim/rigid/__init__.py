@@ -26,7 +26,7 @@ obstacles    those that stand, and those that move freely, as bodies do
 model        the scene as MuJoCo has it; this and the next two alone import it
 finding      MuJoCo finds contacts
 newton       MuJoCo solves for what few contacts give
-crowd        and projected gradients for what many do
+crowd        and projected gradients for what many do, in C (crowd.c)
 engine       a step of motion: what meets what, and what that gives
 contacts     where they are, and how fast things come together there
 planes       those of hulls with planes

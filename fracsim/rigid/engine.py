@@ -272,11 +272,11 @@ class Engine:
         for number in range(1 if rough else LOOKS):
             rows = np.flatnonzero(met.near)
             some = met.contacts.chosen(rows)
-            crowd = Crowd.of(some, self._model.mass, inverse)
             aim: Values = np.asarray(met.meeting.aim[rows] / dt)
+            crowd = Crowd.of(some, some.parting(*free), aim, self._model.mass, inverse)
             enough = NEARLY * self._rules.fast
             most = ROUGH if rough or number else max(MOST, WORK // max(len(rows), 1))
-            met.impulse[rows] = crowd.impulses(some.parting(*free), aim, enough, most, met.impulse[rows])
+            met.impulse[rows] = crowd.impulses(enough, most, met.impulse[rows])
             force = self._forces(bodies, crowd.gained(met.impulse[rows]))
             missed = self._missed(met, met.near, self._motion(self._driven_on(bodies, force), rates))
             met.near |= missed
