@@ -134,7 +134,7 @@ class Engine:
         with a common velocity (3,), and than another (n,) beside what stands, m and m/s; `known` so far, without what
         comes `far`ther (n,) than was thought."""
         dt, g, bodies = self._rules.step, self._rules.gravity, start
-        before, _ = self._renewed(start, rates, common, reach, known.before if known else None, far)
+        before, kept = self._renewed(start, rates, common, reach, known.before if known else None, far)
         contacts, (meeting, parting) = before, self._meeting(before, start, rates)
         share = flown(meeting, before.things, self._count)
         if np.any(share):
@@ -142,7 +142,8 @@ class Engine:
             flying = replace(start, velocity=start.velocity + fallen / 2)
             bodies = replace(self._flown(flying, dt * share), velocity=start.velocity)
         others = share > 0 if known is None else far | (share != known.share)
-        contacts, kept = self._renewed(bodies, rates, common, reach, known.contacts if known else before, others)
+        if known is None or known.contacts is not known.before or np.any(share):
+            contacts, kept = self._renewed(bodies, rates, common, reach, known.contacts if known else before, others)
         if np.any(share):
             lift = lifts(before, contacts, share > 0)
             bodies = replace(bodies, place=bodies.place + lift)

@@ -85,24 +85,28 @@ class Planes:
         this step, as far as they bear. `bodies`, `ways`: (stands, 3) where things are after it."""
         looked, found = self._looked, np.zeros(len(bodies), bool)
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
-            near, x, gap = self._around(bodies, ways[stand], normal, np.zeros(len(bodies)))
+            near, gap = self._around(bodies, ways[stand], normal, np.zeros(len(bodies)))
             rows = np.flatnonzero((gap < -deep) & ~looked.at[number, near])
             if len(rows):
                 of = self.of[near[rows]]
-                bears = _bearing(of, x[rows] - bodies.place[of], normal, gap[rows])
+                bears = _bearing(of, self._arms(bodies, near[rows]), normal, gap[rows])
                 looked.always[number, near[rows[bears]]] = found[of] = True
         return found
 
     def _around(
         self, bodies: Bodies, way: Values, normal: Values, reach: Values, only: Flags | None = None
-    ) -> tuple[Ints, Values, Values]:
-        """Corners (k,) of bodies that come near a plane with a normal (3,) through a point (3,), where they are (k, 3),
-        and how far from it (k,), m; `reach`: (n,) how far each and the plane come, m; `only`: (n,) of these bodies."""
-        low = (bodies.place - way) @ normal < self.extent + reach
+    ) -> tuple[Ints, Values]:
+        """Corners (k,) of bodies that come near a plane with a normal (3,) through a point (3,), and how far from it
+        they are (k,), m; `reach`: (n,) how far each and the plane come, m; `only`: (n,) of these bodies."""
+        height, across = (bodies.place - way) @ normal, np.einsum("nij,i->nj", bodies.turn, normal)
+        low = height < self.extent + reach
         near = np.flatnonzero((low if only is None else low & only)[self.of])
         of = self.of[near]
-        x = np.einsum("kij,kj->ki", bodies.turn[of], self.corners[near]) + bodies.place[of]
-        return near, x, (x - way) @ normal
+        return near, np.einsum("kj,kj->k", across[of], self.corners[near]) + height[of]
+
+    def _arms(self, bodies: Bodies, corners: Ints) -> Values:
+        """(k, 3) corners (k,) beside the centres of their bodies, m."""
+        return np.asarray(np.einsum("kij,kj->ki", bodies.turn[self.of[corners]], self.corners[corners]))
 
     def near(
         self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, only: Flags | None = None
@@ -114,16 +118,18 @@ class Planes:
             return []
         found = []
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
-            near, x, gap = self._around(bodies, ways[stand], normal, reach + speeds[stand], only)
+            near, gap = self._around(bodies, ways[stand], normal, reach + speeds[stand], only)
             looked, always = self._looked.at[number], self._looked.always[number]
             looked[slice(None) if only is None else only[self.of]] = False
             rows = np.flatnonzero((gap < reach[self.of[near]] + speeds[stand]) | always[near])
             if len(rows):
-                near, of, x, gap = near[rows], self.of[near[rows]], x[rows], gap[rows]
+                near, of, gap = near[rows], self.of[near[rows]], gap[rows]
+                arms = self._arms(bodies, near)
+                x = arms + bodies.place[of]
                 way = -step * np.einsum("ki,i->k", bodies.velocity_at(x, of), normal)
                 soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
                 kept = _first(of, gap, NEAREST) | always[near]
-                kept[soon] |= _bearing(of[soon], x[soon] - bodies.place[of[soon]], normal, (gap - way)[soon])
+                kept[soon] |= _bearing(of[soon], arms[soon], normal, (gap - way)[soon])
                 looked[near[kept]] = True
                 points = x[kept] - gap[kept, None] / 2 * normal
                 found.append((number, self.part[near[kept]], gap[kept], points))
