@@ -12,6 +12,8 @@ are given up from time to time: the matrix shrinks, the unknowns stay.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -19,6 +21,9 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr
 from ..mesh.ranks import total
+
+if TYPE_CHECKING:
+    from .lanes import Lanes
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
@@ -56,6 +61,7 @@ class Assembly:
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
+        self._lanes: dict[fem.Form, Lanes | None] = {}
         self._sum = block_csr(pattern) if by_blocks else expanded_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
@@ -97,7 +103,7 @@ class Assembly:
         `diagonal`: of owned dofs, is added to blocks, which `bring` makes the matrix of (collective)."""
         self._sum.data[:] = 0.0
         for form in (self.form, more) if more is not None else (self.form,):
-            fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
+            self._add(form, bcs)
         self._sum.scatter_reverse()
         if self.blocks is None:
             self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
@@ -109,6 +115,18 @@ class Assembly:
             self._sum.data.reshape(-1, d, d)[at, axes, axes] += diagonal.reshape(-1, d)
         self._set(self.blocks)
         self._behind = True
+
+    def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
+        """Add a form to the sum, several cells at a time where there are blocks and that can be done."""
+        if self.blocks is not None and form not in self._lanes:
+            from .lanes import Lanes, compiled
+
+            code = compiled(form)
+            self._lanes[form] = None if code is None else Lanes(form, self._sum, code)
+        if (lanes := self._lanes.get(form)) is None:
+            fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
+        else:
+            lanes.add(self._sum, bcs)
 
     def bring(self) -> None:
         """Bring the matrix to where the blocks are, if there are any (collective)."""

@@ -15,7 +15,8 @@ after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is g
 any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
             keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
-Nothing was found of the others: assemble_into, apply_lifting, expanded_csr, create_matrix.
+Nothing was found of the others: packed, cells_of, integrals, nodes_of_cells, identity_rows, assemble_into,
+apply_lifting, expanded_csr, create_matrix. What FFCx writes is read by mechanics.lanes.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
 
@@ -129,6 +130,39 @@ def evaluate(
 ) -> npt.NDArray[np.float64]:
     """Evaluate an expression in cells into `values` (cells, points times components); returns them."""
     return expression.eval(mesh, cells, values)
+
+
+def packed(form: fem.Form) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """What the kernel of a form over cells is given: (cells, width) numbers of its fields, and its constants."""
+    compiled: Any = form._cpp_object
+    (fields,) = dolfinx.cpp.fem.pack_coefficients(compiled).values()
+    return fields, dolfinx.cpp.fem.pack_constants(compiled)
+
+
+def cells_of(form: fem.Form) -> Ints:
+    """The cells that a form with one integral, over cells, is integrated over now."""
+    compiled: Any = form._cpp_object
+    (number,) = compiled.integral_ids(fem.IntegralType.cell)
+    return np.asarray(compiled.domains(fem.IntegralType.cell, number))
+
+
+def integrals(form: fem.Form) -> list[Any]:
+    """The kind of each integral of a form."""
+    compiled: Any = form._cpp_object
+    return [kind for kind in compiled.integral_types for _ in compiled.integral_ids(kind)]
+
+
+def nodes_of_cells(form: fem.Form) -> Ints:
+    """(cells, nodes) local nodes of a form's functions."""
+    space: Any = form.function_spaces[0]
+    nodes: Ints = space.dofmap.map()
+    return nodes
+
+
+def identity_rows(matrix: la.MatrixCSR, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
+    """Put 1 on the diagonal of owned rows of prescribed dofs."""
+    space: Any = form.function_spaces[0]
+    dolfinx.cpp.fem.insert_diagonal(matrix._cpp_object, space, [bc._cpp_object for bc in bcs], 1.0)
 
 
 # --- vectors and matrices -------------------------------------------------------------------------------------------

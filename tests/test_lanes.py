@@ -1,0 +1,80 @@
+"""Tangents of several cells at a time are those that DOLFINx assembles one cell after another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dolfinx import fem
+
+from fracsim.mechanics.lanes import Lanes, compiled, in_lanes
+from fracsim.mechanics.tangent import Assembly
+from support.scenes import Values
+from test_dead_cells import damaged
+
+SIDE = [{"on": "left", "displacement": [0.1, "free", "free"]}]
+
+
+def summed(form: fem.Form, bcs: list[fem.DirichletBC], code: object) -> Values:
+    """Blocks of a form in a matrix with room for just them; `code`: None for DOLFINx's own way."""
+    assembly = Assembly(form)
+    assembly.use_blocks()
+    assembly._lanes = {form: None if code is None else Lanes(form, assembly._sum, code)}
+    assembly._sum.data[:] = 0.0
+    assembly._add(form, bcs)
+    values: Values = assembly._sum.data.copy()
+    return values
+
+
+def assert_as_one_by_one(form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
+    code = compiled(form)
+    assert code is not None
+    ours, theirs = summed(form, bcs, code), summed(form, bcs, None)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14 * np.abs(theirs).max())
+    assert np.any(np.abs(theirs) > 1e-3 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize(("case", "dim"), [("damped", 2), ("damped", 3), ("rotated", 3), ("extrapolated", 3)])
+def test_as_one_by_one(case: str, dim: int) -> None:
+    """A body that is deformed and flows at random, a third of its cells dead, held at one side along one axis."""
+    balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
+    balance.damage_changed()
+    assert_as_one_by_one(balance._tangent.form, balance.motion.bcs)
+
+
+def test_positive_moduli() -> None:
+    """The same of the form that is added where moduli are made positive."""
+    balance = damaged("rotated", 3, boundary=SIDE)[0].balance
+    assert_as_one_by_one(balance._positive_moduli(0.1), balance.motion.bcs)
+
+
+def test_what_dolfinx_goes_on_with() -> None:
+    """Forms with integrals over facets, and of bent cells."""
+    assert compiled(damaged("rotated", 3)[0].balance._tangent.form) is None
+    bent = {"builder": "box", "size": [1.0, 0.7], "h": 0.4, "order": 2}
+    assert (
+        compiled(damaged("rotated", 2, mesh=bent, boundary=[{"on": "left", "fix": "xy"}])[0].balance._tangent.form)
+        is None
+    )
+
+
+def test_cells_without_room() -> None:
+    """A matrix that was made while cells were dead has no room for them, which is told."""
+    balance = damaged("linear", 3)[0].balance
+    balance.damage_changed()
+    form = balance._tangent.form
+    assembly = Assembly(form)
+    assembly.use_blocks()
+    lanes = Lanes(form, assembly._sum, compiled(form))
+    lanes.add(assembly._sum, [])
+    balance.stress.chi.x.array[:] = 1.0
+    balance.damage_changed()
+    with pytest.raises(ValueError, match="no place for cell"):
+        lanes.add(assembly._sum, [])
+
+
+@pytest.mark.parametrize("line", ("double s = a > b ? a : b;", "double s = pow(a, b);"))
+def test_what_lanes_cannot_do(line: str) -> None:
+    """A choice by a condition, a function that is not taken lane by lane."""
+    kernel = "\nvoid tabulate_tensor_x(double* A)\n{{\n{0}\n}}\n\nbool enabled_x[1] = {{1}};\n\nufcx_integral x\n"
+    assert in_lanes(kernel.format("double s = fabs(a);")) == "{\nreal s = (fabs(a)) - zero;\n}\n"
+    assert in_lanes(kernel.format(line)) is None
