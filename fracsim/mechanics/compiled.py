@@ -11,7 +11,9 @@ import sysconfig
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import numpy.typing as npt
 from dolfinx.jit import get_options
 
 from ..errors import InputError
@@ -38,6 +40,11 @@ def library(source: Path) -> ctypes.CDLL:
             _run([*flags, str(source), "-o", str(fresh), "-lm"])
             fresh.replace(made)
     return ctypes.CDLL(str(made))
+
+
+def at(values: npt.NDArray[Any]) -> ctypes.c_void_p:
+    """Where an array begins, which is to be contiguous; it lives as long as this."""
+    return values.ctypes.data_as(ctypes.c_void_p)
 
 
 def _flags() -> list[str]:

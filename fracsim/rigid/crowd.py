@@ -33,9 +33,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.compiled import library
+from ..mechanics.compiled import at, library
 from .contacts import Contacts
 
+SOURCE = Path(__file__).with_suffix(".c")
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -77,7 +78,7 @@ class Crowd:
         """(k, 3) N s that second things receive, along the axes of the contacts; `enough`: m/s that velocities may be
         off by; `most`: of iterations; `start`: (k, 3) N s from where to go on."""
         p = np.array(start, order="C")
-        spent = _compiled().impulses(self._given, ctypes.c_double(enough), ctypes.c_int64(most), _at(p))
+        spent = library(SOURCE).impulses(self._given, ctypes.c_double(enough), ctypes.c_int64(most), at(p))
         if spent < 0:
             raise MemoryError(f"no room for {len(p)} contacts")
         return p
@@ -85,34 +86,25 @@ class Crowd:
     def gained(self, impulses: Values) -> Values:
         """(n, 6) velocities and spins that impulses (k, 3) give."""
         level: Values = np.empty((len(self.mass) + 1, 6))
-        _compiled().gained(self._given, _at(np.ascontiguousarray(impulses)), _at(level))
+        library(SOURCE).gained(self._given, at(np.ascontiguousarray(impulses)), at(level))
         return level[:-1]
 
     def bound(self) -> Values:
         """(k,) D."""
         count, bodies = len(self.contacts), len(self.mass) + 1
         d, room, rows = np.empty(count), [np.empty(many) for many in (36 * bodies, bodies, 2 * count)], np.arange(count)
-        _compiled().bound(self._given, _at(rows), ctypes.c_int64(count), _at(d), *map(_at, room))
+        library(SOURCE).bound(self._given, at(rows), ctypes.c_int64(count), at(d), *map(at, room))
         return d
 
     @cached_property
     def _given(self) -> Any:
         """For C; the arrays are this crowd's, and stay as long as it."""
-        arrays = map(_at, (self.contacts, self.things, self.mass, self.inertia))
+        arrays = map(at, (self.contacts, self.things, self.mass, self.inertia))
         return ctypes.byref(_Crowd(len(self.contacts), len(self.mass), *arrays))
 
 
 def projected(p: Values, mu: Values) -> Values:
     """(k, 3) the nearest of each cone |p_t| <= mu p_n."""
     near = np.array(p, order="C")
-    _compiled().projected(ctypes.c_int64(len(mu)), _at(near), _at(mu))
+    library(SOURCE).projected(ctypes.c_int64(len(mu)), at(near), at(mu))
     return near
-
-
-def _compiled() -> ctypes.CDLL:
-    return library(Path(__file__).with_suffix(".c"))
-
-
-def _at(values: npt.NDArray[Any]) -> ctypes.c_void_p:
-    """Where an array begins, for C."""
-    return ctypes.c_void_p(values.ctypes.data)

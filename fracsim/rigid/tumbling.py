@@ -8,12 +8,17 @@ a body turns by less than about a radian a step.
 
 from __future__ import annotations
 
+from ctypes import c_double, c_int64
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+
+from ..mechanics.compiled import at, library
 
 Values = npt.NDArray[np.float64]
 
+SOURCE = Path(__file__).with_suffix(".c")
 ROUNDS = 30
 SAME = 1e-14  # change of the turn in a step, rad, that is none
 
@@ -23,18 +28,10 @@ def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Valu
 
     `inverse`: (n, 3, 3) of the inertia in the axes of the bodies, 1 / (kg m^2).
     """
-    if not len(turn):
-        return turn
-    angle = dt[:, None] * rotated(turn, inverse, momentum)
-    rows = np.arange(len(turn))
-    for _ in range(ROUNDS):
-        halfway = Rotation.from_rotvec(angle[rows] / 2).as_matrix() @ turn[rows]
-        found = dt[rows, None] * rotated(halfway, inverse[rows], momentum[rows])
-        change, angle[rows] = np.abs(found - angle[rows]).max(axis=1), found
-        rows = rows[change >= SAME]
-        if not len(rows):
-            break
-    return np.asarray((Rotation.from_rotvec(angle) * Rotation.from_matrix(turn)).as_matrix())
+    given = [np.ascontiguousarray(each) for each in (turn, inverse, momentum, dt)]
+    after: Values = np.empty(turn.shape)
+    library(SOURCE).tumbled(c_int64(len(turn)), *map(at, given), c_int64(ROUNDS), c_double(SAME), at(after))
+    return after
 
 
 def rotated(turn: Values, tensor: Values, vector: Values) -> Values:

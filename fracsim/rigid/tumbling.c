@@ -1,0 +1,66 @@
+/* How each body turns in a step (rigid.tumbling). Matrices are by rows. */
+
+#include <math.h>
+#include <stdint.h>
+
+/* c = a b. */
+static void product(const double *a, const double *b, double *c)
+{
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+}
+
+/* exp of the rotation by a vector: 1 + s W + c W^2, s = sin t / t, c = (1 - cos t) / t^2 = 2 sin^2(t / 2) / t^2. */
+static void rotation(const double *vector, double *r)
+{
+    double x = vector[0], y = vector[1], z = vector[2], square = x * x + y * y + z * z, t = sqrt(square);
+    double half = t > 0 ? sin(t / 2) / (t / 2) : 1, s = t > 0 ? sin(t) / t : 1, c = half * half / 2;
+    double made[9] = {1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y,
+                      c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x,
+                      c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)};
+    for (int i = 0; i < 9; i++) r[i] = made[i];
+}
+
+/* R T R^T v. */
+static void rotated(const double *r, const double *t, const double *v, double *result)
+{
+    double a[3], b[3];
+    for (int j = 0; j < 3; j++) a[j] = r[j] * v[0] + r[3 + j] * v[1] + r[6 + j] * v[2];
+    for (int i = 0; i < 3; i++) b[i] = t[3 * i] * a[0] + t[3 * i + 1] * a[1] + t[3 * i + 2] * a[2];
+    for (int i = 0; i < 3; i++) result[i] = r[3 * i] * b[0] + r[3 * i + 1] * b[1] + r[3 * i + 2] * b[2];
+}
+
+/* R (3 - R^T R) / 2: what a product has lost of right angles is gone but for its square. */
+static void squared(const double *r, double *result)
+{
+    double across[9], more[9];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) across[3 * i + j] = r[i] * r[j] + r[3 + i] * r[3 + j] + r[6 + i] * r[6 + j];
+    product(r, across, more);
+    for (int i = 0; i < 9; i++) result[i] = 1.5 * r[i] - more[i] / 2;
+}
+
+/* The turns (n, 9) of n bodies after times (n,); `same`: rad, a change of the turn that is none. */
+void tumbled(int64_t n, const double *turn, const double *inverse, const double *momentum, const double *time,
+             int64_t rounds, double same, double *after)
+{
+    for (int64_t each = 0; each < n; each++, turn += 9, inverse += 9, momentum += 3, time++, after += 9) {
+        double angle[3], found[3], r[9], halfway[9], change = same;
+        rotated(turn, inverse, momentum, found);
+        for (int j = 0; j < 3; j++) angle[j] = *time * found[j];
+        for (int64_t round = 0; round < rounds && change >= same; round++) {
+            double half[3] = {angle[0] / 2, angle[1] / 2, angle[2] / 2};
+            rotation(half, r);
+            product(r, turn, halfway);
+            rotated(halfway, inverse, momentum, found);
+            change = 0;
+            for (int j = 0; j < 3; j++) {
+                change = fmax(change, fabs(*time * found[j] - angle[j]));
+                angle[j] = *time * found[j];
+            }
+        }
+        rotation(angle, r);
+        product(r, turn, halfway);
+        squared(halfway, after);
+    }
+}
