@@ -38,21 +38,21 @@ def test_as_one_by_one(case: str, dim: int) -> None:
     """A body that is deformed and flows at random, a third of its cells dead, held at one side along one axis."""
     balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
     balance.damage_changed()
-    assert_as_one_by_one(balance._tangent.form, balance.motion.bcs)
+    assert_as_one_by_one(balance.stiffness.form, balance.motion.bcs)
 
 
 def test_positive_moduli() -> None:
     """The same of the form that is added where moduli are made positive."""
     balance = damaged("rotated", 3, boundary=SIDE)[0].balance
-    assert_as_one_by_one(balance._positive_moduli(0.1), balance.motion.bcs)
+    assert_as_one_by_one(balance.stiffness._positive_moduli(0.1), balance.motion.bcs)
 
 
 def test_what_dolfinx_goes_on_with() -> None:
     """Forms with integrals over facets, and of bent cells."""
-    assert compiled(damaged("rotated", 3)[0].balance._tangent.form) is None
+    assert compiled(damaged("rotated", 3)[0].balance.stiffness.form) is None
     bent = {"builder": "box", "size": [1.0, 0.7], "h": 0.4, "order": 2}
     assert (
-        compiled(damaged("rotated", 2, mesh=bent, boundary=[{"on": "left", "fix": "xy"}])[0].balance._tangent.form)
+        compiled(damaged("rotated", 2, mesh=bent, boundary=[{"on": "left", "fix": "xy"}])[0].balance.stiffness.form)
         is None
     )
 
@@ -61,7 +61,7 @@ def test_cells_without_room() -> None:
     """A matrix that was made while cells were dead has no room for them, which is told."""
     balance = damaged("linear", 3)[0].balance
     balance.damage_changed()
-    form = balance._tangent.form
+    form = balance.stiffness.form
     assembly = Assembly(form)
     assembly.use_blocks()
     lanes = Lanes(form, assembly._sum, compiled(form))

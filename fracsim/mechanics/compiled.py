@@ -25,19 +25,26 @@ FASTER = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
 
 @cache
 def library(source: Path) -> ctypes.CDLL:
-    """The functions of a C file, with the flags of FFCx's kernels. Not collective: processes that compile the same file
-    at once each put a whole library in the place of the other's."""
+    """The functions of a C file."""
+    return built(source.stem, source.read_text(), FASTER)
+
+
+def built(name: str, text: str, more: list[str]) -> ctypes.CDLL:
+    """The functions of C, with the flags of FFCx's kernels and `more`. InputError where no compiler takes it.
+
+    Not collective: processes that compile the same at once each put a whole library in the place of the other's.
+    """
     compiler = os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc"
-    flags = [*shlex.split(compiler), "-std=c17", *_flags(), *FASTER, "-shared", "-fPIC"]
-    text = source.read_bytes()
-    tag = hashlib.sha256(" ".join(flags).encode() + text).hexdigest()[:16]
+    command = [*shlex.split(compiler), "-std=c17", *_flags(), *more, "-shared", "-fPIC"]
+    tag = hashlib.sha256(f"{command} {text}".encode()).hexdigest()[:16]
     folder = Path(get_options()["cache_dir"])
-    made = folder / f"fracsim_{source.stem}_{tag}.so"
+    made = folder / f"fracsim_{name}_{tag}.so"
     if not made.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            fresh = Path(scratch) / made.name
-            _run([*flags, str(source), "-o", str(fresh), "-lm"])
+            source, fresh = Path(scratch) / f"{name}.c", Path(scratch) / made.name
+            source.write_text(text)
+            _run([*command, str(source), "-o", str(fresh), "-lm"])
             fresh.replace(made)
     return ctypes.CDLL(str(made))
 

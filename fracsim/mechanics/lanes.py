@@ -9,12 +9,8 @@ DOLFINx's work.
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-import tempfile
-from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.util import module_from_spec, spec_from_file_location
+from ctypes import CDLL, c_int64
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +20,10 @@ from dolfinx import fem, la
 from dolfinx.jit import mpi_jit_decorator
 
 from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
-from .kernels import jit_options
+from .compiled import at, built
 
 LANES = 4
 FUNCTIONS = ("fabs", "sqrt", "log", "exp")  # that are taken lane by lane
-
-_DECLARED = """
-int64_t add(int64_t count, const int32_t* cells, const int32_t* dofs, const int32_t* corners, const double* x,
-         int64_t width, const double* w, int64_t size, const double* c,
-         const int32_t* places, const uint8_t* held, double* blocks);
-void find(int64_t count, const int32_t* dofs, const int64_t* starts, const int32_t* columns, int32_t* places);
-"""
 
 _SOURCE = """
 #include <math.h>
@@ -147,7 +136,7 @@ static inline real lanes_{0}(real x) {{ for (int i = 0; i < LANES; ++i) x[i] = {
 class Lanes:
     """A bilinear form of cells, and where its blocks are in a matrix."""
 
-    def __init__(self, form: fem.Form, matrix: la.MatrixCSR, code: Any) -> None:
+    def __init__(self, form: fem.Form, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: what `compiled` has made of the form."""
         self._form, self._code, self._geometry = form, code, form.mesh.geometry
         dofmap = form.function_spaces[0].dofmap
@@ -172,22 +161,17 @@ class Lanes:
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")
         identity_rows(matrix, self._form, bcs)
 
-    def _call(self, name: str, *given: int | npt.NDArray[Any]) -> int | None:
-        ffi, lib = self._code.ffi, self._code.lib
-        pointers = [each if isinstance(each, int) else ffi.from_buffer(_TYPES[each.dtype.char], each) for each in given]
-        result: int | None = getattr(lib, name)(*pointers)
+    def _call(self, name: str, *given: int | npt.NDArray[Any]) -> int:
+        function = getattr(self._code, name)
+        function.restype = c_int64
+        result: int = function(*(c_int64(each) if isinstance(each, int) else at(each) for each in given))
         return result
-
-
-_TYPES = {np.dtype(kind).char: f"{name}[]" for kind, name in (
-    (np.int32, "int32_t"), (np.int64, "int64_t"), (np.uint8, "uint8_t"), (np.float64, "double"),
-)}  # fmt: skip
 
 
 # --- compiling ------------------------------------------------------------------------------------------------------
 
 
-def compiled(form: fem.Form) -> Any:
+def compiled(form: fem.Form) -> CDLL | None:
     """What `Lanes` takes of a form; None where there is no such thing (collective)."""
     if integrals(form) != [fem.IntegralType.cell]:
         return None
@@ -198,35 +182,19 @@ def compiled(form: fem.Form) -> Any:
         return None
     kernel = Path(str(form.module.__file__))  # type: ignore[union-attr]
     try:
-        return _module(form.mesh.comm, kernel.with_name(kernel.name.split(".")[0] + ".c"), sizes)
+        code: CDLL | None = _library(form.mesh.comm, kernel.with_name(kernel.name.split(".")[0] + ".c"), sizes)
     except Exception:  # of a compiler that has no vectors, or of C that is written otherwise some day
         return None
+    return code
 
 
 @mpi_jit_decorator  # type: ignore[misc]
-def _module(source: Path, sizes: dict[str, int]) -> Any:
-    """The compiled module, beside FFCx's kernel and kept as long."""
-    flags = [*jit_options()["cffi_extra_compile_args"], *_FLAGS]  # type: ignore[misc]
-    made_of = f"{source.name} {sizes} {flags}".encode() + Path(__file__).read_bytes()
-    name = f"fracsim_lanes_{hashlib.sha256(made_of).hexdigest()[:32]}"
-    target = source.with_name(name + EXTENSION_SUFFIXES[0])
-    if not target.exists():
-        if (kernel := in_lanes(source.read_text())) is None:
-            return None
-        import cffi
-
-        functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
-        builder = cffi.FFI()
-        builder.cdef(_DECLARED)
-        text = _SOURCE % (sizes | {"kernel": kernel, "functions": functions})
-        builder.set_source(name, text, extra_compile_args=flags)
-        with tempfile.TemporaryDirectory(dir=source.parent) as folder:
-            os.replace(builder.compile(tmpdir=folder), target)
-    spec = spec_from_file_location(name, target)
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def _library(source: Path, sizes: dict[str, int]) -> CDLL | None:
+    """What FFCx wrote, compiled once more."""
+    if (kernel := in_lanes(source.read_text())) is None:
+        return None
+    functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
+    return built("lanes", _SOURCE % (sizes | {"kernel": kernel, "functions": functions}), _FLAGS)
 
 
 def in_lanes(source: str) -> str | None:
