@@ -154,16 +154,18 @@ void bound(
 /* A contact that is solved for, one after the other in memory. */
 typedef struct {
     Contact at;
-    double d, pace, p[3], change[3], q[3]; /* impulses, how they last changed, and where they are looked at */
-    int64_t number;
+    double d, p[3], change[3], q[3]; /* impulses, how they last changed, and where they are looked at */
+    int64_t number, age;             /* of all contacts; iterations since p turned back */
     int32_t first, second;
 } Row;
 
 typedef struct {
     double *p, *change; /* (count, 3) of all contacts */
-    double *pace, *d;   /* (count,) */
+    double *d;          /* (count,) */
+    int64_t *age;       /* (count,) */
     double *level;      /* (bodies + 1, 6) what is given to bodies */
-    double *back;       /* (bodies + 1,) how far p turned back */
+    double *back;       /* (bodies + 1,) how far p turned back in the last iteration */
+    double *beta;       /* (most,) by age */
     Row *row;           /* some of count */
     int64_t some;
 } State;
@@ -172,36 +174,34 @@ typedef struct {
 static void ahead(const Crowd *crowd, State *now)
 {
     memset(now->level, 0, 6 * (crowd->bodies + 1) * sizeof(double));
-    memset(now->back, 0, (crowd->bodies + 1) * sizeof(double));
+    now->back[crowd->bodies] = 0;
     for (Row *row = now->row; row < now->row + now->some; row++) {
-        double faster = (1 + sqrt(1 + 4 * row->pace * row->pace)) / 2, beta = (row->pace - 1) / faster;
-        row->pace = faster;
+        if (now->back[row->first] > 0 || now->back[row->second] > 0) row->age = 0;
+        double beta = now->beta[row->age++];
         for (int j = 0; j < 3; j++) row->q[j] = row->p[j] + beta * row->change[j];
         push(&row->at, row->q, now->level + 6 * row->first, now->level + 6 * row->second);
     }
+    memset(now->back, 0, (crowd->bodies + 1) * sizeof(double));
     move(crowd, now->level);
 }
 
-/* An iteration; the most, in m/s, that any contact was off by. */
+/* An iteration; the square of the most, in m/s, that any contact was off by. */
 static double iterated(const Crowd *crowd, State *now)
 {
     double worst = 0;
     ahead(crowd, now);
     for (Row *row = now->row; row < now->row + now->some; row++) {
-        double u[3], left[3], mu = row->at.friction;
+        double u[3], left[3], mu = row->at.friction, step = 1 / row->d;
         part(&row->at, now->level + 6 * row->first, now->level + 6 * row->second, u);
         u[0] += mu * sqrt(u[1] * u[1] + u[2] * u[2]);
-        for (int j = 0; j < 3; j++) { row->change[j] = row->p[j]; row->p[j] = row->q[j] - u[j] / row->d; }
+        for (int j = 0; j < 3; j++) { row->change[j] = row->p[j]; row->p[j] = row->q[j] - step * u[j]; }
         project(row->p, mu);
         for (int j = 0; j < 3; j++) { left[j] = row->q[j] - row->p[j]; row->change[j] = row->p[j] - row->change[j]; }
         double back = row->d * dot(left, row->change);
         now->back[row->first] += back;
         now->back[row->second] += back;
-        worst = fmax(worst, row->d * sqrt(dot(left, left)));
+        worst = fmax(worst, row->d * row->d * dot(left, left));
     }
-    now->back[crowd->bodies] = 0;
-    for (Row *row = now->row; row < now->row + now->some; row++)
-        if (now->back[row->first] > 0 || now->back[row->second] > 0) row->pace = 1;
     return worst;
 }
 
@@ -225,7 +225,7 @@ static void taken(const Crowd *crowd, State *now, const int64_t *rows)
 {
     for (int64_t r = 0; r < now->some; r++) {
         int64_t k = rows[r];
-        Row row = {.at = crowd->contact[k], .d = now->d[k], .pace = now->pace[k], .number = k,
+        Row row = {.at = crowd->contact[k], .d = now->d[k], .number = k, .age = now->age[k],
                    .first = (int32_t)crowd->things[2 * k], .second = (int32_t)crowd->things[2 * k + 1]};
         memcpy(row.p, now->p + 3 * k, sizeof row.p);
         memcpy(row.change, now->change + 3 * k, sizeof row.change);
@@ -236,7 +236,7 @@ static void taken(const Crowd *crowd, State *now, const int64_t *rows)
 static void handed(State *now)
 {
     for (const Row *row = now->row; row < now->row + now->some; row++) {
-        now->pace[row->number] = row->pace;
+        now->age[row->number] = row->age;
         memcpy(now->p + 3 * row->number, row->p, sizeof row->p);
         memcpy(now->change + 3 * row->number, row->change, sizeof row->change);
     }
@@ -252,21 +252,32 @@ static int64_t solved(const Crowd *crowd, State *now, double enough, int64_t mos
         bound(crowd, rows, now->some, now->d, square, square + 36 * (crowd->bodies + 1), w);
         taken(crowd, now, rows);
         for (done = 0; !done && spent < until && spent < most; spent++)
-            done = iterated(crowd, now) < enough && (spent + 1) % CHECK == 0;
+            done = iterated(crowd, now) < enough * enough && (spent + 1) % CHECK == 0;
         handed(now);
     }
     return spent;
 }
 
+/* Nesterov's (pace - 1) / pace', pace' = (1 + sqrt(1 + 4 pace^2)) / 2 from pace = 1 on. */
+static void betas(double *beta, int64_t most)
+{
+    double pace = 1;
+    for (int64_t age = 0; age < most; age++) {
+        double faster = (1 + sqrt(1 + 4 * pace * pace)) / 2;
+        beta[age] = (pace - 1) / faster;
+        pace = faster;
+    }
+}
+
 /* The same from impulses p (count, 3) on, which it changes; -1 where there is no memory for it. */
 int64_t impulses(const Crowd *crowd, double enough, int64_t most, double *p)
 {
-    int64_t k = crowd->count, n = crowd->bodies + 1, spent = -1, *rows = malloc((k + 1) * sizeof(int64_t));
-    double *room = calloc(7 * k + 44 * n, sizeof(double)), *pace = room + 3 * k, *d = pace + k, *w = d + k;
-    double *level = w + 2 * k, *back = level + 6 * n, *square = back + n;
-    State now = {p, room, pace, d, level, back, malloc((k + 1) * sizeof(Row)), 0};
+    int64_t k = crowd->count, n = crowd->bodies + 1, spent = -1, *rows = calloc(2 * k + 1, sizeof(int64_t));
+    double *room = calloc(6 * k + 44 * n + most, sizeof(double)), *d = room + 3 * k, *w = d + k;
+    double *level = w + 2 * k, *back = level + 6 * n, *square = back + n, *beta = square + 37 * n;
+    State now = {p, room, d, rows + k, level, back, beta, malloc((k + 1) * sizeof(Row)), 0};
     if (room && rows && now.row) {
-        for (int64_t each = 0; each < k; each++) pace[each] = 1;
+        betas(beta, most);
         spent = solved(crowd, &now, enough, most, square, w, rows);
     }
     free(now.row);

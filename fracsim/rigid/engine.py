@@ -39,7 +39,7 @@ SLIPS = 10  # rounds of slip, at most,
 CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
 CROWD = 300  # contacts: more are not given to Newton's method
 NEARLY = 0.01  # c_0: what velocities of a crowd may be off by,
-MOST, WORK = 150, 500_000  # after so many iterations, at most, of few contacts so many in all
+MOST, WORK = 150, 3_000_000  # after so many iterations, at most, of few contacts so many in all
 LOOKS, ROUGH = 3, 30  # looks for what meets what, at most, and iterations of all but the first whole one
 
 
