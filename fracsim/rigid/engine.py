@@ -257,7 +257,7 @@ class Engine:
             thrown = np.minimum(thrown, lifts * contacts.slipping(*motion, kept))
             if not np.any(missed) and np.all((before - thrown)[pressed] < CLOSE * self._rules.fast * dt):
                 break
-        met.impulse[pressed] = dt * each[pressed]
+        met.impulse[:] = np.where(pressed[:, None], dt * each, 0.0)  # not what pressed in a look before
         return force
 
     def _missed(self, met: _Met, kept: Flags, motion: tuple[Values, Values]) -> Flags:
