@@ -19,6 +19,7 @@ from fracsim.errors import InputError
 from fracsim.fracture.energy.around import Pairs
 from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
 from fracsim.fracture.energy.cutting import fork, leave
+from fracsim.fracture.energy.mixed import gain
 from fracsim.fracture.energy.tips import DISC, CrackTips
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
@@ -49,7 +50,7 @@ def test_what_each_tip_of_a_disc_takes_up() -> None:
 
 def test_tips_abreast_go_apart() -> None:
     """Each at ANGLE to the way of both, from the other, and the one that is ahead by over h = R / 5 waits; not those
-    behind one another, nor those that meet."""
+    behind one another, nor those that meet, nor any that have left each other's discs."""
     ways = rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.2, -0.2]))
 
     def pair(apart: list[float], own: Values, other: Values) -> tuple[Values, bool]:
@@ -62,6 +63,7 @@ def test_tips_abreast_go_apart() -> None:
     np.testing.assert_allclose(pair([0.1, -1.0], ways[0], ways[1])[0], [c, s])
     np.testing.assert_allclose(pair([0.1, 1.0], ways[1], ways[0])[0], [c, -s])
     assert [pair([lead, 1.0], ways[1], ways[0])[1] for lead in (0.5, -0.39, -0.41)] == [False, False, True]
+    assert [pair([-0.9, apart], ways[1], ways[0])[1] for apart in (1.7, 1.9)] == [True, False]
     assert not pair([1.1, 1.0], ways[1], ways[0])[0].any()
     assert not pair([0.1, 1.0], ways[1], -ways[1])[0].any()
     assert not pair([0.0, 0.0], ways[1], ways[1])[0].any()
@@ -90,10 +92,10 @@ def test_a_cell_is_cut_in_three_where_both_ways_out_are_free() -> None:
 # --- against energy, and fine elements -------------------------------------------------------------------------------
 
 
-def forked(length: float, n: int = 40) -> Scene:
-    """A plate of 1 m, pulled by 1 mm, cracked to its middle, with two branches at ANGLE."""
+def forked(upper: float, lower: float, n: int = 40) -> Scene:
+    """A plate of 1 m, pulled by 1 mm, cracked to its middle, with two branches of these lengths, m, at ANGLE."""
     at = np.array([0.5, 0.503])
-    ends = at + length * rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([ANGLE, -ANGLE]))
+    ends = at + rotated(np.array([[upper, 0.0], [lower, 0.0]]), np.array([ANGLE, -ANGLE]))
     study = make_study(
         material={"energy": "linear", "young": YOUNG, "poisson": POISSON, "density": 1.0},
         fracture={"strength": 1e9, "energy": 1e9},
@@ -111,7 +113,7 @@ def test_two_tips_in_a_disc_share_its_force() -> None:
     fifth; the force on each is twice that."""
     books = []
     for length in (0.03, 0.05, 0.07):
-        scene = forked(length)
+        scene = forked(length, length)
         now, reached = seen(scene), tips(scene)
         assert len(reached) == 2
         along = now.tips.point - now.tips.behind
@@ -124,6 +126,23 @@ def test_two_tips_in_a_disc_share_its_force() -> None:
     taken = (before - after) / (end - start)
     assert pytest.approx(taken, rel=0.2) == G
     assert whole > 1.8 * taken
+
+
+def test_a_tip_that_is_ahead_waits_unless_there_is_enough_for_both() -> None:
+    """It takes 2 G_c: less than that, and the branch behind, which shares its disc, is to go first."""
+    scene = forked(0.05, 0.09)
+    stress, graph, held = scene.balance.stress, scene.fracture.graph, criterion_of(scene)
+    for share, goes in ((1.9, False), (2.1, True)):
+        criterion = CrackTips(stress, graph, held.strength, 1.0, held.cut.copy(), branching=True)
+        found = criterion.tips()
+        now = criterion.sight.look(*scene.fracture.evaluate())
+        tangent = (found.point - found.behind) / np.linalg.norm(found.point - found.behind, axis=1)[:, None]
+        ahead = int(np.argmax(found.point[:, 0]))
+        assert found.waits[ahead] and found.waits.sum() == 1
+        released = each(now.forces(), found.ahead, tangent) * gain(now.phases() * ~np.any(found.parts, axis=1))
+        criterion.toughness = released[ahead] / share
+        criterion(*scene.fracture.evaluate())
+        assert (found.cell[ahead] in criterion.cells) == goes
 
 
 def branch(angle: float, length: float = 0.02, finest: float = 5e-5) -> tuple[float, float]:

@@ -9,9 +9,10 @@ crack at rest can, too: each of two short branches releases 0.52 of what the one
 carry energy to a tip faster than it gets on: a slow crack never sees more than G_c, and where steps are longer than
 that a crack runs on within them. And only where no other tip's disc lies over its own.
 
-The stress in discs that lie over each other is neither tip's, nor does their force say which is to go. Until branches
-are two discs' radii apart they keep level, and each goes straight on, at the angle at which short branches open and do
-not slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there as well).
+The force of a disc in which there is another tip is neither's, and does not say which is to go. Until branches have
+left each other's discs they keep level, and each goes straight on, at the angle at which short branches open and do not
+slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there as well). But nobody waits where
+there is enough for both: the other has stopped, and would never be level again.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def each(force: Values, advance: Values, tangent: Values) -> Values:
 
 
 def parted(pairs: Pairs, own: Values, other: Values, radius: Values) -> tuple[Values, Flags]:
-    """(n, 2) whither tips go that run abreast of another, 0 for others, and (n,) whether they wait.
+    """(n, 2) whither tips go that run abreast of another in their disc, 0 for others, and (n,) whether they wait.
 
     `own`, `other`: (pairs, 2) how the place and the other tip go, of any length. `radius`: (n,) R, m. Each at ANGLE to
     the way of both, away from the nearest other.
@@ -72,5 +73,5 @@ def parted(pairs: Pairs, own: Values, other: Values, radius: Values) -> tuple[Va
     way, waits = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
     near = pairs.distance[rows] < disc[rows]
     way[place[near]] = rotated(both[rows[near]], np.sign(left[rows[near]]) * ANGLE)
-    waits[place] = lead[rows] > LEAD * disc[rows]
+    waits[place] = near & (lead[rows] > LEAD * disc[rows])
     return way, waits

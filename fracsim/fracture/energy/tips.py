@@ -186,7 +186,8 @@ class CrackTips:
                 branches &= self._rate[tips.cell] * self._dt <= 1  # a Rayleigh wave stays in the disc within a step
                 ahead = np.where(branches[:, None], tips.course, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
-        may = np.flatnonzero((~mature | self._enough(size, toughness, tips)) & ~(tips.waits | self.barred[tips.cell]))
+        stays = (tips.waits & (size < TIPS * toughness)) | self.barred[tips.cell]
+        may = np.flatnonzero((~mature | self._enough(size, toughness, tips)) & ~stays)
         if not len(may):
             return self._none(0)
         mean = seen.means(may)
