@@ -61,8 +61,9 @@ def test_a_patch_has_the_gradient_and_the_middles_of_a_field(d: int) -> None:
     cells = np.array([chance.permutation(20)[: d + 1] for _ in range(30)])
     patch = Patch(cells, barycentric_gradients(points[cells]))
     field = (points @ A.T + b).ravel()
-    np.testing.assert_allclose(patch.gradients(field), np.tile(A, (30, 1, 1)), rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(patch.middles(field), points[cells].mean(axis=1) @ A.T + b, rtol=1e-12)
+    corners = patch.corners(field)
+    np.testing.assert_allclose(patch.gradients(corners), np.tile(A, (30, 1, 1)), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(patch.middles(corners), points[cells].mean(axis=1) @ A.T + b, rtol=1e-12)
 
 
 def test_eshelbys_stress_is_what_moving_the_material_costs() -> None:

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from fracsim.fracture.energy.along import Alone, Along
 from fracsim.fracture.energy.around import pairs_within
 from fracsim.fracture.energy.cutting import cleave, line_cuts
+from fracsim.fracture.energy.force import plateau, plateau_gradient
 from fracsim.fracture.energy.front import advance
 from fracsim.fracture.energy.row import RowTips
 from fracsim.fracture.energy.tips import NEAR_TIP, CrackTips
@@ -166,6 +167,45 @@ def test_the_force_along_a_front_is_that_of_what_is_near() -> None:
     along.update(np.arange(2 * n), np.tile(point, (2, 1)), np.concatenate([ahead, against]), np.tile(radius, 2))
     both = along(np.concatenate([rate[:, None] * ahead, 50.0 * against]))
     np.testing.assert_allclose(both[:n], expected)
+
+
+def test_forces_and_their_bound_are_sums_over_all_cells() -> None:
+    """Of any Sigma and f: as written out over the whole body; a bound that holds, and that one cell reaches whose Sigma
+    pulls along its grad q, or one that is pushed."""
+    scene = plate(8, {"time": [0, 1], "value": [[0, 0, 0], [0, 0, 1e-6]]}, 1.0)
+    look, domain, rng = seen(scene).around, scene.domain, np.random.default_rng(7)
+    own, volumes, count = look.asked.own, domain.volumes, len(look.tips)
+    sigma, push = np.zeros((domain.cell_count, 3, 3)), np.zeros((domain.cell_count, 3))
+    sigma[own], push[own] = rng.standard_normal((len(own), 3, 3)), 3e4 * rng.standard_normal((len(own), 3))
+    radius = criterion_of(scene).sight._reach.disc[look.tips.cell]
+    apart = domain.nodes[domain.cell_nodes].mean(axis=1)[None] - look.tips.point[:, None]
+    slope = np.array([plateau_gradient(each, np.full(len(each), R)) for each, R in zip(apart, radius, strict=True)])
+    q = plateau(np.linalg.norm(apart, axis=2), radius[:, None])
+    expected = np.einsum("c,tc,ci->ti", volumes, q, push) - np.einsum("c,tck,cik->ti", volumes, slope, sigma)
+    np.testing.assert_allclose(look.forces(sigma[own], push[own]), expected, atol=1e-12 * np.abs(expected).max())
+    assert count > 3 and (look.most(sigma[own], push[own]) > np.linalg.norm(expected, axis=1)).all()
+    steep = np.argmax(np.linalg.norm(slope[0], axis=1))
+    one, none = np.zeros_like(sigma), np.zeros_like(push)
+    one[steep] = np.outer([1.0, 2.0, 3.0], slope[0, steep])
+    most, force = look.most(one[own], none[own])[0], look.forces(one[own], none[own])[0]
+    assert most == pytest.approx(np.linalg.norm(force), rel=1e-12) and most > 0
+    none[steep] = [1.0, 2.0, 3.0]
+    pushed = look.most(0 * one[own], none[own])
+    np.testing.assert_allclose(pushed, np.linalg.norm(look.forces(0 * one[own], none[own]), axis=1), rtol=1e-12)
+
+
+def test_no_tip_is_passed_over_that_reaches_its_energy() -> None:
+    """Where one of them has as much as it takes they are looked at, the others as tough as may be; at rest the bound is
+    twice as much, and they are not where all of them have a fourth."""
+    scene = plate(8, {"time": [0, 1], "value": [[0, 0, 0], [0, 0, 2e-6]]}, 1.0)
+    scene.stepper.advance(scene.start())
+    look = seen(scene)
+    ahead = look.tips.ahead
+    released = np.einsum("ni,ni->n", look.around.forces(look.sigma, look.inertia), ahead)
+    G = released / np.einsum("ni,ni->n", ahead, ahead)
+    assert G.min() > 100 and not look.may_reach(4 * G)
+    for tip in range(len(G)):
+        assert look.may_reach(np.where(np.arange(len(G)) == tip, G, np.inf))
 
 
 def test_what_lies_near_is_found() -> None:

@@ -292,19 +292,22 @@ def test_hard_steps_are_held_against_their_bounds() -> None:
         return record("explicit", cells=9000, steps=100, breaking=60, share=share, whole=2.0, all=2.0 * (1 + share))
 
     quick, slow = (record(name, worst=worst) for name, worst in (("pulled", 1.5), ("bent", 2 * steps.WORST)))
-    collapse, breaking = steps.section([quick, pane(0.9)]).claims
+    collapse, breaking, _ = steps.section([quick, pane(0.9)]).claims
     assert collapse.holds and collapse.measured == "1.5 s (pulled)"
     assert breaking.holds and breaking.measured.startswith("0.90 of it: 3.8 s beside 2.0 s of 100 steps")
-    collapse, breaking = steps.section([quick, slow, pane(1.1)]).claims
+    collapse, breaking, _ = steps.section([quick, slow, pane(1.1)]).claims
     assert collapse.holds is False and "bent" in collapse.measured and breaking.holds is False
-    assert [claim.holds for claim in steps.section([]).claims] == [None, None]
+    for share, holds in ((0.04, True), (0.06, False)):
+        *_, waits = steps.section([record("front", cells=192000, steps=60, share=share)]).claims
+        assert waits.holds is holds and waits.measured == f"{share:.1%} of one of 192,000 tetrahedra"
+    assert [claim.holds for claim in steps.section([]).claims] == [None, None, None]
 
 
 def test_scenes_of_hard_steps_are_what_they_are_called() -> None:
     """Lattices of 5,280 triangles with a notch in one, and as many trials as scenes."""
     for name, data in steps.COLLAPSES.items():
         assert len(build_mesh(validate(data, name).mesh).cells) == 5280
-    assert len({trial.name for trial in steps.trials()}) == len(steps.COLLAPSES) + 1
+    assert len({trial.name for trial in steps.trials()}) == len(steps.COLLAPSES) + 2
 
 
 def test_the_default_solver_is_held_against_the_better_of_two() -> None:

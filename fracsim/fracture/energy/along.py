@@ -46,6 +46,10 @@ class Alone:
         released, made = self._sums(np.where(self._front, np.einsum("nk,nk->n", force, self._ahead), 0.0))
         return np.asarray(np.maximum(over(released, made), 0.0)[:, None] * self._way)
 
+    def most(self, force: Values) -> Values:
+        """(n,) no less than G, J/m^2, of tips by themselves, of the size of the forces on them (n,)."""
+        return over(force, np.sqrt(self._square))
+
     def _sums(self, released: Values) -> tuple[Values, Values]:
         """(n,) g . a and |a|^2."""
         return released, self._square

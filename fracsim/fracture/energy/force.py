@@ -15,7 +15,9 @@ def across(H: Values, vectors: Values) -> Values:
     after the other in memory."""
     result = np.empty_like(vectors)
     for k in range(vectors.shape[1]):
-        result[:, k] = sum(H[:, j, k] * vectors[:, j] for j in range(vectors.shape[1]))
+        result[:, k] = H[:, 0, k] * vectors[:, 0]
+        for j in range(1, vectors.shape[1]):
+            result[:, k] += H[:, j, k] * vectors[:, j]
     return result
 
 
@@ -25,9 +27,12 @@ def eshelby(psi: Values, H: Values, P: Values) -> Values:
     Eshelby (1951); psi and P as the cell has them, chi included.
     """
     result = np.empty_like(P)
-    for k in range(P.shape[2]):
-        result[:, :, k] = -across(H, P[:, :, k])
-        result[:, k, k] += psi
+    for i in range(P.shape[1]):
+        for k in range(P.shape[2]):
+            column = H[:, 0, i] * P[:, 0, k]
+            for j in range(1, P.shape[1]):
+                column += H[:, j, i] * P[:, j, k]
+            np.subtract(psi if i == k else 0.0, column, out=result[:, i, k])
     return result
 
 

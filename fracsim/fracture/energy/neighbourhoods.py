@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix, hstack
 from scipy.spatial import cKDTree
 
 from ...mesh.edges import EdgeGraph
@@ -101,6 +101,7 @@ class Neighbourhoods:
         self._cell: Ints = none
         self._weights: Values = np.empty((0, graph.domain.dim + len(_Sum)))
         self._matrices: dict[int, csr_matrix] = {}
+        self._products: tuple[csc_matrix, csc_matrix, csc_matrix] | None = None
 
     def update(self, cut: Values) -> None:
         """Cracks have changed: look anew where they have (collective)."""
@@ -118,6 +119,7 @@ class Neighbourhoods:
         ends = np.concatenate([[0], np.cumsum(np.bincount(self._place, minlength=len(self.tips)))])
         self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._cell], ends
         self._matrices.clear()
+        self._products = None
         if self.tips.point.shape[1] == 3:
             cell, domain = self.tips.cell, self._graph.domain
             self.along.update(domain.cell_input[cell], self.tips.point, self.tips.ahead, self._reach.disc[cell])
@@ -128,9 +130,26 @@ class Neighbourhoods:
         """(n, d) - sum V Sigma grad q + sum V q f over the discs of tips: Sigma (asked, d, d) in Pa and f (asked, d) in
         N/m^3."""
         d = sigma.shape[1]
-        inside, slopes = self._matrix(d + _Sum.INSIDE), [self._matrix(axis) for axis in range(d)]
-        rows = [inside @ push[:, i] - sum(slopes[k] @ sigma[:, i, k] for k in range(d)) for i in range(d)]
-        return np.column_stack(rows)  # a product a component: of all at once they take half as long again
+        slopes, inside, _ = self._force
+        rows = np.moveaxis(sigma, 0, -1).reshape(d, -1)
+        return np.column_stack([inside @ push[:, i] - slopes @ rows[i] for i in range(d)])
+
+    def most(self, sigma: Values, push: Values) -> Values:
+        """(n,) no less than the size of those forces: sum V |Sigma| |grad q| + sum V q |f|."""
+        _, inside, steep = self._force
+        size, pushed = np.einsum("nij,nij->n", sigma, sigma), np.einsum("ni,ni->n", push, push)
+        return np.asarray(steep @ np.sqrt(size) + inside @ np.sqrt(pushed))
+
+    @property
+    def _force(self) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
+        """(tips, d asked) V grad q, one axis after the other, (tips, asked) V q and V |grad q|; by columns, which takes
+        two thirds of the time: in rows each sum waits for the one before."""
+        if self._products is None:
+            axes = [self._matrix(axis) for axis in range(self.tips.point.shape[1])]
+            steep = sum(each.multiply(each) for each in axes).sqrt()
+            matrices = hstack(axes), self._matrix(len(axes) + _Sum.INSIDE), steep
+            self._products = tuple(each.tocsc() for each in matrices)
+        return self._products
 
     def means(self, rows: Ints, stress: Values) -> Values:
         """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, 3 or 6) which have not come apart,

@@ -16,8 +16,9 @@ class Patch:
     def __init__(self, nodes: Ints, slopes: Values) -> None:
         """`nodes`: (n, d + 1) of cells.    `slopes`: (n, d + 1, d) of their barycentric coordinates, 1/m."""
         count, corners, self._d = slopes.shape
-        self._nodes, index = np.unique(nodes, return_inverse=True)
-        index, size = index.reshape(-1), len(self._nodes)
+        found, index = np.unique(nodes, return_inverse=True)
+        index, size = index.reshape(-1), len(found)
+        self._dofs = np.arange(self._d)[:, None] + self._d * found
         axes = slopes.transpose(2, 0, 1).ravel()  # a block of rows an axis
         self._slopes = csr_matrix(
             (axes, np.tile(index, self._d), corners * np.arange(self._d * count + 1)), (self._d * count, size)
@@ -25,15 +26,15 @@ class Patch:
         share = np.full(index.size, 1 / corners)
         self._mean = csr_matrix((share, index, corners * np.arange(count + 1)), (count, size))
 
-    def _columns(self, field: Values) -> Values:
-        """(d, nodes) of a field of nodes (all * d,)."""
-        return np.ascontiguousarray(field.reshape(-1, self._d)[self._nodes].T)
+    def corners(self, field: Values) -> Values:
+        """(d, corners) of a field of nodes (all * d,), at the corners of the cells."""
+        return field[self._dofs]
 
-    def gradients(self, field: Values) -> Values:
-        """(n, d, d) of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
-        rows = np.array([self._slopes @ each for each in self._columns(field)])
+    def gradients(self, corners: Values) -> Values:
+        """(n, d, d) of a field, H_ij = du_i / dX_j of the displacement."""
+        rows = np.array([self._slopes @ each for each in corners])
         return rows.reshape(self._d, self._d, -1).transpose(2, 0, 1)
 
-    def middles(self, field: Values) -> Values:
-        """(n, d) of a field of nodes (nodes * d,)."""
-        return np.array([self._mean @ each for each in self._columns(field)]).T
+    def middles(self, corners: Values) -> Values:
+        """(n, d) of a field."""
+        return np.array([self._mean @ each for each in corners]).T

@@ -173,7 +173,8 @@ class CrackTips:
         """Tips that advance."""
         tips, d = seen.tips, self._domain.dim
         h, toughness = self._h[tips.cell], np.broadcast_to(self.toughness, len(self._h))[tips.cell]
-        force, mature = seen.forces(), tips.mature.copy()
+        force = seen.forces() if self.shares or seen.may_reach(toughness) else np.zeros_like(tips.point)
+        mature = tips.mature.copy()
         size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
         ahead, apart = np.where(mature[:, None], force, tips.point - tips.behind), APART[d] * h
         if d == 2:
@@ -278,6 +279,9 @@ class CrackTips:
     def _chosen(self, *proposals: Proposal) -> list[Proposal]:
         """The first of those too near to one another: tips before new cracks, then by sigma_1 (collective)."""
         comm, rank = self._domain.comm, np.concatenate([each.rank for each in proposals])
+        if not total(comm, len(rank))[0]:
+            self._idle = True
+            return list(proposals)
         parts = comm.allgather(rank)
         every = np.concatenate(parts)
         left = list(np.lexsort(every[:, 2::-1].T))
