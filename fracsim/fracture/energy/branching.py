@@ -65,13 +65,13 @@ def parted(pairs: Pairs, own: Values, other: Values, radius: Values) -> tuple[Va
     both, disc = unit(own + other), radius[pairs.place]
     left = -np.einsum("ni,ni->n", pairs.apart, rotated(both, np.pi / 2))
     lead = -np.einsum("ni,ni->n", pairs.apart, both)
-    abreast = (np.abs(lead) <= ABREAST * disc) & (np.einsum("ni,ni->n", own, other) > 0) & (left != 0)
+    abreast = (pairs.distance < disc) & (np.abs(lead) <= ABREAST * disc)
+    abreast &= (np.einsum("ni,ni->n", own, other) > 0) & (left != 0)
     rows = np.flatnonzero(abreast)
     rows = rows[np.lexsort([pairs.distance[rows], pairs.place[rows]])]
     place, first = np.unique(pairs.place[rows], return_index=True)
     rows = rows[first]
     way, waits = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
-    near = pairs.distance[rows] < disc[rows]
-    way[place[near]] = rotated(both[rows[near]], np.sign(left[rows[near]]) * ANGLE)
-    waits[place] = near & (lead[rows] > LEAD * disc[rows])
+    way[place] = rotated(both[rows], np.sign(left[rows]) * ANGLE)
+    waits[place] = lead[rows] > LEAD * disc[rows]
     return way, waits
