@@ -32,7 +32,7 @@ _SOURCE = """
 #include <string.h>
 
 enum { NODES = %(nodes)d, D = %(bs)d, CORNERS = %(corners)d };
-typedef double real __attribute__((vector_size(8 * LANES)));
+typedef double real __attribute__((vector_size(8 * LANES), may_alias));
 static const real zero = {0};
 %(functions)s
 static inline void kernel(real* restrict A, const real* restrict w, const real* restrict c,
@@ -47,35 +47,38 @@ static inline void empty(double* A, const int32_t* nodes, const uint8_t* held)
       for (int j = 0; j < NODES * D; ++j) A[LANES * (NODES * D * i + j)] = A[LANES * (NODES * D * j + i)] = 0.0;
 }
 
-/* Tell the processor which blocks will be added to next. */
-static inline void fetch(const int32_t* places, const double* blocks)
+/* Tell the processor what will be added to next. */
+static inline void fetch(const int32_t* places, const double* sum)
 {
   for (int i = 0; i < NODES * NODES; ++i)
   {
-    __builtin_prefetch(blocks + D * D * (int64_t)places[i], 1);
-    __builtin_prefetch(blocks + D * D * (int64_t)places[i] + D * D - 1, 1);
+    __builtin_prefetch(sum + places[i], 1);
+    __builtin_prefetch(sum + places[i] + D * D - 1, 1);
   }
 }
 
 /* A: lane after lane of (NODES D)^2 numbers. */
-static inline void insert(const double* A, const int32_t* places, double* blocks)
+static inline void insert(const double* A, const int32_t* nodes, const int32_t* places, const int32_t* strides,
+    double* sum)
 {
   for (int a = 0; a < NODES; ++a)
     for (int b = 0; b < NODES; ++b)
     {
-      double* to = blocks + (int64_t)D * D * places[NODES * a + b];
+      double* to = sum + places[NODES * a + b];
+      const int64_t stride = strides[nodes[a]];
       const double* from = A + LANES * D * (NODES * D * a + b);
 #pragma GCC unroll 3
       for (int r = 0; r < D; ++r)
 #pragma GCC unroll 3
-        for (int s = 0; s < D; ++s) to[D * r + s] += from[LANES * (NODES * D * r + s)];
+        for (int s = 0; s < D; ++s) to[stride * r + s] += from[LANES * (NODES * D * r + s)];
     }
 }
 
-/* Add the blocks of cells; returns 0, or the number, from 1 on, of one that has no place. */
+/* Add the blocks of cells, rows of which are as far apart as their node's stride; returns 0, or the number, from 1 on,
+   of a cell that has no place. */
 int64_t add(int64_t count, const int32_t* cells, const int32_t* dofs, const int32_t* corners, const double* x,
          int64_t width, const double* w, int64_t size, const double* c,
-         const int32_t* places, const uint8_t* held, double* blocks)
+         const int32_t* places, const int32_t* strides, const uint8_t* held, double* sum)
 {
   real constants[size + 1], numbers[width + 1], points[3 * CORNERS], A[NODES * D * NODES * D];
   for (int i = 0; i < size; ++i) constants[i] = zero + c[i];
@@ -100,15 +103,17 @@ int64_t add(int64_t count, const int32_t* cells, const int32_t* dofs, const int3
       for (int a = 0; a < NODES; ++a) any |= held[nodes[a]] != 0;
       if (any) empty((double*)A + lane, nodes, held);
       if (places[NODES * NODES * cell] < 0) return cell + 1;
-      if (first + LANES + lane < count) fetch(places + NODES * NODES * (int64_t)cells[first + LANES + lane], blocks);
-      insert((const double*)A + lane, places + NODES * NODES * cell, blocks);
+      if (first + LANES + lane < count) fetch(places + NODES * NODES * (int64_t)cells[first + LANES + lane], sum);
+      insert((const double*)A + lane, nodes, places + NODES * NODES * cell, strides, sum);
     }
   }
   return 0;
 }
 
-/* The place of each block of each cell; the first is -1 where one has none. */
-void find(int64_t count, const int32_t* dofs, const int64_t* starts, const int32_t* columns, int32_t* places)
+/* The place of the first entry of each block of each cell, the first one -1 where a block has none. columns: of blocks
+   one after another (apart = 1), or of entries row by row (apart = D). */
+void find(int64_t count, const int32_t* dofs, int64_t apart, const int64_t* starts, const int32_t* columns,
+          int32_t* places)
 {
   for (int64_t cell = 0; cell < count; ++cell, places += NODES * NODES)
   {
@@ -117,9 +122,9 @@ void find(int64_t count, const int32_t* dofs, const int64_t* starts, const int32
     for (int a = 0; a < NODES; ++a)
       for (int b = 0; b < NODES; ++b)
       {
-        int64_t at = starts[nodes[a]], end = starts[nodes[a] + 1];
-        while (at < end && columns[at] != nodes[b]) ++at;
-        places[NODES * a + b] = (int32_t)at;
+        int64_t at = starts[apart * nodes[a]], end = starts[apart * nodes[a] + 1];
+        while (at < end && columns[at] != apart * nodes[b]) at += apart;
+        places[NODES * a + b] = (int32_t)(apart == 1 ? D * D * at : at);
         has &= at < end;
       }
     if (!has) places[0] = -1;
@@ -134,7 +139,7 @@ static inline real lanes_{0}(real x) {{ for (int i = 0; i < LANES; ++i) x[i] = {
 
 
 class Lanes:
-    """A bilinear form of cells, and where its blocks are in a matrix."""
+    """A bilinear form of cells, and where what it adds is in a matrix of blocks, or of single entries."""
 
     def __init__(self, form: fem.Form, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: what `compiled` has made of the form."""
@@ -144,10 +149,13 @@ class Lanes:
         self._held = np.zeros(dofmap.index_map.size_local + dofmap.index_map.num_ghosts, np.uint8)
         self._places = np.zeros((len(self._nodes), self._nodes.shape[1] ** 2), np.int32)
         starts = matrix.indptr.astype(np.int64)
-        self._call("find", len(self._nodes), self._nodes, starts, matrix.indices, self._places)
+        apart = 1 if matrix.block_size[0] > 1 else self._bs
+        lengths = np.diff(starts)[::apart]  # of rows
+        self._strides = (np.full_like(lengths, self._bs) if apart == 1 else lengths).astype(np.int32)
+        self._call("find", len(self._nodes), self._nodes, apart, starts, matrix.indices, self._places)
 
     def add(self, matrix: la.MatrixCSR, bcs: list[fem.DirichletBC]) -> None:
-        """Add this rank's blocks as DOLFINx does: rows and columns of prescribed dofs become the identity's."""
+        """Add this rank's part as DOLFINx does: rows and columns of prescribed dofs become the identity's."""
         cells, geometry, (w, c) = cells_of(self._form), self._geometry, packed(self._form)
         self._held[:] = 0
         for bc in bcs:
@@ -155,7 +163,7 @@ class Lanes:
             np.bitwise_or.at(self._held, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
         missing = self._call(
             "add", len(cells), cells, self._nodes, geometry.dofmap, geometry.x, w.shape[1], w, len(c), c,
-            self._places, self._held, matrix.data,
+            self._places, self._strides, self._held, matrix.data,
         )  # fmt: skip
         if missing:
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")

@@ -1,7 +1,8 @@
 """Assembling the tangent: element matrices are summed in DOLFINx's own sparse matrix and handed to PETSc row by row.
 
 PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell, takes twice as long as the kernels and
-DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values.
+DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values. Larger
+bodies have several cells assembled at a time (lanes).
 
 It can be summed in blocks of the d dofs of a node instead, which go into PETSc's matrix of blocks. Products are made
 with that one; the matrix of single entries, which multigrid is set up from, follows where it is asked for.
@@ -24,6 +25,8 @@ from ..mesh.ranks import total
 
 if TYPE_CHECKING:
     from .lanes import Lanes
+
+MANY = 10_000  # dofs from which on several cells are assembled at a time: it is compiled for 2 s once
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
@@ -117,8 +120,8 @@ class Assembly:
         self._behind = True
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
-        """Add a form to the sum, several cells at a time where there are blocks and that can be done."""
-        if self.blocks is not None and form not in self._lanes:
+        """Add a form to the sum, several cells at a time where that pays and can be done."""
+        if form not in self._lanes and self.matrix.getSize()[0] >= MANY:
             from .lanes import Lanes, compiled
 
             code = compiled(form)
