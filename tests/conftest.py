@@ -97,3 +97,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             super()._assign_work_unit(node)
 
     return Longest(config, log) if config.getoption("dist") == "loadgroup" else None
+
+
+@pytest.fixture(params=["newton", "projections"])
+def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few contacts of rigid bodies, and as many as if they were a crowd."""
+    if request.param == "projections":
+        monkeypatch.setattr("fracsim.rigid.engine.CROWD", 0)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-import fracsim.rigid.engine as engine_room
 import fracsim.rigid.newton as newton_room
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from fracsim.rigid.bodies import Bodies
@@ -41,13 +40,6 @@ def run(engine: Engine, bodies: Bodies, steps: int) -> tuple[Bodies, list[Touche
 def received(touches: list[Touches], thing: int) -> Values:
     """(3,) N s that a thing has received."""
     return np.asarray(sum(each.on(thing)[1].sum(axis=0) for each in touches))
-
-
-@pytest.fixture(params=["newton", "projections"])
-def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few contacts, and as many as if they were a crowd."""
-    if request.param == "projections":
-        monkeypatch.setattr(engine_room, "CROWD", 0)
 
 
 @pytest.mark.parametrize(("step", "friction"), [(2e-3, 0.5), (5e-4, 0.5), (2e-3, 0.0)])

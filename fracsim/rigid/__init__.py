@@ -31,6 +31,7 @@ engine       a step of motion: what meets what, and what that gives
 contacts     where they are, and how fast things come together there
 planes       those of hulls with planes
 meeting      the law that they follow
+events       what strikes bodies in a step, one thing after the other
 lifting      what rests does not sink in as it flies to where it is struck
 siblings     pieces that lie in one another from birth
 tumbling     how bodies turn, by their angular momentum

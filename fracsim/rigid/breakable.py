@@ -234,6 +234,11 @@ class Breakable:
         """Surfaces that may still open; 1 of what flows, for one blow after the other does."""
         return int(self._flow is not None) if self._criterion is None else self._criterion.left
 
+    @property
+    def breaks(self) -> bool:
+        """Whether a surface may still open."""
+        return self._criterion is not None and self._criterion.left > 0
+
     def opened(self, name: int, loads: PointLoads, share: int, energy: float = np.inf) -> Opened:
         """What a strike opens that may start `share` surfaces, or what shape it leaves with an energy to spend, J;
         whether they count is up to `take`. Raises NotConverged."""

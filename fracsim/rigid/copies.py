@@ -84,6 +84,10 @@ class Copies:
         number = name // self.nodes
         return number, self.copy(number).left
 
+    def breaks(self, number: int) -> bool:
+        """Whether surfaces may still open in one of them."""
+        return self.copy(number).breaks
+
     # --- strikes ---
 
     def may_break(self, name: int, force: float) -> bool:

@@ -48,10 +48,11 @@ class Newton:
         self._geom[moving] = 1 + np.arange(len(moving))
         self._jammed = False  # whether contacts of this step were too many to be solved at once
 
-    def begin(self, bodies: Bodies, ways: Values, rates: Values, contacts: Contacts) -> None:
-        """A step of the bodies, of what is driven at `ways` (driven, 3) at `rates` (driven, 3), and these contacts.
-        Raises NotConverged where there is no room for them."""
+    def begin(self, bodies: Bodies, ways: Values, rates: Values, contacts: Contacts, gravity: Values) -> None:
+        """A step of the bodies, of what is driven at `ways` (driven, 3) at `rates` (driven, 3), and these contacts,
+        with `gravity` (3,) m/s^2. Raises NotConverged where there is no room for them."""
         made, data, n = self._made, self._data, self._count
+        made.opt.gravity[:] = gravity
         q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
         q[:n, :3], q[n:, :3] = bodies.place, ways
         q[:n, 3:], q[n:, 3:] = orientation(bodies.turn), [1.0, 0.0, 0.0, 0.0]

@@ -103,6 +103,7 @@ class RigidStepper:
             Overlaps.none(),
         )
         self._engine: Engine | None = None
+        self._broke: set[int] = set()  # copies, in this step
         self.look_again()
 
     def look_again(self) -> None:
@@ -157,6 +158,7 @@ class RigidStepper:
         """
         began = clock = time.perf_counter()
         iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
+        self._broke.clear()
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.names)
         clock = self.phases.add("motion", clock)
@@ -183,9 +185,18 @@ class RigidStepper:
     def _moved(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, Touches]:
         """The bodies of a state, or the pieces that they are now, a step later, and what touched."""
         engine, end = self._engine or self._made(state.t, bodies), state.t + self._rules.step
-        moved, touches = engine.advance(bodies, self.others.ways(end))
+        moved, touches = engine.advance(bodies, self.others.ways(end), self._kin)
         self.overlaps = engine.overlaps
         return moved, touches
+
+    def _kin(self, bodies: Ints) -> Ints:
+        """(m,) of bodies (m,), see rigid.events: copies c of those that may break, or have done so in this step,
+        -2 - c of pieces that may not."""
+        found, mine = np.full(len(bodies), -1), bodies < self.count
+        of, place = np.unique(self.shapes.names[bodies[mine]] // self.copies.nodes, return_inverse=True)
+        may = [number in self._broke or self.copies.breaks(number) for number in map(int, of)]
+        found[mine] = np.where(may, of, -2 - of)[place]
+        return found
 
     def _made(self, t: float, bodies: Bodies) -> Engine:
         """The engine for the bodies as they are now."""
@@ -233,6 +244,7 @@ class RigidStepper:
         parent = np.searchsorted(before.names, before.names[before.piece_of_node[after.names]])
         parts = bodies.divided(self._densities(), after.moments, parent)
         self.blows.forget(np.array([*names], np.int64))
+        self._broke = {name // self.copies.nodes for name in names}
         whole = ~np.isin(before.names[parent], list(names))  # not even by round-off are these other bodies now
         kept = {key: np.array(values) for key, values in vars(parts).items()}
         for key, values in kept.items():

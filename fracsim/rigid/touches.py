@@ -46,6 +46,10 @@ class Touches:
         share = each / np.maximum((both < count).sum(axis=0), 1)
         return np.bincount(np.minimum(both, count).ravel(), np.tile(share, 2), count + 1)[:count].astype(float)
 
+    def and_more(self, more: Touches) -> Touches:
+        """And others after them."""
+        return Touches(*(np.concatenate(both) for both in zip(vars(self).values(), vars(more).values(), strict=True)))
+
     def on(self, thing: int) -> tuple[Values, Values]:
         """(m, 3) points and (m, 3) impulses that one thing received."""
         first, second = self.first == thing, self.second == thing

@@ -1,0 +1,76 @@
+"""Things that are struck more than once in a step, and those that touch what is struck: against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.mechanics.contact.shapes import Sphere
+from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.engine import Engine
+from fracsim.rigid.model import Rules
+from fracsim.rigid.newton import HARD
+from fracsim.rigid.primitives import primitive
+from fracsim.rigid.siblings import Overlaps
+from support.falling import CUBE, DOWN, MASS, cubes, floor
+
+Values = npt.NDArray[np.float64]
+FREE = 0 * DOWN
+BALL = primitive(Sphere(0.5, 3), "ball")
+
+
+def one_step(bodies: Bodies, parts: list[list[object]], rules: Rules, family: Overlaps | None = None) -> Bodies:
+    """Over the floor where there is weight."""
+    return Engine(bodies, parts, [floor()], rules, family).advance(bodies, None, lambda each: each)[0]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("step", [0.4, 0.3, 0.22])
+def test_a_row_of_balls_hands_on_what_the_first_one_has(step: float) -> None:
+    """Equal balls with gaps of 1 m, e = 1, all within a step: at 10 m/s the first stops after 1 m, the second too, and
+    the last goes on from 0.2 s; contacts give way by a share 1 - HARD of what they take."""
+    gives = 2 * (1 - HARD) * 10.0
+    bodies = cubes([[0.0, 0, 9.0], [2.0, 0, 9.0], [4.0, 0, 9.0]])
+    velocity: Values = np.array([[10.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    after = one_step(replace(bodies, velocity=velocity), [[BALL]] * 3, Rules(step, FREE, 0.0, 1.0))
+    assert after.velocity[:, 0] == pytest.approx([0.0, 0.0, 10.0], abs=gives)
+    assert after.place[:, 0] == pytest.approx([1.0, 3.0, 4.0 + 10 * (step - 0.2)], abs=step * gives)
+
+
+@pytest.mark.parametrize("thick", [0.01, 0.1])
+@pytest.mark.parametrize("below", [0.02, 0.5])
+def test_a_ball_does_not_stop_over_a_plate_that_gives_way(thick: float, below: float, solver: None) -> None:
+    """A plate in the air over a floor, both nearer than a ball comes in the step: it takes the plate along, and what
+    ends on the floor is the plate, with the ball on it. Contacts give way by a share 1 - HARD of what they take, in
+    the speed of the lighter one."""
+    step, over = 0.1, 0.3
+    gives = 2 * (1 - HARD) * 20.0 * (1 + 10)
+    bodies = cubes([[0.0, 0, below + thick / 2], [0.0, 0, below + thick + over + 0.5]])
+    bodies = replace(bodies, velocity=np.array([[0.0, 0, 0], [0, 0, -20.0]]), mass=np.array([MASS / 10, MASS]))
+    plate = CUBE * np.array([1.0, 1.0, thick])
+    after = one_step(bodies, [[plate], [BALL]], Rules(step, FREE, 0.0))
+    assert after.place[:, 2] == pytest.approx([thick / 2, thick + 0.5], abs=step * gives)
+    assert np.abs(after.velocity).max() < gives
+
+
+def test_events_of_a_step_keep_momentum_and_gain_no_energy(solver: None) -> None:
+    """Blocks, turned and spinning, that fly into a heap within a few steps of which each is many of their sizes."""
+    rng = np.random.default_rng(1)
+    bodies = cubes([[1.4 * x, 1.4 * y, 1.4 * z] for x in range(3) for y in range(3) for z in range(3)])
+    turn = np.linalg.qr(rng.normal(size=(27, 3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))[:, None, None]
+    velocity = -10 * (bodies.place - bodies.place.mean(axis=0)) + rng.normal(size=(27, 3))
+    bodies = replace(bodies, turn=turn, velocity=velocity, spin=rng.normal(size=(27, 3)))
+    engine, first, before = Engine(bodies, [[CUBE]] * 27, [], Rules(0.02, FREE, 0.4)), bodies, bodies.kinetic
+    size = MASS * float(np.linalg.norm(velocity, axis=1).sum())
+    for _ in range(15):
+        bodies, _ = engine.advance(bodies, None, lambda each: each)
+        assert bodies.kinetic < before * (1 + 1e-9)
+        before = bodies.kinetic
+        assert np.allclose(bodies.momentum, first.momentum, atol=1e-9 * size)
+        assert np.allclose(bodies.angular_momentum, first.angular_momentum, atol=1e-9 * size)
+    assert before < 0.5 * first.kinetic
