@@ -137,3 +137,21 @@ def test_what_is_behind_a_plate_does_not_stop_what_flies_at_it(
         given -= float(report.pushed[0, 2]) * step
     mass = float(state.bodies.mass[-1])
     assert stepper.count > 2 and given > 0.3 * mass * speed
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_it_goes_on_from_a_checkpoint_to_the_last_digit(at: int) -> None:
+    """Before the step that is taken apart, and after it."""
+    ends = []
+    for stops in (False, True):
+        scene = scene_of(0.002, 50.0, SPEEDS[50.0] / 2)
+        stepper, state = scene.stepper, scene.first
+        for step in range(4):
+            if stops and step == at:
+                saved, stepper = stepper.saved(state), scene_of(0.002, 50.0, SPEEDS[50.0] / 2).stepper
+                state = stepper.restore(saved, state.t, state.step, state.work)
+            state, _ = stepper.advance(state)
+        ends.append(state.bodies)
+    assert len(ends[0]) > 3
+    for one, other in zip(*(vars(each).values() for each in ends), strict=True):
+        assert np.array_equal(one, other)
