@@ -34,7 +34,7 @@ meeting      the law that they follow
 events       what strikes bodies in a step, one thing after the other
 lifting      what rests does not sink in as it flies to where it is struck
 siblings     pieces that lie in one another from birth
-tumbling     how bodies turn, by their angular momentum
+tumbling     how bodies turn, by their angular momentum, in C (tumbling.c)
 touches      what touched in a step
 blows        which contacts are blows, and which are loads
 hertz        how long a blow lasts, and what it presses on
