@@ -291,8 +291,8 @@ TEXT = (
     "press with 461 kN where the run has 595. Without them the first crack stays by itself for 100 microseconds and "
     "the load falls to 0.9, until another sets out from its end under a platen. A cell that a crack cuts loses the "
     "pressure along it, too, which gives a tip 1.1 to 1.3 sigma^2 h / 2 E that a sharp crack does not release (2.7 to "
-    "3.1 G_c in the middle of this cylinder); with that taken out of G cracks begin beside it all the same. The other "
-    "papers' own curves are pictures and "
+    "3.1 G_c in the middle of this cylinder); with that taken out of G cracks begin beside it all the same, and with "
+    "both left out it splits in two, at 0.67 of the load. The other papers' own curves are pictures and "
     "could not be laid beside these."
 )
 
