@@ -1,4 +1,4 @@
-"""Tangents of several cells at a time are those that DOLFINx assembles one cell after another."""
+"""Forms of several cells at a time are those that DOLFINx assembles one cell after another."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics.lanes import Lanes, compiled, in_lanes
+from fracsim.mechanics.lanes import MatrixLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
 from support.scenes import Values
 from test_dead_cells import damaged
@@ -19,7 +19,7 @@ def summed(form: fem.Form, bcs: list[fem.DirichletBC], code: object, *, by_block
     assembly = Assembly(form)
     if by_blocks:
         assembly.use_blocks()
-    assembly._lanes = {form: None if code is None else Lanes(form, assembly._sum, code)}
+    assembly._lanes = {form: None if code is None else MatrixLanes(form, code, assembly._sum)}
     assembly._sum.data[:] = 0.0
     assembly._add(form, bcs)
     values: Values = assembly._sum.data.copy()
@@ -42,6 +42,43 @@ def test_as_one_by_one(case: str, dim: int) -> None:
     balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
     balance.damage_changed()
     assert_as_one_by_one(balance.stiffness.form, balance.motion.bcs)
+
+
+@pytest.mark.parametrize(("case", "dim"), [("damped", 2), ("damped", 3), ("extrapolated", 3)])
+def test_forces_as_one_by_one(case: str, dim: int) -> None:
+    """Of the same bodies, with dead cells and without, and moved otherwise: to the last digits."""
+    balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
+    form, assembler = balance._work, balance._assembler
+    code = compiled(form)
+    assert code is not None
+    for change in (
+        lambda: None,
+        balance.damage_changed,
+        lambda: balance.displace(-3 * balance.u.x.array[: balance.owned]),
+    ):
+        change()
+        theirs, ours = assembler.vector(), assembler.vector()
+        assembler.into_unsummed(theirs, form)
+        with ours.localForm() as local:
+            local.set(0.0)
+            VectorLanes(form, code).add(local.array_w)
+        one, other = theirs.array_r, ours.array_r
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-14 * np.abs(other).max())
+        assert np.abs(other).max() > 0
+
+
+def test_what_is_no_number_is_told() -> None:
+    """Where a node is nowhere nothing around it is a number: Newton's method has to see it."""
+    balance = damaged("damped", 3, boundary=SIDE)[0].balance
+    u = balance.u.x.array[: balance.owned].copy()
+    u[4] = np.nan
+    balance.displace(u)
+    code, b = compiled(balance._work), balance._assembler.vector()
+    assert code is not None
+    VectorLanes(balance._work, code).add(b.array_w)
+    nowhere = np.isnan(balance._assembler(balance._work))
+    assert nowhere.any() and not nowhere.all()
+    np.testing.assert_array_equal(np.isnan(b.array_r), nowhere)
 
 
 def test_positive_moduli() -> None:
@@ -68,7 +105,7 @@ def test_cells_without_room() -> None:
     form = balance.stiffness.form
     assembly = Assembly(form)
     assembly.use_blocks()
-    lanes = Lanes(form, assembly._sum, compiled(form))
+    lanes = MatrixLanes(form, compiled(form), assembly._sum)
     lanes.add(assembly._sum, [])
     balance.stress.chi.x.array[:] = 1.0
     balance.damage_changed()

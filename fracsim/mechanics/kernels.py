@@ -56,6 +56,15 @@ def jit_options() -> dict[str, list[str] | int]:
 PATIENCE = 60  # s that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine
 
 
+MANY = 10_000  # dofs from which on it pays to compile a form once more, for 1 to 2 s, for several cells at a time
+
+
+def is_large(form: fem.Form) -> bool:
+    """Whether it is to be assembled several cells at a time, if that can be done (mechanics.lanes)."""
+    dofmap = form.function_spaces[0].dofmap
+    return bool(dofmap.index_map.size_global * dofmap.index_map_bs >= MANY)
+
+
 def compile_form(form: ufl.Form) -> fem.Form:
     """Compile a UFL form (collective)."""
     return compile_together(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))

@@ -22,11 +22,10 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr
 from ..mesh.ranks import total
+from .kernels import is_large
 
 if TYPE_CHECKING:
-    from .lanes import Lanes
-
-MANY = 10_000  # dofs from which on several cells are assembled at a time: it is compiled for 2 s once
+    from .lanes import MatrixLanes
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
@@ -64,7 +63,7 @@ class Assembly:
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._lanes: dict[fem.Form, Lanes | None] = {}
+        self._lanes: dict[fem.Form, MatrixLanes | None] = {}
         self._sum = block_csr(pattern) if by_blocks else expanded_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
@@ -121,11 +120,11 @@ class Assembly:
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
         """Add a form to the sum, several cells at a time where that pays and can be done."""
-        if form not in self._lanes and self.matrix.getSize()[0] >= MANY:
-            from .lanes import Lanes, compiled
+        if form not in self._lanes and is_large(form):
+            from .lanes import MatrixLanes, compiled
 
             code = compiled(form)
-            self._lanes[form] = None if code is None else Lanes(form, self._sum, code)
+            self._lanes[form] = None if code is None else MatrixLanes(form, code, self._sum)
         if (lanes := self._lanes.get(form)) is None:
             fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -9,6 +11,10 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import assemble_into, create_vector
 from ..mesh.domain import Domain
+from .kernels import is_large
+
+if TYPE_CHECKING:
+    from .lanes import VectorLanes
 
 Values = npt.NDArray[np.float64]
 
@@ -24,6 +30,7 @@ class Assembler:
         self.domain = domain
         self.owned = domain.node_count * domain.dim
         self._kept = self.vector()
+        self._lanes: dict[fem.Form, VectorLanes | None] = {}
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the dofs, ghosts included."""
@@ -41,8 +48,20 @@ class Assembler:
         """This rank's part alone into b; returns b."""
         with b.localForm() as local:
             local.set(0.0)
-        assemble_into(b, form)
+            if (lanes := self._in_lanes(form)) is not None:
+                lanes.add(local.array_w)
+        if lanes is None:
+            assemble_into(b, form)
         return b
+
+    def _in_lanes(self, form: fem.Form) -> VectorLanes | None:
+        """The form of several cells at a time, where that pays and can be done (collective the first time)."""
+        if form not in self._lanes and is_large(form):
+            from .lanes import VectorLanes, compiled
+
+            code = compiled(form)
+            self._lanes[form] = None if code is None else VectorLanes(form, code)
+        return self._lanes.get(form)
 
     def summed(self, b: PETSc.Vec) -> PETSc.Vec:
         """b with the parts that other ranks have assembled for its owned dofs (collective)."""
