@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from petsc4py import PETSc
 
 from fracsim.studies.evidence import solvers
 from support.reference import dense_tangent
@@ -78,6 +79,12 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
         balance.vector.array_w[:] = 1.0
         assert solver.linear.solve()
         solver.linear.factors.learn(solver.snes.ksp)
+        told, beside = solver.linear.factors.worth, PETSc.PC().create(scene.domain.comm)
+        beside.setType("python")  # as where springs beside the tangent go before the factors
+        beside.setOperators(*solver.snes.ksp.getOperators())
+        solver.snes.ksp.setPC(beside)
+        solver.linear.factors.learn(solver.snes.ksp)
+        assert solver.linear.factors.worth == told
     free = np.flatnonzero(balance.motion.free)
     least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
     assert (least > 0) == positive == solver.linear.factors.positive

@@ -74,8 +74,12 @@ class Factors:
         return pc
 
     def learn(self, ksp: PETSc.KSP) -> None:
-        """What the factors cost that have just served, and what they tell (collective)."""
-        factors, entries = ksp.getPC().getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
+        """What the factors cost that have just served, and what they tell (collective).
+
+        With springs beside the tangent the KSP's own preconditioner is what has them in it (stepping.woodbury).
+        """
+        assert self._pc is not None
+        factors, entries = self._pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
         self.worth = factors.getMumpsRinfog(3) / (FLOPS * entries["nz_used"])
         self.dear = MANY * self.worth
         self.positive = not self._symmetric or factors.getMumpsInfog(12) == 0  # negative pivots
