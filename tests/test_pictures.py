@@ -126,6 +126,26 @@ def test_dust_is_hidden_on_request(tmp_path: Path) -> None:
     assert np.diff(with_dust).max() > 8 and np.diff(bar).max() == 1
 
 
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("view", ("1,-2,0.3", "-1,0.2,3", "top"))
+def test_a_body_fills_its_picture_from_every_side(view: str, dim: int, tmp_path: Path) -> None:
+    """By what is not paper: between 90 and 98 % of a side, as far from one edge as from the other; one torn and
+    moved apart is whole on every picture of a sheet."""
+    look = Look(view=view, size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
+    sheet = shown(render(written(tmp_path, 0.0, 3.0, dim=dim), tmp_path / "sheet.png", look, sheet="0,1"))
+    drawn = np.abs(sheet - sheet[0, 0]).max(axis=2) > 12
+    torn = drawn[:, -SMALL[0] :]
+    assert not drawn[:, [0, SMALL[0] - 1]].any() and not drawn[[0, -1], : SMALL[0]].any()
+    there = [np.flatnonzero(torn.any(axis=axis)) for axis in (0, 1)]
+    margins, filled = zip(
+        *(((of.min(), side - 1 - of.max()), (np.ptp(of) + 1) / side) for of, side in zip(there, SMALL, strict=True)),
+        strict=True,
+    )
+    tight = int(np.argmax(filled))
+    assert 0.9 < filled[tight] < 0.98
+    assert margins[tight][0] == pytest.approx(margins[tight][1], abs=3) and min(map(min, margins)) > 3
+
+
 # --- colours and what is to be read ---
 
 

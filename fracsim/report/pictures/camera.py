@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,26 +11,60 @@ import numpy.typing as npt
 
 from .body import moved, without_dust
 from .look import Look
-from .obstacles import with_obstacles
-from .shots import Shot, load
+from .obstacles import corners_near
+from .shots import Shot, load, planes_of, study_of
 
 Values = npt.NDArray[np.float64]
 WORTH = 0.005  # of the points: the least piece that the camera looks for
-FILLED = 0.9  # of the picture, by the box of what is to be seen: the rest is for what is written
+ANGLE = np.radians(30.0)  # from the lowest to the highest that the camera sees
+# shares of half a picture that may be filled to the right, left, top and bottom; the rest is for what is written
+FILLED, LETTERED = (0.96, 0.96, 0.94, 0.94), (0.96, 0.96, 0.82, 0.78)
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What is to be seen of some frames.
+
+    Attributes:
+        bounds: (6,) of its box, m.
+        sides: (4,) how far it reaches to the right, left, top and bottom of the camera's axis, m, see `_sides`.
+    """
+
+    bounds: Values
+    sides: Values
+
+    @property
+    def flat(self) -> bool:
+        """A body in 2D."""
+        return bool(self.bounds[4] == self.bounds[5])
+
+
+def scope_of(shot: Shot, look: Look) -> Scope:
+    """Of the large pieces of a frame, and of obstacles near them; in 3D not of planes, which have no end."""
+    points = worth_seeing(drawn_of(shot, look))
+    near = corners_near(points, shot.beside)
+    flat = bool(np.ptp(points[:, 2]) == 0)
+    planes = {} if flat else planes_of(study_of(shot.folder))
+    bodies = [near[file] for file, name in zip(shot.beside, shot.names, strict=True) if name not in planes]
+    everything = np.concatenate([points, *near.values()])
+    bounds = np.stack([everything.min(axis=0), everything.max(axis=0)], axis=1).reshape(-1)
+    return Scope(bounds, _sides(np.concatenate([points, *bodies]), look, flat))
+
+
+def union(scopes: Sequence[Scope]) -> Scope:
+    """All of them."""
+    every = np.stack([scope.bounds for scope in scopes])
+    bounds = np.where(np.arange(6) % 2 == 0, every.min(axis=0), every.max(axis=0))
+    return Scope(bounds, np.max([scope.sides for scope in scopes], axis=0))
 
 
 def worth_seeing(grid: Any) -> Values:
-    """(6,) bounds of the large pieces: those with half a hundredth or more of the points."""
+    """(n, 3) points of the large pieces: those with half a hundredth or more of all points."""
     points = np.asarray(grid.points, float)
     if "piece" in grid.point_data:
         _, of_point, count = np.unique(grid.point_data["piece"], return_inverse=True, return_counts=True)
         points = points[count[of_point] >= min(WORTH * len(points), count.max())]
-    return np.stack([points.min(axis=0), points.max(axis=0)], axis=1).reshape(-1)
-
-
-def bounds_of(shot: Shot, look: Look) -> Values:
-    """(6,) what is worth seeing of a frame, m."""
-    return with_obstacles(worth_seeing(drawn_of(shot, look)), shot.beside)
+    return points
 
 
 def drawn_of(shot: Shot, look: Look) -> Any:
@@ -38,43 +73,51 @@ def drawn_of(shot: Shot, look: Look) -> Any:
     return moved(grid if look.dust else without_dust(grid), look.explode, look.magnify)
 
 
-def union(bounds: Sequence[Values]) -> Values:
-    """(6,) of all of them."""
-    every = np.stack(bounds)
-    return np.where(np.arange(6) % 2 == 0, every.min(axis=0), every.max(axis=0))
+def aim(plotter: Any, scope: Scope, look: Look) -> None:
+    """From where all of a scope is seen, as large as it may be.
+
+    A point x, y to the right and upwards, z towards the camera is in a picture of spreads t (half its sides at a
+    distance of 1) where |x - x_c| <= t_x (D - z), of the camera at x_c, y_c, D: linear in what is sought, so that
+    max(x + t_x z) and max(-x + t_x z) over all points say the least D, and then the middle of the places x_c.
+    Parallel rays: D is half of what is seen upwards, without z.
+    """
+    axes, spreads = _axes(look, scope.flat), _spreads(look, scope.flat)
+    far = float((scope.sides.reshape(2, 2).sum(axis=1) / spreads.reshape(2, 2).sum(axis=1)).max())
+    room = spreads * far - scope.sides
+    across = (room[1::2] - room[::2]) / 2
+    depth = float(axes[2] @ scope.bounds.reshape(3, 2).mean(axis=1))
+    focus = across @ axes[:2] + depth * axes[2]
+    camera = plotter.camera
+    camera.focal_point, camera.up = focus, axes[1]
+    camera.position = focus + (far if scope.flat else far - depth) * axes[2]
+    camera.view_angle = np.degrees(ANGLE)
+    camera.parallel_projection = scope.flat
+    camera.parallel_scale = far
+    camera.zoom(look.zoom)
+    plotter.reset_camera_clipping_range()
 
 
-def is_flat(bounds: Values) -> bool:
-    """A body in 2D."""
-    return bool(bounds[4] == bounds[5])
+def _sides(points: Values, look: Look, flat: bool) -> Values:
+    """(4,) max of x + t z, -x + t z, y + t z, -y + t z, each with its own spread t, m."""
+    x, y, z = _axes(look, flat) @ points.T
+    lean = np.zeros(4) if flat else _spreads(look, flat)
+    return np.array([(each + t * z).max() for each, t in zip((x, -x, y, -y), lean, strict=True)])
 
 
-def aim(plotter: Any, bounds: Values, look: Look) -> None:
-    """So that all of the bounds is seen."""
-    flat = is_flat(bounds)
-    if flat:
-        plotter.view_xy()
-        plotter.enable_parallel_projection()
-    else:
-        plotter.camera_position = [look.direction(), (0, 0, 0), (0, 0, 1)]
-    plotter.reset_camera(bounds=bounds)
-    plotter.camera.zoom(look.zoom * FILLED / _reach(plotter.camera, bounds, look.size[0] / look.size[1]))
-
-
-def _reach(camera: Any, bounds: Values, aspect: float) -> float:
-    """How far the corners of a box are from the middle of the picture, as a share of its half."""
-    corners = np.stack(np.meshgrid(*bounds.reshape(3, 2), indexing="ij"), axis=-1).reshape(-1, 3)
-    back = np.array(camera.position) - np.array(camera.focal_point)
-    distance = float(np.linalg.norm(back))
-    back /= distance
-    right = np.cross(camera.up, back)
+def _axes(look: Look, flat: bool) -> Values:
+    """(3, 3) to the right, upwards and towards the camera."""
+    back = np.array([0.0, 0, 1]) if flat else np.asarray(look.direction(), float)
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 1, 0] if flat or abs(back[2]) == 1 else [0.0, 0, 1], back)
     right /= np.linalg.norm(right)
-    arms = corners - np.array(camera.focal_point)
-    across = np.stack([arms @ right / aspect, arms @ np.cross(back, right)])
-    if camera.parallel_projection:
-        return float(np.abs(across).max() / camera.parallel_scale)
-    depth = (distance - arms @ back) * np.tan(np.radians(camera.view_angle) / 2)
-    return float(np.abs(across / depth).max())
+    return np.stack([right, np.cross(back, right), back])
+
+
+def _spreads(look: Look, flat: bool) -> Values:
+    """(4,) to the right, left, top and bottom: half of a picture's side that may be filled, at a distance of 1."""
+    shares = np.array(FILLED if look.bare else LETTERED)
+    shares[:2] *= look.size[0] / look.size[1]
+    return shares * (1.0 if flat else np.tan(ANGLE / 2))
 
 
 def pixel(plotter: Any, height: int) -> float:

@@ -33,14 +33,10 @@ def add_obstacles(plotter: Any, files: Iterable[Path], *, flat: bool) -> None:
             plotter.add_mesh(grid.extract_cells(part), lighting=not flat, **how)
 
 
-def with_obstacles(bounds: Values, files: Iterable[Path]) -> Values:
-    """(6,) bounds of a body grown by what is near it of its obstacles."""
+def corners_near(points: Values, files: Iterable[Path]) -> dict[Path, Values]:
+    """(n, 3) points of each obstacle, moved into the box of the body's grown by the room around it."""
     import pyvista
 
-    lower, upper = bounds[::2], bounds[1::2]
+    lower, upper = points.min(axis=0), points.max(axis=0)
     room = ROOM * float(np.linalg.norm(upper - lower)) * (upper > lower)  # a flat body stays flat
-    least, most = lower.copy(), upper.copy()
-    for file in files:
-        box = np.array(pyvista.read(file).bounds)
-        least, most = np.minimum(least, box[::2]), np.maximum(most, box[1::2])
-    return np.stack([np.maximum(least, lower - room), np.minimum(most, upper + room)], axis=1).reshape(-1)
+    return {file: np.clip(np.asarray(pyvista.read(file).points, float), lower - room, upper + room) for file in files}

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
-from .camera import bounds_of, is_flat, union
+from .camera import scope_of, union
 from .colouring import merged
 from .look import Look
 from .screen import display
@@ -93,11 +93,11 @@ def chosen_of(every: list[list[Shot]], folders: list[Path], frame: int, sheet: s
 
 def _shoot(shots: Sequence[Shot], look: Look, *, titled: bool) -> Iterator[Pixels]:
     """All from one place, in one range of colours. `titled`: each by the name of its run."""
-    bounds = union([bounds_of(shot, look) for shot in shots])
+    scope = union([scope_of(shot, look) for shot in shots])
     limits = look.limits or merged([range_of(shot, look.colour) for shot in shots])
-    if look.floor and is_flat(bounds):
+    if look.floor and scope.flat:
         raise InputError("--floor: a body in 2D has none")
-    with Stage(look, bounds, limits, study_of(shots[0].folder)) as stage:
+    with Stage(look, scope, limits, study_of(shots[0].folder)) as stage:
         for shot in shots:
             yield stage.shoot(shot, shot.folder.name if titled else None)
 

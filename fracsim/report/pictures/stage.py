@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .body import Body, body_of, shaded
-from .camera import aim, drawn_of, is_flat, pixel
+from .camera import Scope, aim, drawn_of, pixel
 from .colouring import colours, rgb, select, shown_range, titled
 from .floor import add_floor, add_shadow
 from .lettering import Legend, in_seconds, lettered
@@ -33,16 +33,16 @@ HAIR = 1.5  # pixels: what opens by less is drawn as a line
 class Stage:
     """A place to draw frames in, all from one place. A context manager: it ends with the driver's window."""
 
-    def __init__(self, look: Look, bounds: Values, limits: tuple[float, float] | None, study: dict[str, Any]) -> None:
-        """`bounds`: (6,) what is to be seen, m.    `limits`: of the colours, see `range_of`."""
+    def __init__(self, look: Look, scope: Scope, limits: tuple[float, float] | None, study: dict[str, Any]) -> None:
+        """`scope`: what is to be seen.    `limits`: of the colours, see `range_of`."""
         import pyvista
 
-        self.look, self.limits, self._study, self._flat = look, limits, study, is_flat(bounds)
+        self.look, self.limits, self._study, self._flat = look, limits, study, scope.flat
         self.skin = skin_of(look.skin or study.get("output", {}).get("look", "plain"))
-        self._lower, self._size = bounds[4], float(np.linalg.norm(bounds[1::2] - bounds[::2]))
+        self._scope, self._bounds = scope, scope.bounds
+        self._size = float(np.linalg.norm(np.diff(scope.bounds.reshape(3, 2))))
         self._plotter = pyvista.Plotter(off_screen=True, window_size=look.size, lighting="none")
         self._plotter.set_background(SKINS["plain"].backdrop if self._flat else self.skin.backdrop)
-        self._bounds = bounds
         self._light_up()
 
     def __enter__(self) -> Self:
@@ -56,7 +56,7 @@ class Stage:
         plotter, look = self._plotter, self.look
         plotter.suppress_rendering = True  # or all that is added would be drawn at once
         plotter.clear_actors()
-        aim(plotter, self._bounds, look)  # before what is drawn: the width of hairlines is in pixels
+        aim(plotter, self._scope, look)  # before what is drawn: the width of hairlines is in pixels
         grid = drawn_of(shot, look)
         self._add(body_of(grid))
         if not self._flat:
@@ -129,7 +129,7 @@ class Stage:
         there = [(file, name) for file, name in zip(shot.beside, shot.names, strict=True) if name in planes]
         floors = sorted(there, key=lambda each: -_level(planes[each[1]]))[:1]
         floors = [each for each in floors if _level(planes[each[1]]) > LEVEL]
-        normal, point = np.array([0.0, 0, 1]), np.array([*self._bounds.reshape(3, 2).mean(axis=1)[:2], self._lower])
+        normal, point = np.array([0.0, 0, 1]), np.array([*self._bounds.reshape(3, 2).mean(axis=1)[:2], self._bounds[4]])
         if floors:
             normal = planes[floors[0][1]] / np.linalg.norm(planes[floors[0][1]])
             drawn = np.asarray(pyvista.read(floors[0][0]).points, float)
