@@ -38,12 +38,14 @@ class Entry:
     Attributes:
         name: of its file.    text: what is seen.    runs: arguments of `fracsim run` with the name of the folder first.
         render: arguments of `fracsim render` but for its folders and files; without runs a module that draws the file.
+        film: all frames, as a GIF.
     """
 
     name: str
     text: str
     runs: tuple[tuple[str, str], ...]
     render: str
+    film: bool = False
 
 
 def one(study: str, text: str, render: str) -> Entry:
@@ -106,6 +108,10 @@ ENTRIES = (
     one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
     one("rigid-rods", "Rods of steel, bent and dented.", "--sheet 0,2,-1 --floor --view 0.25,-1.3,0.45"),
     one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor"),
+    Entry(
+        "rigid-vase-film", "The same as a film, twenty times as slow.", (("rigid-vase", "rigid-vase"),),
+        "--floor --size 520x340 --fps 5", film=True,
+    ),
     one("rigid-figure", "A jade figure thrown at a wall.", "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor"),
     one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor"),
     one("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6"),
@@ -167,7 +173,8 @@ def draw(entry: Entry) -> None:
         subprocess.run(["fracsim", "render", *folders, "-o", str(target), *shlex.split(entry.render)], check=True)
     else:
         subprocess.run([sys.executable, "-m", entry.render, str(target)], check=True)
-    make_small(target)
+    if not entry.film:
+        make_small(target)
 
 
 def has_ended(folder: Path) -> bool:
@@ -190,17 +197,20 @@ def make_small(path: Path) -> None:
 
 def picture_of(entry: Entry) -> Path:
     """Beside the page."""
-    return PAGE.parent / "gallery" / f"{entry.name}.png"
+    return PAGE.parent / "gallery" / f"{entry.name}.{'gif' if entry.film else 'png'}"
 
 
 def text_of(entry: Entry) -> str:
     """Its part of the page."""
     lines = [f"    ./env fracsim run {arguments} -o {RUNS / folder}" for folder, arguments in entry.runs]
     folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
-    last = f"fracsim render {folders} {entry.render}" if entry.runs else f"python3 -m {entry.render} {entry.name}.png"
+    file = picture_of(entry).name
+    last = f"python3 -m {entry.render} {file}"
+    if entry.runs:
+        last = f"fracsim render {folders} {entry.render}" + (f" -o {file}" if entry.film else "")
     body = "\n".join([*lines, f"    ./env {last}"])
     said = f"{entry.text} {figures(entry)}".rstrip()
-    return f"## {entry.name}\n\n![{entry.text}](gallery/{entry.name}.png)\n\n{said}\n\n{body}\n\n"
+    return f"## {entry.name}\n\n![{entry.text}](gallery/{file})\n\n{said}\n\n{body}\n\n"
 
 
 def figures(entry: Entry) -> str:
