@@ -15,6 +15,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 import fracsim.rigid.newton as newton_room
 from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.course import Course
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.finding import Finder
 from fracsim.rigid.model import Part, Rules, Stand, model_of
@@ -338,9 +339,10 @@ def test_a_round_body_meets_a_floor_with_few_of_its_corners() -> None:
     angle = np.pi * (3 - np.sqrt(5)) * number
     ball = 0.5 * np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
     bodies = replace(cubes([[0.0, 0.0, 0.6]]), velocity=np.array([[0.0, 0.0, -20.0]]))
-    rules, reach, still = Rules(2e-2, DOWN), np.array([2e-2 * 20.0]), np.zeros(1)
-    find = Finder(model_of(bodies, [[ball]], [floor()], rules))
-    assert 6 <= len(find(bodies, np.zeros((1, 3)), [reach, reach], [still, still], rules.step)) <= 24
+    rules, reach, still = Rules(2e-2, DOWN), np.array([2e-2 * 20.0]), np.zeros((1, 3))
+    model = model_of(bodies, [[ball]], [floor()], rules)
+    course, looked = Course(still, np.zeros(3), [reach, reach]), model.planes.looked()
+    assert 6 <= len(Finder(model)(bodies, still, course, rules.step, looked)) <= 24
     after, _ = Engine(bodies, [[ball]], [floor()], rules).advance(bodies)
     low = (ball @ after.turn[0].T + after.place[0])[:, 2].min()
     assert -5e-4 < low < 5e-3

@@ -13,6 +13,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.mechanics.contact.shapes import Sphere
 from fracsim.rigid.contacts import Contacts
+from fracsim.rigid.course import Course
 from fracsim.rigid.finding import Finder
 from fracsim.rigid.model import Rules, Stand, model_of
 from fracsim.rigid.primitives import primitive
@@ -34,12 +35,15 @@ def test_some_bodies_meet_what_they_meet_among_all() -> None:
     bodies = cubes((1.1 * np.indices((4, 4, 4)).reshape(3, -1).T + 0.6).tolist())
     bodies = replace(bodies, turn=Rotation.random(64, rng=rng).as_matrix(), velocity=rng.normal(size=(64, 3)))
     ball = Stand(primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
-    find = Finder(model_of(bodies, [[CUBE]] * 64, [floor(0.5), ball], Rules(5e-3, DOWN, 0.4)))
-    ways, reach, slide = np.array([[0.0, 0, 0], [1.0, 1.0, -0.2]]), [*rng.uniform(0.01, 0.3, (2, 64))], 2 * [np.ones(2)]
+    model = model_of(bodies, [[CUBE]] * 64, [floor(0.5), ball], Rules(5e-3, DOWN, 0.4))
+    find, looked = Finder(model), model.planes.looked()
+    rates: Values = np.tile([200.0, 0.0, 0.0], (2, 1))  # 1 m a step
+    course = Course(rates, np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 64))])
+    ways: Values = np.array([[0.0, 0, 0], [1.0, 1.0, -0.2]])
     some = np.append([True], rng.uniform(size=63) < 0.3)
-    every, chosen = (find(bodies, ways, reach, slide, 5e-3, only) for only in (None, some))
+    every, chosen = (find(bodies, ways, course, 5e-3, looked, only) for only in (None, some))
     met = np.append(some, [False, False])[every.things].any(axis=1)
     assert {64, 65} <= set(every.things[met].ravel()) and 50 < np.count_nonzero(met) < len(every) - 50
     assert np.array_equal(told(chosen), told(every.chosen(np.flatnonzero(met))))
-    again = find(bodies, ways, reach, slide, 5e-3)
+    again = find(bodies, ways, course, 5e-3, looked)
     assert np.array_equal(told(again), told(every)), "and all are looked for afterwards"

@@ -11,11 +11,14 @@ import trimesh
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
+import fracsim.rigid.engine as engine_room
+import fracsim.rigid.striking as striking_room
 from fracsim.mesh.split.build import split
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.meeting import SOON
-from fracsim.rigid.model import SLOW
+from fracsim.rigid.model import SLOW, Model
+from fracsim.rigid.motion import flown
 from fracsim.rigid.newton import HARD
 from fracsim.rigid.stepper import RigidState, RigidStepper
 from fracsim.rigid.touches import Touches
@@ -67,20 +70,21 @@ class Watch:
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     """Of the steps of an engine."""
-    found, advance, flown = Watch(), Engine.advance, Engine._flown
+    found, advance = Watch(), Engine.advance
 
     def watched(self: Engine, *how: Any) -> tuple[Bodies, Touches]:
         found.bent = 0.0
         moved, found.touches = advance(self, *how)
         return moved, found.touches
 
-    def flies(self: Engine, bodies: Bodies, time: Values) -> Bodies:
+    def flies(model: Model, bodies: Bodies, time: Values) -> Bodies:
         turned = np.linalg.norm(bodies.spin, axis=1) * time
-        found.bent += float((self._model.extent * turned**2).max())
-        return flown(self, bodies, time)
+        found.bent += float((model.extent * turned**2).max())
+        return flown(model, bodies, time)
 
     monkeypatch.setattr(Engine, "advance", watched)
-    monkeypatch.setattr(Engine, "_flown", flies)
+    monkeypatch.setattr(engine_room, "flown", flies)
+    monkeypatch.setattr(striking_room, "flown", flies)
     return found
 
 

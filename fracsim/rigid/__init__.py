@@ -27,7 +27,11 @@ model        the scene as MuJoCo has it; this and the next two alone import it
 finding      MuJoCo finds contacts
 newton       MuJoCo solves for what few contacts give
 crowd        and projected gradients for what many do, in C (crowd.c)
-engine       a step of motion: what meets what, and what that gives
+engine       a step of motion: rounds of what meets what, and what that gives
+striking     what meets in the events of a step, and where bodies are then
+pushing      what the contacts of an event give
+motion       how bodies fly, and are driven on
+course       how far things come in a step
 contacts     where they are, and how fast things come together there
 planes       those of hulls with planes
 meeting      the law that they follow

@@ -15,7 +15,7 @@ along the normal; what is driven is where it was as the step began.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from .bodies import Bodies
 from .contacts import Contacts
+from .course import Course
 from .meeting import SOON, Meetings
 from .siblings import Parting
 
@@ -33,26 +34,18 @@ Kin = Callable[[Ints], Ints]  # of bodies (m,): the number c of what each is a p
 
 
 @dataclass(frozen=True)
-class Course:
-    """How far things come in a step: no point of a body comes farther than a `reach` (n,) beside what moves with a
-    `common` velocity (3,), and than another (n,) beside what stands, m; that goes at `rates` (stands, 3), m/s."""
-
-    rates: Values
-    common: Values
-    reach: Sequence[Values]
-
-
-@dataclass(frozen=True)
 class Stage:
     """Which event of a step: the only one, where it is not taken apart.
 
     Attributes:
-        gravity: (3,) m/s^2 that acts in it: in the first.    begun: (n,) shares of the step that bodies have come
-        through, None where it is not taken apart.    after: so many events may follow.
-        quick: m/s, what is slower strikes nothing.    first: whether it is the first one.
+        gravity: (3,) m/s^2 that acts in it: in the first.    parting: how overlaps stand as it begins.
+        begun: (n,) shares of the step that bodies have come through, None where it is not taken apart.
+        after: so many events may follow.    quick: m/s, what is slower strikes nothing.
+        first: whether it is the first one.
     """
 
     gravity: Values
+    parting: Parting
     begun: Values | None = None
     after: int = 0
     quick: float = 0.0
@@ -68,9 +61,9 @@ class Stage:
         """(n,) shares of the step that bodies have come through."""
         return 0.0 if self.begun is None else self.begun
 
-    def after_it(self, share: Values) -> Stage:
+    def after_it(self, share: Values, parting: Parting) -> Stage:
         """The next one, of bodies that have come through shares (n,)."""
-        return Stage(0 * self.gravity, share, self.after - 1, self.quick, first=False)
+        return Stage(0 * self.gravity, parting, share, self.after - 1, self.quick, first=False)
 
 
 class Event:
@@ -79,7 +72,7 @@ class Event:
     Attributes:
         stage, course: which, and how far things come.    before: what was near bodies as it began.
         bodies: where they are struck, after the share (n,) of the step.    contacts, meeting: k of them.
-        parting: how overlaps stand.    near: (k,) those that are looked at so far.
+        parting: how overlaps stand in it.    near: (k,) those that are looked at so far.
         impulse: (k, 3) of them so far, along their axes, N s.
     """
 
@@ -106,6 +99,11 @@ class Event:
     def strikes(self) -> Flags:
         """(k,) what strikes in it."""
         return (self.meeting.closing > 0) & ~self.meeting.waits
+
+    def taken_apart(self, events: int) -> Stage:
+        """The first of at most so many, instead of it."""
+        quick = SOON * float(self.meeting.closing.max())
+        return Stage(self.stage.gravity, self.stage.parting, np.zeros(len(self.bodies)), events - 1, quick)
 
 
 def behind(event: Event, waits: Flags, near: float, count: int, kin: Kin) -> bool:

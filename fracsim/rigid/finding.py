@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +10,9 @@ from ..errors import NotConverged
 from ..mechanics.contact.axes import frame
 from .bodies import Bodies
 from .contacts import Contacts
+from .course import Course
 from .model import Model, orientation
+from .planes import Looked
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -28,13 +28,13 @@ class Finder:
         self._kind = model.made.geom_contype.copy(), model.made.body_contype.copy()
 
     def __call__(
-        self, bodies: Bodies, ways: Values, reach: Sequence[Values], slide: Sequence[Values], step: float,
-        only: Flags | None = None,
-    ) -> Contacts:  # fmt: skip
-        """What comes together in a step, s, by reaches (n,) of bodies, beside what moves as most do and beside what
-        stands, and (stands,) of what stands at `ways` (stands, 3), likewise, m; `only`: (n,) of some bodies, what
-        others have with one another and with what stands is not looked for."""
+        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None
+    ) -> Contacts:
+        """What comes together in a step, s, of a course, what stands being at `ways` (stands, 3), m; `looked`: at
+        corners over planes in it; `only`: (n,) of some bodies, what others have with one another and with what stands
+        is not looked for."""
         model, made, data, n = self._model, self._model.made, self._data, self._count
+        reach, slide = course.reach, course.slide(step)
         of_thing = np.concatenate([reach[0], slide[0]])
         made.body_pos[1 : n + 1], made.body_pos[n + 1 :] = bodies.place, ways[model.driven]
         made.body_quat[1 : n + 1] = orientation(bodies.turn)
@@ -54,7 +54,7 @@ class Finder:
             geoms, model.thing[geoms], found.pos.reshape(-1, 3).copy(), found.frame.reshape(-1, 3, 3).copy(),
             found.dist.copy(), found.friction[:, 0].copy(), places
         )  # fmt: skip
-        for each in self._of_planes(bodies, ways, reach[1], slide[1], step, only):
+        for each in self._of_planes(bodies, ways, reach[1], slide[1], step, looked, only):
             every = every.and_more(each)
         return every
 
@@ -69,11 +69,12 @@ class Finder:
             made.body_contype[0], made.body_contype[1 : n + 1][~only], made.body_contype[n + 1 :] = 0, 0, 0
 
     def _of_planes(
-        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, only: Flags | None
-    ) -> list[Contacts]:
+        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, looked: Looked,
+        only: Flags | None,
+    ) -> list[Contacts]:  # fmt: skip
         """Contacts of hulls with planes: the first thing is the plane."""
         planes, model, places, found = self._model.planes, self._model, np.concatenate([bodies.place, ways]), []
-        for number, parts, gaps, points in planes.near(bodies, ways, reach, speeds, step, only):
+        for number, parts, gaps, points in planes.near(bodies, ways, reach, speeds, step, looked, only):
             geoms = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
             axes = np.tile(frame(planes.normal[number])[:, [2, 0, 1]].T, (len(parts), 1, 1))
             friction = np.full(len(parts), planes.friction[number])

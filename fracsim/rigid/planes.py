@@ -7,7 +7,7 @@ looked at once more with these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -45,8 +45,9 @@ def _bearing(of: Ints, arm: Values, normal: Values, later: Values) -> Flags:
 
 
 @dataclass
-class _Looked:
-    """(p, N) corners that were looked at when it was last asked for what is near, and those that are in any case."""
+class Looked:
+    """(p, N) corners that were looked at in a step when it was last asked for what is near, and those that are in any
+    case."""
 
     at: Flags
     always: Flags
@@ -70,20 +71,16 @@ class Planes:
     of: Ints
     part: Ints
     extent: Values
-    _looked: _Looked = field(init=False)
 
-    def __post_init__(self) -> None:
+    def looked(self) -> Looked:
+        """As a step begins: nothing has been missed in it."""
         none = np.zeros((len(self.stand), len(self.corners)), bool)
-        object.__setattr__(self, "_looked", _Looked(none, none.copy()))
+        return Looked(none, none.copy())
 
-    def begin(self) -> None:
-        """A step: nothing has been missed in it."""
-        self._looked.always[:] = False
-
-    def missed(self, bodies: Bodies, ways: Values, deep: float) -> Flags:
+    def missed(self, bodies: Bodies, ways: Values, deep: float, looked: Looked) -> Flags:
         """(n,) bodies with corners that are in a plane by more than `deep`, m, and were not looked at: now they are, in
         this step, as far as they bear. `bodies`, `ways`: (stands, 3) where things are after it."""
-        looked, found = self._looked, np.zeros(len(bodies), bool)
+        found = np.zeros(len(bodies), bool)
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
             near, gap = self._around(bodies, ways[stand], normal, np.zeros(len(bodies)))
             rows = np.flatnonzero((gap < -deep) & ~looked.at[number, near])
@@ -109,8 +106,9 @@ class Planes:
         return np.asarray(np.einsum("kij,kj->ki", bodies.turn[self.of[corners]], self.corners[corners]))
 
     def near(
-        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, only: Flags | None = None
-    ) -> list[tuple[int, Ints, Values, Values]]:
+        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, looked: Looked,
+        only: Flags | None = None,
+    ) -> list[tuple[int, Ints, Values, Values]]:  # fmt: skip
         """Of each plane that anything is near to: its number here, the parts (k,) that are, the distances (k,) of
         corners and the points (k, 3), m. `ways`, `speeds`: (stands, 3) and (stands,) where planes are and what they
         come in a step, m; `reach`: (n,) what bodies do; `step`: s; `only`: (n,) of these bodies."""
@@ -119,8 +117,8 @@ class Planes:
         found = []
         for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
             near, gap = self._around(bodies, ways[stand], normal, reach + speeds[stand], only)
-            looked, always = self._looked.at[number], self._looked.always[number]
-            looked[slice(None) if only is None else only[self.of]] = False
+            seen, always = looked.at[number], looked.always[number]
+            seen[slice(None) if only is None else only[self.of]] = False
             rows = np.flatnonzero((gap < reach[self.of[near]] + speeds[stand]) | always[near])
             if len(rows):
                 near, of, gap = near[rows], self.of[near[rows]], gap[rows]
@@ -130,7 +128,7 @@ class Planes:
                 soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
                 kept = _first(of, gap, NEAREST) | always[near]
                 kept[soon] |= _bearing(of[soon], arms[soon], normal, (gap - way)[soon])
-                looked[near[kept]] = True
+                seen[near[kept]] = True
                 points = x[kept] - gap[kept, None] / 2 * normal
                 found.append((number, self.part[near[kept]], gap[kept], points))
         return found

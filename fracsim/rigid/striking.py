@@ -1,0 +1,174 @@
+"""What comes together in the events of a step, first and after one another: where bodies are then, and what is near.
+
+Mostly a step has one event; see rigid.events for those that are taken apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from .bodies import Bodies
+from .contacts import Contacts
+from .course import Course, course_of
+from .events import Event, Kin, Stage, behind, so_far
+from .finding import Finder
+from .lifting import lifts, raised
+from .meeting import Meetings, flown_together, later, meetings, meetings_apart
+from .meeting import flown as flown_before
+from .model import Model, Rules
+from .motion import flown, of_things
+from .planes import Looked
+from .pushing import crowded
+from .siblings import Parting
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+EVENTS, OF_CROWD = 6, 3  # of a step that is taken apart, at most: of few contacts, and of a crowd
+
+
+@dataclass(frozen=True)
+class Again:
+    """An `event` as the round before had it, without what comes `far`ther (n,) than was thought: of what was near as it
+    began contacts `kept` are still known, the first ones."""
+
+    event: Event
+    far: Flags
+    kept: Ints
+
+
+class Striking:
+    """In one step of the bodies of a model."""
+
+    def __init__(
+        self, model: Model, rules: Rules, finder: Finder, ways: Values, looked: Looked, kin: Kin | None
+    ) -> None:  # fmt: skip
+        """`ways`: (stands, 3) where what stands is as the step begins, m; `looked`: at corners over planes, in this
+        step; `kin`: of what may break (None: nothing does)."""
+        self._model, self._rules, self._finder, self._kin = model, rules, finder, kin
+        self._ways, self._looked, self._count = ways, looked, len(model.mass)
+
+    def first(self, start: Bodies, parting: Parting, course: Course, known: Event | None, far: Flags) -> Event:
+        """What comes together first in the step, which begins with `parting` as overlaps stand; `known` so far, without
+        what comes `far`ther (n,) than was thought."""
+        before, same = self._renewed(start, course, known.before if known else None, far)
+        again = Again(known, far, same) if known else None
+        stage = Stage(self._rules.gravity, parting)
+        if known and not known.last:
+            stage = replace(known.stage, parting=parting)
+        event, kept = self._event(start, before, stage, course, again)
+        if event.last and self._goes_on(event):
+            events = OF_CROWD if crowded(event) else EVENTS
+            event, kept = self._event(start, before, event.taken_apart(events), course, again)
+        if known:
+            event.near[: len(kept)] |= known.near[kept]
+            event.near &= ~event.waits
+            event.impulse[: len(kept)] = known.impulse[kept]
+        return event
+
+    def after(self, met: Event, bodies: Bodies) -> Event | None:
+        """The event after one that left bodies with these velocities; None where they meet nothing else."""
+        model, rules, rates = self._model, self._rules, met.course.rates
+        far = met.course.farther(course_of(model, rules, bodies, rates, met.course.common))
+        course = course_of(model, rules, bodies, rates)
+        contacts, kept = self._renewed(bodies, course, met.contacts, far)
+        stage = met.stage.after_it(met.share, met.parting)
+        struck = _rows(met.near & met.strikes, kept, len(contacts))
+        if not np.any(self._meeting(contacts, bodies, rates, stage, met.share, struck)[0].closing):
+            return None
+        return self._event(bodies, contacts, stage, course, struck=struck)[0]
+
+    def _goes_on(self, met: Event) -> bool:
+        """Whether the step is to be taken apart."""
+        if self._kin is None:
+            return False
+        rules, meeting = self._rules, met.meeting
+        waits = later(meeting.gap, meeting.closing, rules.step, rules.fast)
+        return behind(met, waits, rules.fast * rules.step, self._count, self._kin)
+
+    def _event(
+        self, start: Bodies, before: Contacts, stage: Stage, course: Course, again: Again | None = None,
+        struck: Flags | None = None,
+    ) -> tuple[Event, Ints]:  # fmt: skip
+        """An event of bodies near to which is `before`, of which some have `struck` (k,) where they are; and which
+        contacts that were known are kept, the first ones."""
+        meeting, parting = self._meeting(before, start, course.rates, stage, stage.begun, struck)
+        share = self._flights(meeting, before, stage)
+        flies = share > stage.since
+        time = self._rules.step * (share - stage.since)
+        fallen = time[:, None] * stage.gravity
+        bodies = self._flown(start, time, fallen) if np.any(flies) else start
+        contacts, kept = self._near(bodies, before, course, share, flies, again)
+        if np.any(flies):
+            lift = lifts(before, contacts, flies & stage.first)
+            bodies = replace(bodies, place=bodies.place + lift)
+            falling, lifted = replace(bodies, velocity=bodies.velocity + fallen), raised(contacts, lift)
+            struck = None if struck is None else _rows(struck, kept, len(contacts))
+            past, landed = share if stage.apart else None, replace(contacts, gap=lifted)
+            meeting, parting = self._meeting(landed, falling, course.rates, stage, past, struck)
+        return Event(stage, course, before, bodies, share, contacts, meeting, parting), kept
+
+    def _flights(self, meeting: Meetings, contacts: Contacts, stage: Stage) -> Values:
+        """(n,) share of the step at which bodies are struck in an event."""
+        if stage.begun is None:
+            return flown_before(meeting, contacts.things, self._count)
+        return flown_together(meeting, contacts.things, stage.begun, self._rules.fast * self._rules.step)
+
+    def _flown(self, start: Bodies, time: Values, fallen: Values) -> Bodies:
+        """The bodies after times (n,) s in which they gain velocities (n, 3) m/s, which they are left without."""
+        flying = replace(start, velocity=start.velocity + fallen / 2)
+        return replace(flown(self._model, flying, time), velocity=start.velocity)
+
+    def _near(
+        self, bodies: Bodies, before: Contacts, course: Course, share: Values, flies: Flags, again: Again | None
+    ) -> tuple[Contacts, Ints]:
+        """What is near bodies that are struck after shares (n,) of the step, and which contacts known are kept."""
+        if again is None:
+            return self._renewed(bodies, course, before, flies)
+        event = again.event
+        if event.contacts is event.before and not np.any(flies):
+            return before, again.kept
+        return self._renewed(bodies, course, event.contacts, again.far | (share != event.share))
+
+    def _renewed(self, bodies: Bodies, course: Course, known: Contacts | None, others: Flags) -> tuple[Contacts, Ints]:
+        """Contacts `known`, those of bodies (n,) that are `others` now found again; and which are kept, which are the
+        first. What of a crowd flies or goes farther is little of it."""
+        if known is None:
+            return self._find(bodies, course), np.empty(0, np.int64)
+        stays = np.append(~others, np.ones(len(course.rates), bool))
+        kept = np.flatnonzero(stays[known.things].all(axis=1))
+        if not np.any(others):
+            return known, kept
+        return known.chosen(kept).and_more(self._find(bodies, course, others)), kept
+
+    def _find(self, bodies: Bodies, course: Course, only: Flags | None = None) -> Contacts:
+        """Contacts of what comes together within the step, of all bodies or `only` some (n,)."""
+        return self._finder(bodies, self._ways, course, self._rules.step, self._looked, only)
+
+    def _meeting(
+        self, contacts: Contacts, bodies: Bodies, rates: Values, stage: Stage, past: Values | None,
+        struck: Flags | None,
+    ) -> tuple[Meetings, Parting]:  # fmt: skip
+        """How contacts act in a step, or at shares `past` (n,) of one that is taken apart, those but that have `struck`
+        (k,), and how overlaps stand."""
+        rules, motion = self._rules, of_things(bodies, rates)
+        gap, parting = stage.parting(contacts.geoms, contacts.things, contacts.gap)
+        closing = contacts.closing(*motion)
+        if past is None:
+            return meetings(gap, closing, rules.step, rules.fast, rules.restitution), parting
+        gap, come, rest = so_far(contacts, gap, motion, rates, past, rules.step)
+        strikes = closing > max(rules.fast, stage.quick)
+        if struck is not None:
+            strikes &= ~struck
+        return meetings_apart(gap, closing, rules.step, rules.fast, rules.restitution, come, rest, strikes), parting
+
+
+def _rows(flags: Flags, kept: Ints, count: int) -> Flags:
+    """(count,) the flags of those that were kept, which are the first."""
+    found = np.zeros(count, bool)
+    found[: len(kept)] = flags[kept]
+    return found
