@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
+from fracsim.mechanics import lanes
 from fracsim.mechanics.lanes import MatrixLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
 from support.scenes import Values
@@ -14,23 +15,25 @@ from test_dead_cells import damaged
 SIDE = [{"on": "left", "displacement": [0.1, "free", "free"]}]
 
 
-def summed(form: fem.Form, bcs: list[fem.DirichletBC], code: object, *, by_blocks: bool) -> Values:
-    """Entries of a form in a matrix with room for just them; `code`: None for DOLFINx's own way."""
+def summed(form: fem.Form, bcs: list[fem.DirichletBC], *, lanes: bool, by_blocks: bool) -> Values:
+    """Entries of a form in a matrix with room for just them."""
     assembly = Assembly(form)
     if by_blocks:
         assembly.use_blocks()
-    assembly._lanes = {form: None if code is None else MatrixLanes(form, code, assembly._sum)}
     assembly._sum.data[:] = 0.0
-    assembly._add(form, bcs)
+    if lanes:
+        several = MatrixLanes.of(form, assembly._sum)
+        assert several is not None
+        several.add(assembly._sum, bcs)
+    else:
+        fem.assemble_matrix(assembly._sum, form, bcs)  # type: ignore[arg-type]
     values: Values = assembly._sum.data.copy()
     return values
 
 
 def assert_as_one_by_one(form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
-    code = compiled(form)
-    assert code is not None
     for by_blocks in (True, False):
-        ours, theirs = (summed(form, bcs, each, by_blocks=by_blocks) for each in (code, None))
+        ours, theirs = (summed(form, bcs, lanes=lanes, by_blocks=by_blocks) for lanes in (True, False))
         largest = np.abs(theirs[theirs != 1.0]).max()  # beside rows of prescribed dofs
         assert largest > 0
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-13 * largest)
@@ -105,12 +108,12 @@ def test_cells_without_room() -> None:
     form = balance.stiffness.form
     assembly = Assembly(form)
     assembly.use_blocks()
-    lanes = MatrixLanes(form, compiled(form), assembly._sum)
-    lanes.add(assembly._sum, [])
+    several = MatrixLanes(form, compiled(form), assembly._sum)
+    several.add(assembly._sum, [])
     balance.stress.chi.x.array[:] = 1.0
     balance.damage_changed()
     with pytest.raises(ValueError, match="no place for cell"):
-        lanes.add(assembly._sum, [])
+        several.add(assembly._sum, [])
 
 
 @pytest.mark.parametrize("line", ("double s = a > b ? a : b;", "double s = pow(a, b);"))
@@ -119,3 +122,18 @@ def test_what_lanes_cannot_do(line: str) -> None:
     kernel = "\nvoid tabulate_tensor_x(double* A)\n{{\n{0}\n}}\n\nbool enabled_x[1] = {{1}};\n\nufcx_integral x\n"
     assert in_lanes(kernel.format("double s = fabs(a);")) == "{\nreal s = (fabs(a)) - zero;\n}\n"
     assert in_lanes(kernel.format(line)) is None
+    assert in_lanes("double s = fabs(a);") is in_lanes("\nvoid tabulate_tensor_x(double* A);\n") is None
+
+
+def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Kernels of FFCx may be there from before: nobody else misses it. What nobody expects is not kept quiet."""
+    balance = damaged("damped", 3, boundary=SIDE)[0].balance
+    monkeypatch.setattr(lanes, "_said", [])
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert compiled(balance._work) is compiled(balance.stiffness.form) is None
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and told[0].startswith("fracsim: note: cells are taken one by one")
+    assert "no-such-compiler" in told[0] and told[0].endswith("install a C compiler, or name yours in CC")
+    monkeypatch.setattr(lanes, "SOURCE", None)
+    with pytest.raises(AttributeError):
+        compiled(balance._work)

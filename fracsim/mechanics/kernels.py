@@ -59,8 +59,22 @@ PATIENCE = 60  # s that a process waits for a kernel that another one compiles; 
 MANY = 10_000  # dofs from which on it pays to compile a form once more, for 1 to 2 s, for several cells at a time
 
 
-def is_large(form: fem.Form) -> bool:
-    """Whether it is to be assembled several cells at a time, if that can be done (mechanics.lanes)."""
+class OfLarge[Lanes]:
+    """What takes several cells of a form at a time (mechanics.lanes), made where it is first asked for."""
+
+    def __init__(self, make: Callable[[fem.Form], Lanes | None]) -> None:
+        """`make`: None where it cannot be done."""
+        self._make = make
+        self._made: dict[fem.Form, Lanes | None] = {}
+
+    def __call__(self, form: fem.Form) -> Lanes | None:
+        """That of a form; None where it does not pay, or cannot be done (collective the first time)."""
+        if form not in self._made and _is_large(form):
+            self._made[form] = self._make(form)
+        return self._made.get(form)
+
+
+def _is_large(form: fem.Form) -> bool:
     dofmap = form.function_spaces[0].dofmap
     return bool(dofmap.index_map.size_global * dofmap.index_map_bs >= MANY)
 

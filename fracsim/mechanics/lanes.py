@@ -10,15 +10,17 @@ DOLFINx's work.
 from __future__ import annotations
 
 import re
+import sys
 from ctypes import CDLL, Structure, byref, c_int64, c_void_p
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem, la
 from dolfinx.jit import mpi_jit_decorator
 
+from ..errors import InputError
 from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
 from .compiled import at, built
 
@@ -44,6 +46,12 @@ class _Form(Structure):
 
 class Lanes:
     """A form of cells, whose kernel takes several at a time."""
+
+    @classmethod
+    def of(cls, form: fem.Form, *more: Any) -> Self | None:
+        """Those of a form, where that can be done; `more`: what the class takes beside it (collective)."""
+        code = compiled(form)
+        return None if code is None else cls(form, code, *more)
 
     def __init__(self, form: fem.Form, code: CDLL) -> None:
         """`code`: what `compiled` has made of the form."""
@@ -108,27 +116,37 @@ def compiled(form: fem.Form) -> CDLL | None:
     if sizes["NODES"] > corners:  # bent cells gain half as much, and take 15 s to compile
         return None
     kernel = Path(str(form.module.__file__))  # type: ignore[union-attr]
-    try:
-        code: CDLL | None = _library(form.mesh.comm, kernel.with_name(kernel.name.split(".")[0] + ".c"), sizes)
-    except Exception:  # of a compiler that has no vectors, or of C that is written otherwise some day
+    comm = form.mesh.comm
+    made = _library(comm, kernel.with_name(kernel.name.split(".")[0] + ".c"), sizes)
+    if isinstance(made, Exception):
+        if comm.rank == 0 and not _said:
+            print(f"fracsim: note: cells are taken one by one, which takes longer: {made}", file=sys.stderr)
+        _said.append(made)
         return None
-    return code
+    return made
+
+
+_said: list[Exception] = []  # why there was no library: it is told once
 
 
 @mpi_jit_decorator  # type: ignore[misc]
-def _library(source: Path, sizes: dict[str, int]) -> CDLL | None:
-    """What FFCx wrote, compiled once more."""
-    if (kernel := in_lanes(source.read_text())) is None:
-        return None
-    functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
-    text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
-    return built("lanes", text, [*_FLAGS, *(f"-D{name}={value}" for name, value in sizes.items())])
+def _library(source: Path, sizes: dict[str, int]) -> CDLL | Exception | None:
+    """What FFCx wrote, compiled once more; why not, where there is no compiler any more, none that has vectors, or no
+    place to keep it in: FFCx's kernel may be an old one."""
+    try:
+        if (kernel := in_lanes(source.read_text())) is None:
+            return None
+        functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
+        text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
+        return built("lanes", text, [*_FLAGS, *(f"-D{name}={value}" for name, value in sizes.items())])
+    except (InputError, OSError) as error:
+        return error
 
 
 def in_lanes(source: str) -> str | None:
     """The body of the only kernel in FFCx's C, for numbers with lanes; None where it does what those cannot."""
     _, *kernels = source.split("\nvoid tabulate_tensor_")
-    if len(kernels) != 1:
+    if len(kernels) != 1 or "{" not in kernels[0] or "\nufcx_integral " not in kernels[0]:
         return None
     body = kernels[0][kernels[0].index("{") : kernels[0].index("\nufcx_integral ")].split("\nbool enabled_")[0]
     called = set(re.findall(r"\b([A-Za-z_]\w*) *\(", re.sub(r"//.*", "", body)))

@@ -22,7 +22,7 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr
 from ..mesh.ranks import total
-from .kernels import is_large
+from .kernels import OfLarge
 
 if TYPE_CHECKING:
     from .lanes import MatrixLanes
@@ -63,7 +63,7 @@ class Assembly:
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._lanes: dict[fem.Form, MatrixLanes | None] = {}
+        self._lanes = OfLarge(self._in_lanes)
         self._sum = block_csr(pattern) if by_blocks else expanded_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
@@ -119,16 +119,16 @@ class Assembly:
         self._behind = True
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
-        """Add a form to the sum, several cells at a time where that pays and can be done."""
-        if form not in self._lanes and is_large(form):
-            from .lanes import MatrixLanes, compiled
-
-            code = compiled(form)
-            self._lanes[form] = None if code is None else MatrixLanes(form, code, self._sum)
-        if (lanes := self._lanes.get(form)) is None:
+        """Add a form to the sum (collective the first time)."""
+        if (lanes := self._lanes(form)) is None:
             fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         else:
             lanes.add(self._sum, bcs)
+
+    def _in_lanes(self, form: fem.Form) -> MatrixLanes | None:
+        from .lanes import MatrixLanes
+
+        return MatrixLanes.of(form, self._sum)
 
     def bring(self) -> None:
         """Bring the matrix to where the blocks are, if there are any (collective)."""

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import assemble_into, create_vector
 from ..mesh.domain import Domain
-from .kernels import is_large
+from .kernels import OfLarge
 
 if TYPE_CHECKING:
     from .lanes import VectorLanes
@@ -30,7 +30,7 @@ class Assembler:
         self.domain = domain
         self.owned = domain.node_count * domain.dim
         self._kept = self.vector()
-        self._lanes: dict[fem.Form, VectorLanes | None] = {}
+        self._lanes = OfLarge(_in_lanes)
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the dofs, ghosts included."""
@@ -45,23 +45,14 @@ class Assembler:
         return self.summed(self.into_unsummed(b, form))
 
     def into_unsummed(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
-        """This rank's part alone into b; returns b."""
+        """This rank's part alone into b; returns b (collective the first time)."""
         with b.localForm() as local:
             local.set(0.0)
-            if (lanes := self._in_lanes(form)) is not None:
+            if (lanes := self._lanes(form)) is not None:
                 lanes.add(local.array_w)
         if lanes is None:
             assemble_into(b, form)
         return b
-
-    def _in_lanes(self, form: fem.Form) -> VectorLanes | None:
-        """The form of several cells at a time, where that pays and can be done (collective the first time)."""
-        if form not in self._lanes and is_large(form):
-            from .lanes import VectorLanes, compiled
-
-            code = compiled(form)
-            self._lanes[form] = None if code is None else VectorLanes(form, code)
-        return self._lanes.get(form)
 
     def summed(self, b: PETSc.Vec) -> PETSc.Vec:
         """b with the parts that other ranks have assembled for its owned dofs (collective)."""
@@ -71,3 +62,9 @@ class Assembler:
     def destroy(self) -> None:
         """Give the memory back."""
         self._kept.destroy()
+
+
+def _in_lanes(form: fem.Form) -> VectorLanes | None:
+    from .lanes import VectorLanes
+
+    return VectorLanes.of(form)
