@@ -67,16 +67,15 @@ class Engine:
         does).
 
         What is struck goes farther than it would have, and what it meets there is looked for in rounds."""
-        model, rules, parting = self._model, self._rules, self._parting
+        model, rules = self._model, self._rules
         rates: Values = np.zeros_like(self._way) if ways is None else np.asarray((ways - self._way) / rules.step)
         course, end = course_of(model, rules, bodies, rates), self._way if ways is None else ways
         looked, known = model.planes.looked(), None
         far: Flags = np.ones(self._count, bool)
-        strikes = Striking(model, rules, self._finder, self._way, looked, kin)
+        strikes = Striking(model, rules, self._finder, self._way, looked, self._parting, kin)
         for _ in range(ROUNDS):
-            met = known = strikes.first(bodies, parting, course, known, far)
+            met = known = strikes.first(bodies, course, known, far)
             moved, touches, last, done = self._moved(bodies, met, strikes, rough=True)
-            parting = last.parting
             # what is struck in an event but the last has been looked for again with what that left it
             far = last.last & last.course.farther(course_of(model, rules, moved, rates, last.course.common))
             far |= model.planes.missed(moved, end, MISSED * rules.fast * rules.step, looked)

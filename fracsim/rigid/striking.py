@@ -45,21 +45,19 @@ class Striking:
     """In one step of the bodies of a model."""
 
     def __init__(
-        self, model: Model, rules: Rules, finder: Finder, ways: Values, looked: Looked, kin: Kin | None
+        self, model: Model, rules: Rules, finder: Finder, ways: Values, looked: Looked, parting: Parting,
+        kin: Kin | None,
     ) -> None:  # fmt: skip
         """`ways`: (stands, 3) where what stands is as the step begins, m; `looked`: at corners over planes, in this
-        step; `kin`: of what may break (None: nothing does)."""
+        step; `parting`: how overlaps stand as it begins; `kin`: of what may break (None: nothing does)."""
         self._model, self._rules, self._finder, self._kin = model, rules, finder, kin
-        self._ways, self._looked, self._count = ways, looked, len(model.mass)
+        self._ways, self._looked, self._parting, self._count = ways, looked, parting, len(model.mass)
 
-    def first(self, start: Bodies, parting: Parting, course: Course, known: Event | None, far: Flags) -> Event:
-        """What comes together first in the step, which begins with `parting` as overlaps stand; `known` so far, without
-        what comes `far`ther (n,) than was thought."""
+    def first(self, start: Bodies, course: Course, known: Event | None, far: Flags) -> Event:
+        """What comes together first in the step; `known` so far, without what comes `far`ther (n,) than was thought."""
         before, same = self._renewed(start, course, known.before if known else None, far)
         again = Again(known, far, same) if known else None
-        stage = Stage(self._rules.gravity, parting)
-        if known and not known.last:
-            stage = replace(known.stage, parting=parting)
+        stage = Stage(self._rules.gravity, self._parting) if known is None or known.last else known.stage
         event, kept = self._event(start, before, stage, course, again)
         if event.last and self._goes_on(event):
             events = OF_CROWD if crowded(event) else EVENTS

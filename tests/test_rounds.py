@@ -1,0 +1,38 @@
+"""Rounds of a step in which contacts are looked for: what one finds anew changes nothing where there is nothing new."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.engine import Engine
+from fracsim.rigid.model import Rules
+from fracsim.rigid.siblings import Overlaps
+from support.falling import CUBE, DOWN, cubes
+
+Values = npt.NDArray[np.float64]
+STEP, SPEED = 0.02, 5.0
+
+
+def struck(monkeypatch: pytest.MonkeyPatch, farther: float) -> tuple[Bodies, Overlaps]:
+    """Two pieces that lie in one another by 0.3 m from birth and fly on together; a third block strikes the one ahead
+    half-way through the step. `farther`: times what was thought, see rigid.course."""
+    monkeypatch.setattr("fracsim.rigid.course.FARTHER", farther)
+    bodies = cubes([[0.0, 0.0, 0.0], [0.7, 0.05, 0.0], [1.8, 0.0, 0.05]])
+    velocity: Values = np.array([[SPEED, 0, 0], [SPEED, 0, 0], [-SPEED, 0, 0]])
+    engine = Engine(bodies, [[CUBE]] * 3, [], Rules(STEP, 0 * DOWN), Overlaps.new(np.array([[0, 1]])))
+    return engine.advance(replace(bodies, velocity=velocity))[0], engine.overlaps
+
+
+def test_a_round_does_not_go_on_from_how_overlaps_stood_after_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There one of them had flown to the blow and the other not: what they lay in one another by was less by v dt / 2,
+    and in the next round they were pushed apart by what they are more."""
+    (once, stands), (again, stands_again) = (struck(monkeypatch, farther) for farther in (1e9, 0.0))
+    assert np.allclose(stands.depth, stands_again.depth, atol=1e-12)
+    assert np.allclose(once.velocity, again.velocity, atol=1e-9) and np.allclose(once.place, again.place, atol=1e-11)
