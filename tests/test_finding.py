@@ -47,3 +47,22 @@ def test_some_bodies_meet_what_they_meet_among_all() -> None:
     assert np.array_equal(told(chosen), told(every.chosen(np.flatnonzero(met))))
     again = find(bodies, ways, course, 5e-3, looked)
     assert np.array_equal(told(again), told(every)), "and all are looked for afterwards"
+
+
+def test_things_come_together_as_fast_as_their_points_do() -> None:
+    """Speeds along the axes of random contacts: points of turning bodies a moment before and after, by rotations."""
+    rng = np.random.default_rng(2)
+    places, velocity, spin = rng.normal(size=(3, 7, 3))
+    things = np.array([[a, b] for a in range(7) for b in range(7) if a != b])
+    point, k = rng.normal(size=(len(things), 3)), len(things)
+    axes = Rotation.random(k, rng=rng).as_matrix()
+    contacts = Contacts.found(things, things, point, axes, np.zeros(k), np.zeros(k), places)
+    gone: Values = np.zeros((2, k, 3))  # where the point is, of the first and of the second thing
+    for dt in (-1e-5, 1e-5):
+        turn = Rotation.from_rotvec(dt * spin).as_matrix()
+        at = [(turn[of] @ (point - places[of])[:, :, None])[:, :, 0] + places[of] + dt * velocity[of] for of in things.T]
+        gone += np.array(at) / (2 * dt)
+    apart = np.einsum("kij,kj->ki", axes, gone[1] - gone[0])
+    assert np.allclose(contacts.parting(velocity, spin), apart, atol=1e-8)
+    assert np.allclose(contacts.closing(velocity, spin), -apart[:, 0], atol=1e-8)
+    assert np.array_equal(contacts.of_both(np.arange(7) < 4), (things < 4).all(axis=1))

@@ -70,7 +70,7 @@ class Crowd:
         count = len(contacts)
         rows: Values = np.empty((count, 19))
         rows[:, :9], rows[:, 15:18], rows[:, 18] = contacts.axes.reshape(count, 9), free, contacts.friction
-        rows[:, 9:12], rows[:, 12:15] = contacts.arms
+        rows[:, 9:15] = contacts.arms.reshape(count, 6)
         rows[:, 15] += aim
         things = np.ascontiguousarray(np.minimum(contacts.things, len(mass)))
         return cls(rows, things, 1 / mass, np.ascontiguousarray(inverse))

@@ -146,10 +146,10 @@ def so_far(
     that has more of it.    motion: (things, 3) velocities and spins.    rates: (stands, 3) m/s of what stands."""
     n = len(past)
     every, (velocity, spin) = np.append(past, np.zeros(len(rates))), motion
-    least = np.append(past, np.ones(len(rates)))[contacts.things].min(axis=1)
-    both = every[contacts.things].max(axis=1)
+    least = np.minimum(*np.append(past, np.ones(len(rates)))[contacts.things.T])
+    both = np.maximum(*every[contacts.things.T])
     among = contacts.closing(every[:, None] * velocity, every[:, None] * spin)
-    come = np.where(contacts.things.max(axis=1) < n, among, both * contacts.closing(velocity, spin))
+    come = np.where(np.maximum(*contacts.things.T) < n, among, both * contacts.closing(velocity, spin))
     if np.any(rates):
         moved: Values = np.zeros((len(every), 3))
         moved[n:] = rates

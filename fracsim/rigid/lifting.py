@@ -44,6 +44,8 @@ def _standing(contacts: Contacts, flew: Flags) -> tuple[Ints, Ints, Values]:
 
 def raised(contacts: Contacts, lift: Values) -> Values:
     """(k,) distances where bodies (n,) are moved by (n, 3), m."""
+    if not np.any(lift):
+        return contacts.gap
     things = np.minimum(contacts.things, len(lift))
     moved = np.append(lift, np.zeros((1, 3)), axis=0)[things]
     return np.asarray(contacts.gap + np.einsum("ki,ki->k", moved[:, 1] - moved[:, 0], contacts.axes[:, 0]))

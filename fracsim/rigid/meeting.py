@@ -97,7 +97,8 @@ def flown_together(meeting: Meetings, things: Ints, begun: Values, near: float) 
     would be held against one another where they are at different times; nothing flies to what something else strikes
     before."""
     count, rows = len(begun), np.flatnonzero(meeting.closing)
-    links = things[(meeting.gap < near) & (things < count).all(axis=1)]
+    links = things[meeting.gap < near]
+    links = links[np.maximum(*links.T) < count]
     joined = csr_array((np.ones(len(links)), links.T), shape=(count, count))
     of = np.append(connected_components(joined, directed=False)[1], count)
     groups, when = of[np.minimum(things[rows], count)], meeting.when[rows]

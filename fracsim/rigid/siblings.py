@@ -98,17 +98,19 @@ class Parting:
         what is allowed from then on."""
         if not len(self.known) and not len(self.new):
             return gap, self
-        code, place = np.unique(_code(geoms, self.geoms), return_inverse=True)
+        every, deep = _code(geoms, self.geoms), np.flatnonzero(gap < 0)
+        code, place = np.unique(every[deep], return_inverse=True)
         depth: Values = np.zeros(len(code))
-        np.maximum.at(depth, place, -gap)
+        np.maximum.at(depth, place, -gap[deep])
         allowed: Values = np.zeros(len(code))
-        bodies = (things < len(self.names)).all(axis=1)
-        allowed[place[bodies & np.isin(_code(things, self.geoms), self.new)]] = np.inf
+        pairs = things[deep]
+        bodies = np.maximum(*pairs.T) < len(self.names)
+        allowed[place[bodies & np.isin(_code(pairs, self.geoms), self.new)]] = np.inf
         _, at, known = np.intersect1d(code, self.known, assume_unique=True, return_indices=True)
         allowed[at] = self.depth[known]
-        allowed = np.minimum(allowed, depth)
         some = allowed > 0
-        return gap + allowed[place], replace(self.gone, known=code[some], depth=allowed[some])
+        code, allowed = code[some], np.minimum(allowed, depth)[some]
+        return gap + _looked_up(every, code, allowed), replace(self.gone, known=code, depth=allowed)
 
     @property
     def gone(self) -> Parting:
@@ -127,4 +129,11 @@ class Parting:
 
 def _code(pairs: Ints, geoms: int) -> Ints:
     """(k,) of pairs (k, 2) below a number."""
-    return np.asarray(pairs.min(axis=1, initial=geoms) * geoms + pairs.max(axis=1, initial=0), np.int64)
+    return np.asarray(np.minimum(*pairs.T) * geoms + np.maximum(*pairs.T), np.int64)
+
+
+def _looked_up(codes: Ints, known: Ints, values: Values) -> Values:
+    """(k,) the values (m,) of codes (k,) among those known (m,), ascending; 0 of all others."""
+    place = np.searchsorted(known, codes)
+    there = np.append(known, -1)[place] == codes
+    return np.asarray(np.where(there, np.append(values, 0.0)[place], 0.0))

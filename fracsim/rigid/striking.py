@@ -138,7 +138,7 @@ class Striking:
         if known is None:
             return self._find(bodies, course), np.empty(0, np.int64)
         stays = np.append(~others, np.ones(len(course.rates), bool))
-        kept = np.flatnonzero(stays[known.things].all(axis=1))
+        kept = np.flatnonzero(known.of_both(stays))
         if not np.any(others):
             return known, kept
         return known.chosen(kept).and_more(self._find(bodies, course, others)), kept
