@@ -60,7 +60,9 @@ def test_things_come_together_as_fast_as_their_points_do() -> None:
     gone: Values = np.zeros((2, k, 3))  # where the point is, of the first and of the second thing
     for dt in (-1e-5, 1e-5):
         turn = Rotation.from_rotvec(dt * spin).as_matrix()
-        at = [(turn[of] @ (point - places[of])[:, :, None])[:, :, 0] + places[of] + dt * velocity[of] for of in things.T]
+        at = [
+            (turn[of] @ (point - places[of])[:, :, None])[:, :, 0] + places[of] + dt * velocity[of] for of in things.T
+        ]
         gone += np.array(at) / (2 * dt)
     apart = np.einsum("kij,kj->ki", axes, gone[1] - gone[0])
     assert np.allclose(contacts.parting(velocity, spin), apart, atol=1e-8)
