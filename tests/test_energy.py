@@ -202,7 +202,7 @@ def test_no_force_of_waves_that_pass(kind: str) -> None:
     shape, push = waves(nodes)
     scene.balance.displace(shape.ravel())
     still = float(np.linalg.norm(seen(scene).forces(), axis=1).min())
-    criterion.moving(np.zeros(shape.size), push.ravel(), 1e-9)
+    criterion.moving(np.zeros(shape.size), push.ravel(), 0.0, 1e-9)
     assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * still
 
     r = DISC[2] / 24 * (np.arange(40) + 0.5) / 40
@@ -215,7 +215,7 @@ def test_no_force_of_waves_that_pass(kind: str) -> None:
     carried = float(np.linalg.norm((area * kinetic) @ slope))
     assert carried > 0.3 * still
     scene.balance.displace(np.zeros(shape.size))
-    criterion.moving(velocity * shape.ravel(), np.zeros(shape.size), 1e-9)
+    criterion.moving(velocity * shape.ravel(), np.zeros(shape.size), 0.0, 1e-9)
     assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * carried
 
 

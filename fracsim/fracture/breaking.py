@@ -83,7 +83,8 @@ class Breaking:
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.not_finite, self.opened, self._pace, self._joining = 0, opened, pace, joining
-        self._due, self._dt = True, math.inf
+        self._due, self._now, self._dt = True, 0.0, math.inf
+        self._restless = getattr(criterion, "carried", None) is not None  # remembers more than what broke
         if opened is not None:
             self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
@@ -108,14 +109,14 @@ class Breaking:
     def begin(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""
         self.degradation.begin(t, dt)
-        self._dt = dt
+        self._now, self._dt = t + dt, dt
         if self._pace is not None:
             self.passes = max(1, math.ceil(self._pace * dt))
             self._due = math.floor(self._pace * (t + dt)) > math.floor(self._pace * t)
 
     def moving(self, v: Values, a: Values) -> None:
         """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
-        self.criterion.moving(v, a, self._dt)
+        self.criterion.moving(v, a, self._now, self._dt)
 
     def __call__(self) -> PassResult:
         """One pass on the current displacement (collective)."""
@@ -125,7 +126,7 @@ class Breaking:
             broken += self.graph.break_idle()
         before = [each.x.array.copy() for each in self.stress.fields] if broken else []
         lost = self.degradation(weakened > 0, stress, psi)
-        if weakened or lost.loss:
+        if weakened or lost.loss or self._restless:
             self.changed()
         return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died, before)
 

@@ -29,8 +29,8 @@ class Criterion(Protocol):
         on all ranks once what each has found is joined (collective).
         """
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2, in a step of dt s."""
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2, at the end of a step of dt, s."""
 
     def memory(self) -> object:
         """What it remembers of earlier passes, never to be written to again."""
@@ -133,7 +133,7 @@ class OverloadedEdges:
         wanted = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
         return edges[wanted[edges]], load[wanted[edges]]
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
         """Stress is all that counts."""
 
     def memory(self) -> object:

@@ -60,7 +60,7 @@ class Holding:
         kept = fails[edges]
         return edges[kept], load[kept]
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
         """Stress is all that counts."""
 
     def memory(self) -> object:

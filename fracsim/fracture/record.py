@@ -18,12 +18,14 @@ class EdgeRecord:
         graph: the edges and their damage.
         at: (edges,) s at which each broke, NaN while it is whole.
         cut: (edges,) where, from the end that comes first in the input mesh (0) to the other (1); NaN: in the middle.
+        carried: (edges, n) of tips that run, the time of the last look in the end; None where none do.
     """
 
     def __init__(self, graph: EdgeGraph) -> None:
         self.graph = graph
         self.at = np.full(len(graph.broken), np.nan)
         self.cut = np.full(len(graph.broken), np.nan)
+        self.carried: Values | None = None
 
     def note(self, t: float, cut: Values | None = None) -> None:
         """Edges that broke since the last call did so at t (s), at `cut` (edges,) where it is given."""
@@ -32,10 +34,16 @@ class EdgeRecord:
         if cut is not None:
             self.cut[new] = cut[new]
 
-    def remember(self, cut: Values) -> None:
-        """Edges that are weakened and not broken are cut at `cut` (edges,)."""
+    def remember(self, cut: Values, carried: Values | None) -> None:
+        """Edges that are weakened and not broken are cut at `cut` (edges,); tips carry what is said by the rank that
+        looked at them last, which has them (collective)."""
         held = (self.graph.integrity < 1) & ~self.graph.broken
         self.cut[held] = cut[held]
+        if carried is not None:
+            ago = -np.nan_to_num(carried[:, -1], nan=-np.inf)
+            newest = ago <= self.graph.least(ago)
+            columns = [self.graph.least(np.where(newest, each, np.inf)) for each in carried.T]
+            self.carried = np.column_stack(columns)
 
     def gathered(self) -> tuple[Ints, Values] | None:
         """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
@@ -43,12 +51,16 @@ class EdgeRecord:
 
     def saved(self) -> tuple[Ints, Values] | None:
         """The same of all edges that are not whole (collective)."""
-        return self.graph.gather_weakened(np.column_stack([self.at, self.cut]))
+        carried = [] if self.carried is None else [self.carried]
+        return self.graph.gather_weakened(np.column_stack([self.at, self.cut, *carried]))
 
     def restore(self, keys: Ints, values: Values) -> None:
-        """Take up what `saved` gave, (n, 2) keys and (n, 2) values, on every rank."""
+        """Take up what `saved` gave, (n, 2) keys and (n, 2 and more) values, on every rank."""
         local, place = self.graph.find_keys(keys)
-        self.at[local], self.cut[local] = values[place].T
+        self.at[local], self.cut[local] = values[place, :2].T
+        if values.shape[1] > 2:
+            self.carried = np.full((len(self.at), values.shape[1] - 2), np.nan)
+            self.carried[local] = values[place, 2:]
 
 
 def cut_by_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:

@@ -38,6 +38,7 @@ class Breaks:
         self.pieces: Pieces | None = None
         self.figures = (0, 0, _bodies(self._domain))
         self._cut_by: npt.NDArray[np.float64] | None = None
+        self._carried: npt.NDArray[np.float64] | None = None
         if breaking is not None:
             from ..fracture.record import EdgeRecord
             from ..mesh.parting import Parting
@@ -46,6 +47,7 @@ class Breaks:
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
             self._cut_by = getattr(breaking.criterion, "cut", None)
+            self._carried = getattr(breaking.criterion, "carried", None)
             if breaking.opened is not None:
                 self.record.note(0.0, breaking.opened)
             self.count()
@@ -61,14 +63,18 @@ class Breaks:
         self.count()
 
     def remember(self) -> None:
-        """A checkpoint is written: edges that cracks have cut and that hold on are cut there."""
+        """A checkpoint is written: edges that cracks have cut and that hold on are cut there, and tips run
+        (collective)."""
         if self.record is not None and self._cut_by is not None:
-            self.record.remember(self._cut_by)
+            self.record.remember(self._cut_by, self._carried)
 
     def restored(self) -> None:
         """The record was read from a checkpoint: so were the places of cuts (collective)."""
         if self.record is not None and self._cut_by is not None:
             self._cut_by[:] = self.record.cut
+            if self._carried is not None and self.record.carried is not None:
+                known = ~np.isnan(self.record.carried[:, 0])
+                self._carried[known] = self.record.carried[known]
         self.count()
 
     def count(self) -> None:

@@ -81,8 +81,12 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     rows = balance.domain.dim == 3 and not moves
-    criterion_type = RowTips if rows else CrackTips
-    tips = criterion_type(stress, graph, strength, toughness, opened, branching=study.fracture.branching)
+    criterion_type: type[CrackTips] = RowTips if rows else CrackTips
+    if study.fracture.branching:
+        from ..fracture.energy.running import RunningTips
+
+        criterion_type = RunningTips
+    tips = criterion_type(stress, graph, strength, toughness, opened)
     pace = tips.pace() if moves and not given else None
     kind = ClosingSplitting if stress.closes else Splitting
     splitting = kind(stress, graph, tips.release_rate() if moves else None)

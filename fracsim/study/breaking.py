@@ -37,7 +37,7 @@ class Fracture(Table):
     energy: Positive | None = None  # G_c, J/m^2: cracks advance where they release it; None: edges break one by one
     # with energy: a tip goes by the energy that it releases; or cracks hold on while they open (l_ch >= 8 h: concrete)
     law: Literal["griffith", "cohesive"] = "griffith"
-    branching: Flag = False  # with energy, in the plane and with inertia: a tip to which 2 G_c flows goes on as two
+    branching: Flag = False  # with energy, in the plane, with inertia: up to c_R / 2, and two where 2 G_c flows
     approach: Literal["chi", "edge"] = "chi"  # degraded energy; edge-projected strain (linear and corotated)
     radius: NonNegative = 0.0  # m, of the non-local average; 0: local
     # neighbours: no radius, one average over the cells that share a node

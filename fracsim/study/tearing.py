@@ -49,7 +49,7 @@ def refuse_forks(study: Study, dim: int) -> None:
 
 def _branching(study: Study, h: float) -> Iterator[str]:
     """When tips branch, and whether steps are short enough for it."""
-    yield "tips branch to which 2 G_c flows"
+    yield "cracks run at up to half of the Rayleigh speed; tips branch to which 2 G_c flows"
     material, step = study.material, study.time.breaking_step or study.time.longest
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
     wave = RADIUS * h / rayleigh_speed(shear, material.poisson)

@@ -48,7 +48,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "fracture": {"strength": 1e5, "energy": 0.02, "branching": True},
         "crack": [{"segment": [[0.0, 0.52], [0.3, 0.52]]}],
         "boundary": [{"on": "bottom", "velocity": [0.0, -0.8]}, {"on": "top", "velocity": [0.0, 0.8]}],
-        "time": {"scheme": "newmark", "step": 5e-4, "end": 0.008},
+        "time": {"scheme": "newmark", "step": 5e-4, "end": 0.012},
     },
 }  # fmt: skip
 RUNS["cohesive"] = {

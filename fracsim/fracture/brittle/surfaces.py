@@ -67,7 +67,7 @@ class BrittleSurfaces:
         edges = self._cut_edges(opened)
         return edges, np.ones(len(edges))
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
         """Stress is all that counts."""
 
     def memory(self) -> tuple[Values, Values]:

@@ -12,7 +12,8 @@ front      in space: the crack that an advance makes, by which g is divided
 along      in space: G of tips by themselves, or of the front nearby
 seen       the body as tips see it
 mixed      where a crack in tension and sliding turns, and what that releases
-branching  where a crack becomes two, and tips that share a disc
+running    how fast cracks run that may branch, and where they do
+branching  tips that share a disc
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
 row        in space, without inertia: all of a front gets on at once

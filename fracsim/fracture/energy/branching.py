@@ -1,17 +1,13 @@
-"""Where a crack branches, and how tips go that share a disc (in the plane).
+"""How tips go that share a disc, as those of a crack that has branched do (in the plane; running says when one does).
 
     g = G a,   a = sum_k q(x_k) t_k      of tips x_k in the disc, along t_k, that take up G each
-    G >= 2 G_c                           the crack branches
 
 A disc with several tips advances them all, so that its force is over all of them, as that in space is over the crack
-that an advance makes (front). Two cracks take up 2 G_c: a tip that is given so much goes on as two (Eshelby 1970). A
-crack at rest can, too: each of two short branches releases 0.52 of what the one does straight on. Only where waves
-carry energy to a tip faster than it gets on: a slow crack never sees more than G_c, and where steps are longer than
-that a crack runs on within them. And only where no other tip's disc lies over its own.
+that an advance makes (front). Each of two short branches releases 0.52 of what the one crack does straight on.
 
 The force of a disc in which there is another tip is neither's, and does not say which is to go. Until branches have
 left each other's discs they keep level, and each goes straight on, at the angle at which short branches open and do not
-slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there as well). But nobody waits where
+slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there). But nobody waits where
 there is enough for both: the other has stopped, and would never be level again.
 """
 

@@ -31,6 +31,11 @@ class JoinedTips:
         """(edges,) where cracks cut local edges."""
         return self._tips.cut
 
+    @property
+    def carried(self) -> Values | None:
+        """(edges, n) of tips that run."""
+        return self._tips.carried
+
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """The edges that cracks cut now, none of them one that has to join (collective)."""
         graph, barred = self._graph, self._tips.barred
@@ -46,9 +51,9 @@ class JoinedTips:
             barred[stuck] = True
             self._tips.cut[edges] = np.nan
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2, in a step of dt s."""
-        self._tips.moving(v, a, dt)
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2, at the end of a step of dt, s."""
+        self._tips.moving(v, a, now, dt)
 
     def memory(self) -> object:
         """Where cracks cut."""

@@ -88,10 +88,12 @@ class CrackTips:
         toughness: G_c in J/m^2, a number or (cells,).    strength: of each edge in each cell.
         cells: (n,) of this rank that were chosen last.    barred: (cells,) not to be cut (joined).
         onwards: whether tips go on for more than a cell in a pass without inertia.    course: numbers that say whither.
-        shares: whether tips of a front in space share its force (along).
+        shares: whether tips of a front in space share its force (along).    forks: whether a tip may become two.
+        carried: (edges, n) of tips that run, at the edge by which each came in, the time of the last look in the end.
     """
 
-    onwards, shares, course = True, False, 2
+    onwards, shares, course, forks = True, False, 2, False
+    carried: Values | None = None
 
     def __init__(
         self,
@@ -100,22 +102,19 @@ class CrackTips:
         strength: Strength,
         toughness: PerCell,
         opened: Values | None = None,
-        *,
-        branching: bool = False,
     ) -> None:
-        """`opened`: (edges,) where the cracks that are there already cut edges; `branching`: whether a tip may become
-        two (collective)."""
+        """`opened`: (edges,) where the cracks that are there already cut edges (collective)."""
         self._stress, self._graph, self.strength, self.toughness = stress, graph, strength, toughness
         domain = self._domain = stress.domain
         self.cut: Values = np.full(len(graph.broken), np.nan) if opened is None else opened.copy()
         self._h = local_size(domain)
         self.disc = DISC[domain.dim]
         reach = Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h)
-        self.sight = Sight(stress, graph, reach, forks=branching, shares=self.shares)
+        self.sight = Sight(stress, graph, reach, forks=self.forks, shares=self.shares)
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
-        self._idle, self._branching, self._dt = True, branching, np.inf
+        self._idle, self._now, self._dt = True, 0.0, np.inf
         self.cells: Ints = np.empty(0, np.int64)
         self.barred: Flags = np.zeros(domain.cell_count, bool)
 
@@ -138,11 +137,11 @@ class CrackTips:
         """Those of this rank (collective)."""
         return self.sight.follow(self.cut)
 
-    def moving(self, v: Values, a: Values, dt: float) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2; cracks may branch where a step sees the waves at a tip."""
-        self.sight.motion, self._dt = (v, a), dt
+    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """The body moves so: (owned dofs,) in m/s and m/s^2, at the end of a step of dt, s."""
+        self.sight.motion, self._now, self._dt = (v, a), now, dt
 
-    def memory(self) -> Values:
+    def memory(self) -> object:
         """Where cracks cut."""
         return self.cut.copy()
 
@@ -182,9 +181,8 @@ class CrackTips:
             mature &= size > 0  # a force back is that of other tips in the disc
             turns, abreast = mature & np.any(turned, axis=1), np.any(tips.parts, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
-            if self._branching:
-                branches = turns & tips.alone & (size >= TIPS * toughness)
-                branches &= self._rate[tips.cell] * self._dt <= 1  # a Rayleigh wave stays in the disc within a step
+            if self.forks:
+                branches = turns & self._forked(size, toughness, tips)
                 ahead = np.where(branches[:, None], tips.course, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
         stays = (tips.waits & (size < TIPS * toughness)) | self.barred[tips.cell]
@@ -199,12 +197,20 @@ class CrackTips:
         active[weak] = np.sqrt(seen.squares(may[weak])) >= strained
         rows = may[active]
         rank = self._ranked(0, sigma[active], self._numbers(tips.cell[rows]), tips.point[rows], apart[rows])
-        entry = np.argmax(~self._graph.intact(tips.cell[rows]), axis=1)
+        entry = self._entry(tips.cell[rows])
         return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows], branches[rows])
+
+    def _entry(self, cells: Ints) -> Ints:
+        """(n,) local edge by which a crack came into cells."""
+        return np.argmax(~self._graph.intact(cells), axis=1)
 
     def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
         """(n,) which tips, on which a force of `size` (n,) acts, reach their G_c (collective)."""
         return size >= toughness
+
+    def _forked(self, size: Values, toughness: Values, tips: Tips) -> Flags:
+        """(n,) which tips go on as two."""
+        return np.zeros(len(tips), bool)
 
     @staticmethod
     def _turned(psi: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
