@@ -40,27 +40,40 @@ static void squared(const double *r, double *result)
     for (int i = 0; i < 9; i++) result[i] = 1.5 * r[i] - more[i] / 2;
 }
 
-/* The turns (n, 9) of n bodies after times (n,); `same`: rad, a change of the turn that is none. */
+/* The turn after a time from one before it; `same`: rad, a change of the turn that is none. */
+static void turned(const double *turn, const double *inverse, const double *momentum, double time, int64_t rounds,
+                   double same, double *after)
+{
+    double angle[3], found[3], r[9], halfway[9], change = same;
+    rotated(turn, inverse, momentum, found);
+    for (int j = 0; j < 3; j++) angle[j] = time * found[j];
+    for (int64_t round = 0; round < rounds && change >= same; round++) {
+        double half[3] = {angle[0] / 2, angle[1] / 2, angle[2] / 2};
+        rotation(half, r);
+        product(r, turn, halfway);
+        rotated(halfway, inverse, momentum, found);
+        change = 0;
+        for (int j = 0; j < 3; j++) {
+            change = fmax(change, fabs(time * found[j] - angle[j]));
+            angle[j] = time * found[j];
+        }
+    }
+    rotation(angle, r);
+    product(r, turn, halfway);
+    squared(halfway, after);
+}
+
+/* The turns (n, 9) of n bodies after times (n,), each in as many parts as it turns by `most` in, rad. */
 void tumbled(int64_t n, const double *turn, const double *inverse, const double *momentum, const double *time,
-             int64_t rounds, double same, double *after)
+             int64_t rounds, double same, double most, double *after)
 {
     for (int64_t each = 0; each < n; each++, turn += 9, inverse += 9, momentum += 3, time++, after += 9) {
-        double angle[3], found[3], r[9], halfway[9], change = same;
-        rotated(turn, inverse, momentum, found);
-        for (int j = 0; j < 3; j++) angle[j] = *time * found[j];
-        for (int64_t round = 0; round < rounds && change >= same; round++) {
-            double half[3] = {angle[0] / 2, angle[1] / 2, angle[2] / 2};
-            rotation(half, r);
-            product(r, turn, halfway);
-            rotated(halfway, inverse, momentum, found);
-            change = 0;
-            for (int j = 0; j < 3; j++) {
-                change = fmax(change, fabs(*time * found[j] - angle[j]));
-                angle[j] = *time * found[j];
-            }
-        }
-        rotation(angle, r);
-        product(r, turn, halfway);
-        squared(halfway, after);
+        double spin[3];
+        rotated(turn, inverse, momentum, spin);
+        double angle = fabs(*time) * sqrt(spin[0] * spin[0] + spin[1] * spin[1] + spin[2] * spin[2]);
+        int64_t parts = angle > most ? (int64_t)ceil(angle / most) : 1;
+        turned(turn, inverse, momentum, *time / parts, rounds, same, after);
+        for (int64_t part = 1; part < parts; part++)
+            turned(after, inverse, momentum, *time / parts, rounds, same, after);
     }
 }

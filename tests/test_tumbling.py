@@ -1,0 +1,77 @@
+"""How bodies turn where nothing acts: a top keeps its angular momentum to round-off, and its energy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from fracsim.rigid.tumbling import PART, rotated, tumbled
+
+Values = npt.NDArray[np.float64]
+TOP = np.diag([1.0, 2.0, 3.0])[None]  # kg m^2
+NEARLY = np.array([[0.1, 2 * np.pi, 0.2]])  # rad/s: about the axis that it does not stay on
+
+
+def tops(steps: int, turns: float) -> tuple[Values, Values, Values]:
+    """Rotations (1, 3, 3), spins (1, 3) and energies (steps,) of an asymmetric top that nothing acts on."""
+    turn, spin, energy = np.eye(3)[None], NEARLY, []
+    for _ in range(steps):
+        momentum, inverse = rotated(turn, TOP, spin), np.linalg.inv(TOP)
+        turn = tumbled(turn, inverse, momentum, np.array([turns / steps]))
+        spin = rotated(turn, inverse, momentum)
+        energy.append(float(np.einsum("ni,nij,nj->", spin, turn @ TOP @ np.swapaxes(turn, 1, 2), spin)) / 2)
+    return turn, spin, np.array(energy)
+
+
+def kept(turns: int, a_turn: int) -> float:
+    """Largest relative error of energy and angular momentum of the top."""
+    turn, spin, energy = tops(turns * a_turn, turns)
+    start = TOP[0] @ NEARLY[0]
+    momentum = (turn @ TOP @ np.swapaxes(turn, 1, 2))[0] @ spin[0]
+    assert np.allclose(momentum, start, atol=1e-12 * np.linalg.norm(start))
+    return float(np.abs(energy / (NEARLY[0] @ start / 2) - 1).max())
+
+
+def test_a_top_keeps_its_angular_momentum_to_round_off_and_its_energy() -> None:
+    """Four turns with sixty steps each, through its tumbles."""
+    assert kept(4, 60) < 1e-3
+
+
+def test_what_turns_by_a_radian_a_step_keeps_its_energy_as_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of second order: as many parts as PART fits in, squared, better than in one, within a tenth."""
+    in_parts, parts = kept(4, 6), math.ceil(2 * np.pi / 6 / PART)
+    monkeypatch.setattr("fracsim.rigid.tumbling.PART", np.inf)
+    assert in_parts * parts**2 == pytest.approx(kept(4, 6), rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_top_keeps_its_energy_over_a_hundred_turns() -> None:
+    """Issue 13: 1e-3."""
+    assert kept(100, 100) < 1e-3
+
+
+def test_what_whirls_beside_others_does_not_change_how_they_turn() -> None:
+    """Each as it would alone, slow and fast, and one too fast to be found in so many rounds."""
+    rng = np.random.default_rng(2)
+    turn, size = Rotation.random(20, random_state=1).as_matrix(), rng.uniform(1.0, 3.0, (20, 3))
+    inverse, momentum = size[:, :, None] * np.eye(3), np.geomspace(1e-3, 1e3, 20)[:, None] * rng.normal(size=(20, 3))
+    together = tumbled(turn, inverse, momentum, np.full(20, 0.01))
+    for k in range(20):
+        alone = tumbled(turn[[k]], inverse[[k]], momentum[[k]], np.full(1, 0.01))
+        assert np.allclose(alone[0], together[k], rtol=0.0, atol=1e-14)
+
+
+def test_a_top_turns_as_euler_says() -> None:
+    """I dw/dt = (I w) x w in the axes of the body, by an adaptive Runge-Kutta method: of second order in the step."""
+    main = np.diag(TOP[0])
+    exact = solve_ivp(lambda _, w: np.cross(main * w, w) / main, (0, 1.5), NEARLY[0], rtol=1e-11, atol=1e-12).y[:, -1]
+    errors = []
+    for steps in (75, 150):
+        turn, spin, _ = tops(steps, 1.5)
+        errors.append(float(np.abs(turn[0].T @ spin[0] - exact).max()))
+    assert errors[1] < 0.05 and errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
