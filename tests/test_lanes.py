@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
+from fracsim.mechanics import compiled as compiling
 from fracsim.mechanics import lanes
 from fracsim.mechanics.lanes import MatrixLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
@@ -128,11 +129,11 @@ def test_what_lanes_cannot_do(line: str) -> None:
 def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Kernels of FFCx may be there from before: nobody else misses it. What nobody expects is not kept quiet."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
-    monkeypatch.setattr(lanes, "_said", [])
+    monkeypatch.setattr(compiling, "_told", [])
     monkeypatch.setenv("CC", "no-such-compiler")
     assert compiled(balance._work) is compiled(balance.stiffness.form) is None
     told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1 and told[0].startswith("fracsim: note: cells are taken one by one")
+    assert len(told) == 1 and told[0].startswith("fracsim: note: this run takes longer")
     assert "no-such-compiler" in told[0] and told[0].endswith("install a C compiler, or name yours in CC")
     monkeypatch.setattr(lanes, "SOURCE", None)
     with pytest.raises(AttributeError):

@@ -7,6 +7,7 @@ import hashlib
 import os
 import shlex
 import subprocess
+import sys
 import sysconfig
 import tempfile
 from functools import cache
@@ -14,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from dolfinx.jit import get_options
+from dolfinx.jit import get_options, mpi_jit_decorator
+from mpi4py import MPI
 
 from ..errors import InputError
 from .kernels import jit_options
@@ -47,6 +49,30 @@ def built(name: str, text: str, more: list[str]) -> ctypes.CDLL:
             _run([*command, str(source), "-o", str(fresh), "-lm"])
             fresh.replace(made)
     return ctypes.CDLL(str(made))
+
+
+_told: list[Exception] = []  # why functions were not there
+
+
+def built_together(comm: MPI.Comm, name: str, text: str, more: list[str]) -> ctypes.CDLL | None:
+    """The same on all ranks; None where there is no compiler that takes it on one of them, which is told once: FFCx's
+    kernels may be there from before, and others do the same without it, later (collective)."""
+    made = _tried(comm, name, text, more)
+    if not comm.allreduce(isinstance(made, Exception), op=MPI.LOR):
+        return made
+    if isinstance(made, Exception):
+        if not _told:
+            print(f"fracsim: note: this run takes longer than it could: {made}", file=sys.stderr)
+        _told.append(made)
+    return None
+
+
+@mpi_jit_decorator  # type: ignore[misc]
+def _tried(name: str, text: str, more: list[str]) -> ctypes.CDLL | Exception:
+    try:
+        return built(name, text, more)
+    except (InputError, OSError) as error:
+        return error
 
 
 def at(values: npt.NDArray[Any]) -> ctypes.c_void_p:

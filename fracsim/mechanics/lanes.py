@@ -10,7 +10,6 @@ DOLFINx's work.
 from __future__ import annotations
 
 import re
-import sys
 from ctypes import CDLL, Structure, byref, c_int64, c_void_p
 from pathlib import Path
 from typing import Any, Self
@@ -18,11 +17,9 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem, la
-from dolfinx.jit import mpi_jit_decorator
 
-from ..errors import InputError
 from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
-from .compiled import at, built
+from .compiled import at, built_together
 
 Values = npt.NDArray[np.float64]
 
@@ -115,32 +112,15 @@ def compiled(form: fem.Form) -> CDLL | None:
     sizes = {"RANK": form.rank, "D": bs, "NODES": space.element.space_dimension // bs, "CORNERS": corners}
     if sizes["NODES"] > corners:  # bent cells gain half as much, and take 15 s to compile
         return None
-    kernel = Path(str(form.module.__file__))  # type: ignore[union-attr]
-    comm = form.mesh.comm
-    made = _library(comm, kernel.with_name(kernel.name.split(".")[0] + ".c"), sizes)
-    if isinstance(made, Exception):
-        if comm.rank == 0 and not _said:
-            print(f"fracsim: note: cells are taken one by one, which takes longer: {made}", file=sys.stderr)
-        _said.append(made)
+    source = Path(str(form.module.__file__))  # type: ignore[union-attr]
+    kernel = in_lanes(source.with_name(source.name.split(".")[0] + ".c").read_text())
+    if kernel is None:
         return None
-    return made
-
-
-_said: list[Exception] = []  # why there was no library: it is told once
-
-
-@mpi_jit_decorator  # type: ignore[misc]
-def _library(source: Path, sizes: dict[str, int]) -> CDLL | Exception | None:
-    """What FFCx wrote, compiled once more; why not, where there is no compiler any more, none that has vectors, or no
-    place to keep it in: FFCx's kernel may be an old one."""
-    try:
-        if (kernel := in_lanes(source.read_text())) is None:
-            return None
-        functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
-        text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
-        return built("lanes", text, [*_FLAGS, *(f"-D{name}={value}" for name, value in sizes.items())])
-    except (InputError, OSError) as error:
-        return error
+    functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
+    text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
+    return built_together(
+        form.mesh.comm, "lanes", text, [*_FLAGS, *(f"-D{name}={value}" for name, value in sizes.items())]
+    )
 
 
 def in_lanes(source: str) -> str | None:

@@ -29,6 +29,7 @@ from .term import Term, sum_of_forms
 
 if TYPE_CHECKING:
     from .positive import Positive
+    from .products import Products
 
 Values = npt.NDArray[np.float64]
 
@@ -77,9 +78,9 @@ class Stiffness:
         """That of K, until `shrink` makes another."""
         return self._assembly.matrix
 
-    def in_blocks(self) -> PETSc.Mat | None:
-        """The same in blocks of a node's dofs, which are assembled first from here on; None where terms, or a mass that
-        couples nodes, add to single entries (collective)."""
+    def in_blocks(self) -> Products | None:
+        """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms,
+        or a mass that couples nodes, add to single entries, or nothing can be compiled (collective)."""
         own = (Term.add_stiffness, Term.coupling, Term.low_rank)
         adds = any(getattr(type(term), each.__name__) is not each for term in self._terms for each in own)
         return None if adds or not self._mass.diagonal else self._assembly.use_blocks()

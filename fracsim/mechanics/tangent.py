@@ -4,8 +4,8 @@ PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell,
 DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values. Larger
 bodies have several cells assembled at a time (lanes).
 
-It can be summed in blocks of the d dofs of a node instead, which go into PETSc's matrix of blocks. Products are made
-with that one; the matrix of single entries, which multigrid is set up from, follows where it is asked for.
+It can be summed in blocks of the d dofs of a node instead. Products are made with those where they are (products);
+PETSc's matrix of single entries, which multigrid is set up from, follows where it is asked for.
 
 Where a body falls apart, the entries of its dead cells are zeros that every product with the matrix still reads. They
 are given up from time to time: the matrix shrinks, the unknowns stay.
@@ -25,7 +25,10 @@ from ..mesh.ranks import total
 from .kernels import OfLarge
 
 if TYPE_CHECKING:
+    from ctypes import CDLL
+
     from .lanes import MatrixLanes
+    from .products import Products
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
@@ -36,51 +39,53 @@ class Assembly:
 
     Attributes:
         form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
-        blocks: the same in blocks, where it is assembled into those; kept as long.
+        blocks: products with what is assembled into blocks, where it is; kept as long.
     """
 
     matrix: PETSc.Mat
 
     def __init__(self, form: fem.Form) -> None:
         self.form = form
-        self.blocks: PETSc.Mat | None = None
+        self.blocks: Products | None = None
         self._behind = False  # whether the blocks have been assembled since the matrix
         self._dead: Flags | None = None
         self._make()
 
-    def use_blocks(self) -> PETSc.Mat:
-        """Assemble into blocks from here on; returns their matrix (collective)."""
+    def use_blocks(self) -> Products | None:
+        """Assemble into blocks from here on; products with them, None where there is no compiler (collective)."""
         if self.blocks is None:
+            from .products import compiled
+
+            size = self.matrix.getBlockSize()
+            if (code := compiled(self.form.mesh.comm, size)) is None:
+                return None
             self.matrix.destroy()
-            self._make(by_blocks=True)
-            assert self.blocks is not None
+            self._make(code)
         return self.blocks
 
-    def _make(self, *, by_blocks: bool = False) -> None:
-        """Matrices with the pattern of the cells that the form is integrated over, and a full diagonal."""
+    def _make(self, by_blocks: CDLL | None = None) -> None:
+        """Matrices with the pattern of the cells that the form is integrated over, and a full diagonal; `by_blocks`:
+        what makes products with blocks."""
         pattern = fem.create_sparsity_pattern(self.form)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
         self._lanes = OfLarge(self._in_lanes)
-        self._sum = block_csr(pattern) if by_blocks else expanded_csr(pattern)
+        self._sum = expanded_csr(pattern) if by_blocks is None else block_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
         self._own = slice(int(starts[-1]))  # entries or blocks of owned rows; those of ghosts come after
         names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
         self._starts = starts.astype(PETSc.IntType)
         self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
-        if by_blocks:
-            self._make_blocks()
+        self._by_blocks = by_blocks
+        if by_blocks is not None:
+            from .products import Products
 
-    def _make_blocks(self) -> None:
-        """The matrix of blocks, and where the blocks on the diagonal are."""
-        size, comm = self.matrix.getBlockSize(), self.matrix.comm
-        csr = self._starts, self._columns
-        self.blocks = PETSc.Mat().createBAIJ(self.matrix.getSizes(), size, csr=csr, comm=comm)
-        rows = np.repeat(np.arange(len(self._starts) - 1), np.diff(self._starts))
-        self._on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
+            self.blocks = Products(self._sum, by_blocks)
+            rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+            self._on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
 
     def fit(self, dead: Flags, share: float) -> bool:
         """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
@@ -93,9 +98,8 @@ class Assembly:
         if not back and (alive == room or alive > share * room):
             return False
         self._dead = dead.copy()
-        by_blocks = self.blocks is not None
         self.destroy()
-        self._make(by_blocks=by_blocks)
+        self._make(self._by_blocks)
         return True
 
     def __call__(
@@ -112,10 +116,9 @@ class Assembly:
             self.matrix.assemble()
             return
         if diagonal is not None:
-            d = self.blocks.getBlockSize()
+            d = self.matrix.getBlockSize()
             at, axes = self._on_diagonal[:, None], np.arange(d)
             self._sum.data.reshape(-1, d, d)[at, axes, axes] += diagonal.reshape(-1, d)
-        self._set(self.blocks)
         self._behind = True
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
@@ -133,13 +136,11 @@ class Assembly:
     def bring(self) -> None:
         """Bring the matrix to where the blocks are, if there are any (collective)."""
         if self._behind:
-            self._set(self.matrix)
+            d = self.matrix.getBlockSize()
+            values = self._sum.data[: d * d * self._own.stop]
+            self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
+            self.matrix.assemble()
             self._behind = False
-
-    def _set(self, matrix: PETSc.Mat) -> None:
-        d = matrix.getBlockSize()
-        matrix.setValuesBlockedIJV(self._starts, self._columns, self._sum.data[: d * d * self._own.stop])
-        matrix.assemble()
 
     def destroy(self) -> None:
         """Give the memory of PETSc's matrices back."""

@@ -10,9 +10,12 @@ the cache, and each product is called from here.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from petsc4py import PETSc
+
+if TYPE_CHECKING:
+    from ..mechanics.products import Products
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
 
@@ -25,11 +28,12 @@ class Blocks:
         first: whether blocks are assembled first.
     """
 
-    def __init__(self, tangent: PETSc.Mat, assembled: PETSc.Mat | None) -> None:
-        """`assembled`: the blocks, where they are assembled first."""
+    def __init__(self, tangent: PETSc.Mat, assembled: Products | None) -> None:
+        """`assembled`: products with the blocks, where they are assembled first."""
         self.tangent = tangent
         self.first = assembled is not None
-        self._copy = assembled
+        self._assembled = assembled
+        self._copy: PETSc.Mat | None = None
         self._entries, self._state = 0.0, -1
 
     def follow(self) -> None:
@@ -44,8 +48,9 @@ class Blocks:
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
-        assert self._copy is not None
-        self._copy.mult(x, y)
+        by = self._assembled or self._copy
+        assert by is not None
+        by.mult(x, y)
 
     def matrix(self) -> PETSc.Mat:
         """The matrix."""
@@ -55,9 +60,9 @@ class Blocks:
 
     def forget(self) -> None:
         """Give the memory of PETSc's objects back."""
-        if self._copy is not None and not self.first:
+        if self._copy is not None:
             self._copy.destroy()
-        self._copy = None
+            self._copy = None
 
 
 def worth_it(tangent: PETSc.Mat) -> bool:

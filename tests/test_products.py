@@ -1,0 +1,35 @@
+"""Products with blocks where DOLFINx has summed them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fracsim.mechanics.tangent import Assembly
+from test_dead_cells import damaged
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_products_are_those_of_the_dense_matrix(dim: int) -> None:
+    """Of a body that is deformed at random, a third of whose cells are dead, which DOLFINx writes out."""
+    balance = damaged("damped", dim)[0].balance
+    balance.damage_changed()
+    assembly = Assembly(balance.stiffness.form)
+    products = assembly.use_blocks()
+    assert products is not None and assembly.use_blocks() is products
+    assembly([], None, np.linspace(1.0, 2.0, balance.owned) * 1e4)
+    x, y = assembly.matrix.createVecs()
+    x.setRandom()
+    products.mult(x, y)
+    dense = assembly._sum.to_dense()
+    np.testing.assert_allclose(y.array_r, dense @ x.array_r, rtol=0, atol=1e-14 * np.abs(dense).sum(1).max())
+
+
+def test_without_a_compiler_single_entries_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is there serves on."""
+    assembly = Assembly(damaged("damped", 3)[0].balance.stiffness.form)
+    matrix = assembly.matrix
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert assembly.use_blocks() is assembly.blocks is None
+    assembly([])
+    assert assembly.matrix is matrix and matrix.norm() > 0
