@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fracsim.errors import InputError
-from fracsim.mechanics import compiled
+from fracsim.mesh import compiled
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
 
+from ..mesh.compiled import machine_flags
 from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels
 from ..mesh.domain import Domain
 from ..mesh.ranks import raise_together
@@ -36,21 +35,8 @@ _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
 @cache
 def jit_options() -> dict[str, list[str] | int]:
-    """Flags for the machine's own instructions: 1.6 x faster tangents of the neo-Hookean energy than -O2.
-
-    FFCx caches kernels by source and flags. The CPU's name goes into the flags, so that a home directory shared by
-    different machines never hands a kernel to one that cannot run it.
-    """
-    try:
-        cpu = next(
-            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
-        )
-    except (OSError, StopIteration):
-        cpu = os.uname().machine
-    tag = hashlib.sha256(cpu.encode()).hexdigest()[:8]
-    # cffi asks for -std=c17, which forbids fused multiply-add; without it GCC 14 has been seen not to end on a tangent
-    flags = ["-O3", "-march=native", "-ffp-contract=fast", "-g0", f"-DFRACSIM_CPU=0x{tag}"]
-    return {"cffi_extra_compile_args": flags, "timeout": PATIENCE}
+    """Of FFCx, which caches kernels by source and flags."""
+    return {"cffi_extra_compile_args": machine_flags(), "timeout": PATIENCE}
 
 
 PATIENCE = 60  # s that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem, la
 
+from ..mesh.compiled import at, built_together
 from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
-from .compiled import at, built_together
 
 Values = npt.NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from dolfinx import la
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from .compiled import FASTER, at, built_together
+from ..mesh.compiled import FASTER, at, built_together
 
 SOURCE = Path(__file__).with_suffix(".c")
 

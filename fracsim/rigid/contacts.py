@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.compiled import at, library
+from ..mesh.compiled import at, library
 from .touches import Touches
 
 SOURCE = Path(__file__).with_suffix(".c")

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.compiled import at, library
+from ..mesh.compiled import at, library
 from .contacts import Contacts
 
 SOURCE = Path(__file__).with_suffix(".c")

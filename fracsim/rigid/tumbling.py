@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.compiled import at, library
+from ..mesh.compiled import at, library
 
 Values = npt.NDArray[np.float64]
 
