@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
-from fracsim.fracture.edge_stress import carried_by, edge_vectors, frobenius_norm, greatest_pull, normal_stress
+from fracsim.fracture.edge_stress import carried_by, frobenius_norm, greatest_pull, normal_stress
 from fracsim.mesh.simplices import local_edges
 from fracsim.mesh.small_matrices import barycentric_gradients
 from support.laws import T_stress, Tensor, rotation
@@ -49,7 +49,7 @@ def flags_of(patterns: Tensor, edges: int) -> Tensor:
 def test_normal_stress_is_n_sigma_n(dim: int, seed: int) -> None:
     """n . sigma . n by matrix products, edge by edge."""
     corners, components = simplex(dim, seed), stress_components(dim, seed)
-    found = normal_stress(components[None], edge_vectors(corners[None]))[0]
+    found = normal_stress(components[None], corners[None])[0]
     sigma = as_matrix(components)
     for (i, j), value in zip(local_edges(dim), found, strict=True):
         n = (corners[j] - corners[i]) / np.linalg.norm(corners[j] - corners[i])
@@ -75,9 +75,8 @@ def test_intact_edges_keep_their_stress(dim: int, seed: int, pattern: int) -> No
     """Along an intact edge the carried stress is the full one, along a broken edge it is zero (METHOD section 3)."""
     corners, components = simplex(dim, seed)[None], stress_components(dim, seed)[None]
     intact = flags_of(np.array([pattern]), len(local_edges(dim)))
-    vectors = edge_vectors(corners)
-    kept = normal_stress(carried_by(components, corners, intact), vectors)
-    expected = np.where(intact, normal_stress(components, vectors), 0.0)
+    kept = normal_stress(carried_by(components, corners, intact), corners)
+    expected = np.where(intact, normal_stress(components, corners), 0.0)
     np.testing.assert_allclose(kept, expected, atol=100 * EPS * np.linalg.cond(T_stress(corners[0])))
 
 
@@ -87,8 +86,8 @@ def test_edge_stress_turns_with_the_body(dim: int) -> None:
     corners, components, Q = simplex(dim, 3), stress_components(dim, 3), rotation(dim, 5)
     turned = Q @ as_matrix(components) @ Q.T
     upper = ((0, 0), (1, 1), (0, 1)) if dim == 2 else ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    after = normal_stress(np.array([[turned[i, j] for i, j in upper]]), edge_vectors((corners @ Q.T)[None]))
-    np.testing.assert_allclose(after, normal_stress(components[None], edge_vectors(corners[None])), atol=50 * EPS)
+    after = normal_stress(np.array([[turned[i, j] for i, j in upper]]), (corners @ Q.T)[None])
+    np.testing.assert_allclose(after, normal_stress(components[None], corners[None]), atol=50 * EPS)
 
 
 @pytest.mark.parametrize("dim", DIMS)

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from .edge_stress import carried_by, edge_vectors, greatest_pull, normal_stress
+from ..mesh.ranks import total
+from .edge_stress import carried_by, greatest_pull, normal_stress
 from .strength import Strength
 
 Values = npt.NDArray[np.float64]
@@ -65,14 +66,15 @@ class CarriedStress:
         """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
         graph = self._graph
         damaged = np.flatnonzero(graph.damaged)
-        if not self._comm.allreduce(len(damaged)):
+        if not total(self._comm, len(damaged))[0]:
             return stress, None
         active = ~graph.split
-        carried = stress.copy()
-        carried[np.flatnonzero(graph.split)] = 0.0
+        split = graph.split[damaged]
+        carried, whole = stress.copy(), damaged[~split]
+        carried[damaged[split]] = 0.0
         if self._leaves_out:
-            whole = damaged[active[damaged]]
-            carried[whole] = carried_by(stress[whole], self._stress.corners(whole), graph.intact(whole))
+            corners = self._stress.corners(whole)
+            carried[whole] = carried_by(stress.take(whole, axis=0), corners, graph.intact(whole))
         return carried, active
 
     def reaching(self, carried: Values, active: Flags | None, bound: float) -> tuple[npt.NDArray[np.int64], Values]:
@@ -118,7 +120,7 @@ class OverloadedEdges:
         may = size >= self.strength.weakest_of(cells) * (1 - ROUND_OFF)
         cells, averaged = cells[may], averaged[may]
         edges = self._graph.cell_edges[cells]
-        along = normal_stress(averaged, edge_vectors(self._stress.corners(cells)))
+        along = normal_stress(averaged, self._stress.corners(cells))
         strength = self.strength(cells, edges)
         over = (along >= strength) & ~self._graph.broken[edges]
         return edges[over], along[over] / strength[over]

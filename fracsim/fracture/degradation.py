@@ -18,7 +18,7 @@ from ..forms.kinematics import deformation_gradient
 from ..mechanics.kernels import CellExpression
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from .edge_stress import edge_vectors, normal_stress
+from .edge_stress import share_carried
 
 Values = npt.NDArray[np.float64]
 
@@ -81,9 +81,7 @@ class Chi:
         cells = np.flatnonzero(graph.damaged & (chi[: len(psi)] > 0))
         if not len(cells):
             return 0.0, 0.0, False
-        load = np.abs(normal_stress(stress[cells], edge_vectors(self._stress.corners(cells))))
-        whole, kept = load.sum(axis=1), (load * graph.cell_integrity(cells)).sum(axis=1)
-        share = np.divide(kept, whole, out=np.ones_like(kept), where=whole > 0)
+        share = share_carried(stress.take(cells, axis=0), self._stress.corners(cells), graph.cell_integrity(cells))
         share[graph.split[cells]] = 0.0
         lost = np.maximum(chi[cells] - share, 0.0)
         changed = lost > 0

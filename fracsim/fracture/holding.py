@@ -21,7 +21,7 @@ from ..mesh.around import CellsAround
 from ..mesh.edges import EdgeGraph
 from ..mesh.simplices import is_split, local_edges
 from .criterion import OverloadedEdges
-from .edge_stress import edge_vectors, normal_stress
+from .edge_stress import normal_stress
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -88,7 +88,7 @@ class Holding:
     def _own_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
         """(n,) the greatest load over strength of the failing edges (n, edges) of cells, by what these feel
         themselves."""
-        along = normal_stress(stress[cells], edge_vectors(self._stress.corners(cells)))
+        along = normal_stress(stress[cells], self._stress.corners(cells))
         strength = self.strength(cells, self._graph.cell_edges[cells])
         return np.asarray(np.where(fails, along / strength, 0.0).max(axis=1, initial=0.0))
 

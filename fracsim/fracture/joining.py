@@ -22,7 +22,7 @@ from ..mesh.edges import EdgeGraph
 from ..mesh.ranks import total
 from ..mesh.simplices import is_split
 from ..meshes.components import components
-from .edge_stress import edge_vectors, normal_stress
+from .edge_stress import normal_stress
 from .strength import Strength
 
 Ints = npt.NDArray[np.int64]
@@ -82,7 +82,7 @@ class Joining:
         feel themselves; -max where there is none."""
         graph = self._graph
         cells = np.flatnonzero(~graph.split & without[graph.cell_nodes].any(axis=1))
-        along = normal_stress(stress[cells], edge_vectors(self._stress.corners(cells)))
+        along = normal_stress(stress[cells], self._stress.corners(cells))
         result = np.full(len(graph.broken), -np.finfo(float).max)
         np.maximum.at(result, graph.cell_edges[cells], along / self._strength(cells, graph.cell_edges[cells]))
         return np.asarray(result[edges])

@@ -15,7 +15,7 @@ from dolfinx.common import IndexMap
 from .domain import Domain, Ints
 from .incidence import Incidence
 from .ranks import total
-from .simplices import is_split, local_edges
+from .simplices import intact_edges, is_split, local_edges
 
 
 class EdgeGraph:
@@ -158,8 +158,7 @@ class EdgeGraph:
 
     def intact(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
         """(n, k) whether each local edge of the cells is intact."""
-        bits = np.arange(self.cell_edges.shape[1])
-        return np.asarray((self.pattern[cells, None] >> bits) & 1 == 0)
+        return np.asarray(intact_edges(self.domain.dim)[self.pattern[cells]])
 
     def cell_integrity(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
         """(n, k) integrity of each local edge of the cells."""

@@ -22,12 +22,17 @@ def local_edges(dim: int) -> npt.NDArray[np.int64]:
 
 
 @cache
+def intact_edges(dim: int) -> npt.NDArray[np.bool_]:
+    """(patterns, edges per cell): for each pattern, which edges are intact."""
+    edges = len(local_edges(dim))
+    return (np.arange(1 << edges)[:, None] >> np.arange(edges)) & 1 == 0
+
+
+@cache
 def node_groups(dim: int) -> npt.NDArray[np.int8]:
     """(patterns, d + 1): for each pattern, the lowest local node that each local node is joined to by intact edges."""
-    edges = local_edges(dim)
-    patterns = np.arange(1 << len(edges))
-    intact = (patterns[:, None] >> np.arange(len(edges))) & 1 == 0
-    label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(patterns), 1))
+    edges, intact = local_edges(dim), intact_edges(dim)
+    label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(intact), 1))
     for _ in range(dim):  # a path through d + 1 nodes has at most d edges
         for edge in range(len(edges)):
             i, j = int(edges[edge, 0]), int(edges[edge, 1])
