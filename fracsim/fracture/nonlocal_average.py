@@ -4,12 +4,15 @@
 
 with reference centroids X and volumes V (M22 eq. 13). Built once; a rank holds copies of the cells of other ranks
 within R of its own. Where all rows would take gigabytes (fine meshes: the weights of a radius grow as h^-6), a row is
-made when a stress near it first reaches the strength.
+made when a stress near it first reaches the strength. In a pass few cells pull as hard as the bound that is asked for,
+and fewer have come apart since the last one: only rows near these are looked at.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from ctypes import Structure, byref, c_double, c_int64, c_void_p
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +20,14 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from ..mesh.compiled import at, library
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+SOURCE = Path(__file__).with_suffix(".c")
 
 KERNELS: dict[str, Callable[[Values], Values]] = {
     "linear": lambda q: 1 - q,
@@ -44,9 +51,9 @@ class NonlocalAverage:
         near = self._exchange(centroids)
         volumes = self._exchange(domain.volumes[:, None])[:, 0]
         order = np.argsort(self._exchange(domain.cell_input[:, None].astype(float))[:, 0], kind="stable")
-        self._rows = _Rows(centroids, near[order], volumes[order], order, radius, kernel)
+        self._rows = _AllRows(centroids, near[order], volumes[order], order, radius, kernel)
 
-    def __call__(self, values: Values, active: npt.NDArray[np.bool_] | None = None) -> Values:
+    def __call__(self, values: Values, active: Flags | None = None) -> Values:
         """Averages (cells, n) of cell values (cells, n); cells not `active` enter none. 0 where none is left."""
         self._rows.make_all()
         n = values.shape[1]
@@ -54,15 +61,13 @@ class NonlocalAverage:
             values = np.column_stack([np.where(active[:, None], values, 0.0), active])
         near = self._exchange(values)
         averages = np.zeros((len(values), n))
-        for cells, weights, full in self._rows.made:
-            sums = weights @ near
-            weight = full[:, None] if active is None else sums[:, -1:]
-            averages[cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(cells), n)), where=weight > 0)
+        for rows in self._rows.made:
+            sums = rows.times(near)
+            weight = rows.full[:, None] if active is None else sums[:, -1:]
+            averages[rows.cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(sums), n)), where=weight > 0)
         return averages
 
-    def reaching(
-        self, values: Values, size: Values, bound: float, active: npt.NDArray[np.bool_] | None = None
-    ) -> tuple[npt.NDArray[np.int64], Values]:
+    def reaching(self, values: Values, size: Values, bound: float, active: Flags | None = None) -> tuple[Ints, Values]:
         """(m,) cells whose average may reach `bound` in size, and those averages (m, n) (collective).
 
         `size` (cells,) is a norm of `values`: the norm of an average is at most the average of norms, which takes one
@@ -72,40 +77,82 @@ class NonlocalAverage:
         if self._comm.allreduce(float(np.max(size, initial=0.0)), op=MPI.MAX) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
         near, pull = self._exchange(values), self._exchange(size[:, None])[:, 0]
-        # hairs below the bound: the sums are rounded
-        self._rows.make(pull >= bound * (1 - 1e-9))
-        weighing = self._rows.sums(None if active is None else self._exchange(active[:, None].astype(float))[:, 0])
-        found: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
+        hot = pull >= bound * (1 - 1e-9)  # hairs below the bound: the sums are rounded
+        self._rows.make(hot)
+        may = self._rows.around(hot)
+        weighing = self._rows.sums(None if active is None else self._exchange(active[:, None].astype(float)))
+        found: list[Ints] = [np.empty(0, np.int64)]
         averages: list[Values] = [np.empty((0, n))]
-        for (cells, weights, _), weight in zip(self._rows.made, weighing, strict=True):
-            rows = np.flatnonzero((weights @ pull >= bound * (1 - 1e-12) * weight) & (weight > 0))
-            found.append(cells[rows])
-            averages.append(np.asarray(weights[rows] @ near) / weight[rows, None])
+        for rows, weight in zip(self._rows.made, weighing, strict=True):
+            some = rows.above(np.flatnonzero(may[rows.cells]), pull, weight, bound * (1 - 1e-12))
+            found.append(rows.cells[some])
+            averages.append(rows.times(near, some) / weight[some, None])
         order = np.argsort(np.concatenate(found))
         return np.concatenate(found)[order], np.concatenate(averages)[order]
 
 
+class _Given(Structure):
+    """As nonlocal_average.c has it."""
+
+    _fields_ = (("start", c_void_p), ("place", c_void_p), ("weight", c_void_p))
+
+
 class _Rows:
+    """Rows of the weights of near cells around some cells.
+
+    Attributes:
+        cells: (n,) they.    full: (n,) sums of their weights.
+    """
+
+    def __init__(self, cells: Ints, weights: csr_matrix) -> None:
+        """`weights`: (n, near)."""
+        self.cells, self.full = cells, np.asarray(weights.sum(axis=1))[:, 0]
+        self._kept = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
+        self._given = _Given(*map(at, self._kept))
+        self._all = np.arange(len(cells))
+
+    def above(self, some: Ints, pull: Values, weight: Values, bound: float) -> Ints:
+        """(m,) those of some rows whose average of `pull` (near,) reaches a bound; `weight`: (n,) sums of weights."""
+        code, found = library(SOURCE, as_arrays=True).above, np.empty(len(some), np.int64)
+        code.restype = c_int64
+        given = map(at, (some, np.ascontiguousarray(pull), weight))
+        return found[: code(byref(self._given), c_int64(len(some)), *given, c_double(bound), at(found))]
+
+    def mark(self, places: Flags, marks: Flags) -> None:
+        """Mark those near (near,) the own cells that are among some `places` (near,)."""
+        sizes = c_int64(len(self.cells)), at(self.cells)
+        library(SOURCE, as_arrays=True).mark(byref(self._given), *sizes, at(places), at(marks))
+
+    def times(self, values: Values, some: Ints | None = None) -> Values:
+        """(n, k) sums over the weights of near values (near, k), of all rows or of some of them."""
+        some = self._all if some is None else some
+        found, values = np.empty((len(some), values.shape[1])), np.ascontiguousarray(values)
+        sizes = c_int64(len(some)), at(some), c_int64(values.shape[1])
+        library(SOURCE, as_arrays=True).times(byref(self._given), *sizes, at(values), at(found))
+        return found
+
+
+class _AllRows:
     """Weights of near cells around `centres`: all of them at once, or row by row where they would be too many.
 
     Each row has its weights in the order of the input mesh: the same order of summation at any rank count.
 
     Attributes:
-        made: (centres, their rows, sums of those), one block after the other. They are never joined: that would take
-            their memory once more.
+        made: one block after the other. They are never joined: that would take their memory once more.
     """
 
     def __init__(
-        self, centres: Values, near: Values, volumes: Values, places: npt.NDArray[np.int64], radius: float, kernel: str
+        self, centres: Values, near: Values, volumes: Values, places: Ints, radius: float, kernel: str
     ) -> None:
         """`near`, `volumes`: centroids and volumes of near cells in that order, `places` (near,) where values have
-        them."""
+        them, the centres first."""
         self._places = places
         self._centres, self._near, self._volumes, self._radius, self._kernel = centres, near, volumes, radius, kernel
         self._tree = cKDTree(near)
         self._missing = np.ones(len(centres), bool)
-        self.made: list[tuple[npt.NDArray[np.int64], csr_matrix, Values]] = []
-        self._active: Values = np.empty(0)
+        self._border = np.zeros(len(centres), bool)  # with cells of other ranks within the radius
+        self.made: list[_Rows] = []
+        self._active: Values = np.ones((len(near), 1))
         self._sums: list[Values] = []
         if self._expected() <= AT_ONCE:
             self.make_all()
@@ -116,7 +163,15 @@ class _Rows:
         counts = self._tree.query_ball_point(self._centres[::every], self._radius, return_length=True)
         return float(np.sum(counts)) * every
 
-    def make(self, hot: npt.NDArray[np.bool_]) -> None:
+    def around(self, places: Flags) -> Flags:
+        """(centres,) which of those that have rows may have any of some near cells (near,) within the radius: what is
+        near one of them it is near to."""
+        count, marks = len(self._centres), np.zeros(len(places), bool)
+        for rows in self.made:
+            rows.mark(places, marks)
+        return marks[:count] | self._border if places[count:].any() else marks[:count]
+
+    def make(self, hot: Flags) -> None:
         """See that there are rows of all centres with a `hot` near cell within the radius."""
         if not self._missing.any() or not hot.any():
             return
@@ -131,25 +186,29 @@ class _Rows:
         self._add(np.flatnonzero(self._missing))
 
     def sums(self, active: Values | None) -> list[Values]:
-        """Sums of the weights of near cells with 1 in `active` (near,), of each block `made`; None: of all. They are
-        kept until others are active."""
+        """Sums of the weights of near cells with 1 in `active` (near, 1), of each block `made`; None: of all."""
         if active is None:
-            return [full for *_, full in self.made]
-        if not np.array_equal(active, self._active):
-            self._active, self._sums = active, []
-        self._sums += [weights @ self._active for _, weights, _ in self.made[len(self._sums) :]]
+            return [rows.full for rows in self.made]
+        changed = (active != self._active)[:, 0]
+        if changed.any():
+            near, self._active = self.around(changed), active
+            for rows, sums in zip(self.made, self._sums, strict=False):
+                some = np.flatnonzero(near[rows.cells])
+                sums[some] = rows.times(active, some)[:, 0]
+        self._sums += [rows.times(active)[:, 0] for rows in self.made[len(self._sums) :]]
         return self._sums
 
-    def _add(self, cells: npt.NDArray[np.int64]) -> None:
+    def _add(self, cells: Ints) -> None:
         for start in range(0, len(cells), CHUNK):
             part = cells[start : start + CHUNK]
             pairs = cKDTree(self._centres[part]).sparse_distance_matrix(
                 self._tree, self._radius, output_type="coo_matrix"
             )
             weights = self._volumes[pairs.col] * KERNELS[self._kernel](pairs.data / self._radius)
+            self._border[part[pairs.row[self._places[pairs.col] >= len(self._centres)]]] = True
             rows = csr_matrix((weights, (pairs.row, pairs.col)), shape=(len(part), len(self._near)))
             rows.sort_indices()
             rows.indices = self._places[rows.indices].astype(rows.indices.dtype)
             rows.has_sorted_indices = False
-            self.made.append((part, rows, np.asarray(rows.sum(axis=1))[:, 0]))
+            self.made.append(_Rows(part, rows))
         self._missing[cells] = False
