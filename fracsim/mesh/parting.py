@@ -8,12 +8,16 @@ to an edge that has broken is in that part, and past all that has come off is in
 
 from __future__ import annotations
 
+from ctypes import Structure, byref, c_int64, c_void_p
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from ..meshes.components import components
+from .compiled import at, library
 from .domain import Domain
 from .edges import EdgeGraph
 from .pieces import Pieces, find_pieces, followed
@@ -21,7 +25,28 @@ from .ranks import total
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-FAR = (3, 12)  # edges that one goes, where need be
+FAR = (3, 12, 48)  # edges that one goes, where need be
+SOURCE = Path(__file__).with_suffix(".c")
+
+
+class _Given(Structure):
+    """As parting.c has it."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("nodes", "broken", "edges", "end", "shared"))
+
+
+@dataclass(frozen=True)
+class _Room:
+    """For what is reached, and for places of nodes (nodes,) among it: -1 but while it lasts."""
+
+    nodes: Ints
+    place: Ints
+    part: Ints
+    goes_on: Flags
+
+    @classmethod
+    def of(cls, nodes: int) -> _Room:
+        return cls(np.empty(nodes, np.int64), np.full(nodes, -1), np.empty(nodes, np.int64), np.empty(nodes, bool))
 
 
 class Parting:
@@ -34,7 +59,9 @@ class Parting:
     def __init__(self, graph: EdgeGraph) -> None:
         self._graph, self._domain = graph, graph.domain
         self._shared = _on_other_ranks(graph.domain)
-        self._place = np.full(len(self._shared), -1)  # of nodes among those that are reached, while it lasts
+        self._room = _Room.of(len(self._shared))
+        self._code = library(SOURCE).reached
+        self._code.restype = c_int64
         self._look_everywhere()
 
     def look(self) -> Pieces:
@@ -67,25 +94,13 @@ class Parting:
     def _reached(self, ends: Ints, far: int) -> tuple[Ints, Ints, Flags]:
         """(n,) nodes at most `far` whole edges from `ends`, (n,) the part each is in, and (parts,) which of these go on
         or may do so on another rank."""
-        graph, place = self._graph, self._place
-        nodes, links, rim = [ends], [], ends
-        place[ends], count = np.arange(len(ends)), len(ends)
-        for _ in range(far):
-            edges = graph.edges_at.each(rim)
-            links.append(graph.edge_nodes[edges[~graph.broken[edges]]])
-            rim = links[-1].ravel()
-            rim = rim[place[rim] < 0]
-            place[rim] = np.arange(len(rim))
-            rim = rim[place[rim] == np.arange(len(rim))]  # each once
-            place[rim] = np.arange(count, count + len(rim))
-            nodes.append(rim)
-            count += len(rim)
-        parts, part = components(place[np.concatenate(links)], count)
-        every, goes_on = np.concatenate(nodes), np.zeros(parts, bool)
-        place[every] = -1
-        goes_on[part[self._shared[every]]] = True
-        goes_on[part[count - len(rim) :]] = True
-        return every, part, goes_on
+        graph, room, parts = self._graph, self._room, c_int64()
+        room.nodes[: len(ends)] = ends
+        edges = graph.edges_at
+        given = _Given(*map(at, (graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared)))
+        sizes = byref(given), c_int64(len(ends)), c_int64(far)
+        count = self._code(*sizes, *map(at, (room.nodes, room.place, room.part, room.goes_on)), byref(parts))
+        return room.nodes[:count], room.part[:count], room.goes_on[: parts.value]
 
     def _part(self, nodes: Ints, part: Ints, goes_on: Flags) -> None:
         """Parts (parts,) of nodes (n,) that do not go on are pieces of their own (collective)."""
