@@ -227,8 +227,15 @@ class Balance:
 
     def update_reactions(self) -> None:
         """Refresh `reactions` on prescribed dofs alone: a residual over the few cells that touch them (collective)."""
+        if not self._is_held:
+            return
         b = self._add_nodal(self._assembler.into(self._kept, self._work_at_supports))
         self.reactions[self.motion.owned] = b.array_r[self.motion.owned]
+
+    @cached_property
+    def _is_held(self) -> bool:
+        """Whether the motion of any dof is prescribed (collective the first time)."""
+        return bool(total(self.domain.comm, len(self.motion.owned))[0])
 
     @cached_property
     def limits_steps(self) -> bool:

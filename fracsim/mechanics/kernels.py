@@ -71,7 +71,8 @@ def compile_form(form: ufl.Form) -> fem.Form:
 
 
 class CellForm(fem.Form):
-    """A form over `cells_measure`, cells of which may be left out later: its kernels stay, and so do its facets.
+    """A form over `cells_measure`, cells of which may be left out later: its kernels stay, and so do its facets. They
+    are bound to the cells that are left when they are asked for next.
 
     fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a form
     whose derivatives let one of them vanish.
@@ -79,22 +80,36 @@ class CellForm(fem.Form):
 
     def __init__(self, form: ufl.Form) -> None:
         whole = compile_form(form)
-        super().__init__(whole._cpp_object, whole.ufcx_form, whole.code, whole.module)
         self._whole: Any = whole._cpp_object
+        self._dead: npt.NDArray[np.bool_] | None = None  # that are not left out yet
+        super().__init__(whole._cpp_object, whole.ufcx_form, whole.code, whole.module)
         self._constants = [constant._cpp_object for constant in form.constants()]
+
+    @property
+    def _cpp_object(self) -> Any:
+        """What DOLFINx asks a form for."""
+        if self._dead is not None:
+            dead, self._dead = self._dead, None  # binding asks for it, too
+            self._bound = self._over(~dead)
+        return self._bound
+
+    @_cpp_object.setter
+    def _cpp_object(self, bound: Any) -> None:
+        self._bound = bound
 
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
-        self._cpp_object = self._over(~dead)
+        self._dead = dead
 
     @contextmanager
     def only(self, chosen: npt.NDArray[np.bool_]) -> Iterator[None]:
         """Integrate over the cells of the measure that are flagged, for as long as it lasts (not collective)."""
-        kept, self._cpp_object = self._cpp_object, self._over(chosen)
+        kept, dead, self._dead = self._bound, self._dead, None
+        self._bound = self._over(chosen)
         try:
             yield
         finally:
-            self._cpp_object = kept
+            self._bound, self._dead = kept, dead
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
         return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])

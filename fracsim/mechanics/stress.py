@@ -232,8 +232,8 @@ class Stress(Term):
         the cells alone that lost any (collective)."""
         lower = np.zeros(self.domain.cell_count, bool)
         for field, was in zip(self.fields, before, strict=True):
-            differs = (field.x.array != was).reshape(-1, field.function_space.dofmap.bs)
-            lower |= differs[: len(lower)].any(axis=1)
+            for differs in (field.x.array != was).reshape(-1, field.function_space.dofmap.bs).T:  # rows are short
+                lower |= differs[: len(lower)]
         with self._alone.only(lower):
             now = self.exchange(before)
             lost = self.force()
@@ -248,5 +248,5 @@ class Stress(Term):
     def corners(self, cells: npt.NDArray[np.integer]) -> Values:
         """(n, d + 1, d) corners of cells in the configuration that the energy's stress belongs to, m."""
         nodes, d = self.domain.cell_nodes[cells], self.domain.dim
-        corners = self.domain.nodes[nodes]
-        return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d)[nodes]
+        corners = self.domain.nodes.take(nodes, axis=0)  # a third of the time of an index
+        return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d).take(nodes, axis=0)

@@ -60,9 +60,10 @@ class CrackFront:
         result, split = np.zeros(len(cells)), self._graph.split[cells]
         if self._domain.dim == 2:
             # to the middle of the cuts: two of them are a segment, three a branch
-            points = self._points(cells[split])
-            middle = np.nanmean(points, axis=1, keepdims=True)
-            result[split] = np.nansum(np.linalg.norm(points - middle, axis=2), axis=1)
+            points, broken = self._points(cells[split]), self._graph.broken[self._graph.cell_edges[cells[split]]]
+            middle = np.where(broken[..., None], points, 0.0).sum(axis=1) / broken.sum(axis=1)[:, None]
+            arms = np.sqrt(np.square(points - middle[:, None]).sum(axis=2))
+            result[split] = np.where(broken, arms, 0.0).sum(axis=1)
             return result
         many = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern[cells]]
         for count, area in ((3, _triangles), (4, _quadrangles)):
