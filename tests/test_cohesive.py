@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from fracsim.fracture.cohesive.softening import carried, decay, widths
 from fracsim.fracture.cohesive.tips import without
 from fracsim.scene import Scene
 from fracsim.study.check import check_study
+from fracsim.studies import folder as packaged
 from support.resumed import assert_alike, going_stopped_resumed
-from support.scenes import DIRECT, make_scene, make_study
+from support.scenes import DIRECT, make_scene, make_study, march
 from support.tearing import RUNS
 
 Values = npt.NDArray[np.float64]
@@ -155,6 +157,26 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     assert_alike(again, going, 1e-9)
     np.testing.assert_allclose(again.scene.fracture.criterion.cut, going.scene.fracture.criterion.cut, atol=1e-9)
     assert np.count_nonzero(~np.isnan(going.scene.fracture.criterion.cut)) > going.breaks.figures[0]
+
+
+def test_a_panel_of_concrete_is_as_stiff_as_by_another_program() -> None:
+    """Pushed up by 10 micrometres, 20 mm from the end of its arm, Winkler's panel of the study's modulus takes 563.94 N
+    by MOOSE, of quadratic hexahedra (github.com/PSAAPGroupLinder/lShapedPanelBenchmark); here more, as cells are
+    linear, and less of it as they are finer."""
+    study = tomllib.loads((packaged() / "l-panel.toml").read_text())
+    seat = {"on": {"box": [[0.4799, 0.2499], [0.4801, 0.2501]]}, "displacement": ["free", 1e-5]}
+    stiffness = []
+    for h in (0.02, 0.01):
+        scene, state = make_scene(
+            mesh=study["mesh"] | {"h": h, "h_corner": h, "seat": 0.02}, material=study["material"],
+            boundary=[{"on": "bottom", "fix": "xy"}, seat],
+            time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}, solver=DIRECT,
+        )  # fmt: skip
+        march(scene, state)
+        stiffness.append(2 * scene.balance.stress.stored() * study["material"]["thickness"] / 1e-5**2)
+    found = 563.94 / 1e-5
+    assert found < stiffness[1] < stiffness[0] < 1.05 * found
+    assert stiffness[1] == pytest.approx(found, rel=0.02)
 
 
 # --- what is refused, and told ---------------------------------------------------------------------------------------
