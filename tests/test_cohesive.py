@@ -15,8 +15,8 @@ from fracsim.fracture.cohesive.breaking import CohesiveBreaking
 from fracsim.fracture.cohesive.softening import carried, decay, widths
 from fracsim.fracture.cohesive.tips import without
 from fracsim.scene import Scene
-from fracsim.study.check import check_study
 from fracsim.studies import folder as packaged
+from fracsim.study.check import check_study
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, make_scene, make_study, march
 from support.tearing import RUNS
