@@ -384,6 +384,7 @@ def _run_rigid(
     source: Path | None,
 ) -> dict[str, Any]:
     """Rigid bodies move on rank 0, and are the same on any number of ranks, which analyse them (collective)."""
+    from .rigid.waiting import tell
     from .scene.rigid import build_rigid_scene, help_rigid
 
     def work() -> dict[str, Any]:
@@ -404,7 +405,7 @@ def _run_rigid(
             return work()
         finally:
             if comm.size > 1:
-                comm.bcast(None)
+                tell(comm, None)
 
     with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt:
         if comm.rank:

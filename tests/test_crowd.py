@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from fracsim.rigid.contacts import Contacts
 from fracsim.rigid.crowd import Crowd, projected
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.model import Rules
+from fracsim.rigid.waiting import Helper
 from support.falling import CUBE, DOWN, MASS, cubes
 
 Values = npt.NDArray[np.float64]
@@ -79,6 +81,19 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
     assert np.allclose(p[both, 1:], -friction * p[both, :1] * u[both, 1:] / slip[both, None], rtol=0.01, atol=1e-3)
     if friction == 0.3:
         assert np.count_nonzero(both) > 10 and np.count_nonzero(pressed & ~sliding) > 10
+
+
+def test_two_threads_come_to_the_same_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a crowd, in as many iterations; whatever each of them was busy with."""
+    monkeypatch.setattr("fracsim.rigid.crowd.FEW", 10)
+    contacts, bodies = pile(0.3)
+    still = np.zeros((1, 3))
+    free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
+    crowd = Crowd.of(contacts, free, np.zeros(len(contacts)), bodies.mass, np.linalg.inv(bodies.inertia))
+    with Helper(os.sched_getaffinity(0)) as helper:
+        for most in (1, 17, 150, 150, 1000):
+            alone, two = (crowd.impulses(1e-7, most, np.zeros_like(free), each) for each in (None, helper))
+            assert alone.max() > 0 and np.array_equal(alone, two)
 
 
 def test_a_heap_keeps_its_momentum_and_loses_energy() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mechanics.contact.shapes import Sphere
+from fracsim.mechanics.contact.shapes import Box, Sphere
 from fracsim.rigid.contacts import Contacts
 from fracsim.rigid.course import Course
 from fracsim.rigid.finding import Finder
 from fracsim.rigid.model import Rules, Stand, model_of
 from fracsim.rigid.primitives import primitive
+from fracsim.rigid.waiting import Helper
 from support.falling import CUBE, DOWN, cubes, floor
 
 Values = npt.NDArray[np.float64]
@@ -47,6 +49,24 @@ def test_some_bodies_meet_what_they_meet_among_all() -> None:
     assert np.array_equal(told(chosen), told(every.chosen(np.flatnonzero(met))))
     again = find(bodies, ways, course, 5e-3, looked)
     assert np.array_equal(told(again), told(every)), "and all are looked for afterwards"
+
+
+def test_two_threads_find_what_one_does() -> None:
+    """In the same order: of 216 blocks askew over a floor, a block that stands and a driven ball, all and some."""
+    rng = np.random.default_rng(6)
+    bodies = cubes((1.05 * np.indices((6, 6, 6)).reshape(3, -1).T + 0.6).tolist())
+    bodies = replace(bodies, turn=Rotation.random(216, rng=rng).as_matrix())
+    block = Stand(primitive(Box((2.0, 2.0, 1.0)), "block"), np.array([3.0, 3.0, 0.1]), 0.3)
+    ball = Stand(primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
+    model = model_of(bodies, [[CUBE]] * 216, [floor(0.5), block, ball], Rules(5e-3, DOWN, 0.4))
+    course = Course(np.full((3, 3), 100.0), np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 216))])
+    ways, looked = np.array([[0.0, 0, 0], [3.0, 3.0, 0.1], [1.0, 1.0, -0.2]]), model.planes.looked()
+    with Helper(os.sched_getaffinity(0)) as helper:
+        alone, two = Finder(model), Finder(model, helper)
+        for only in (None, rng.uniform(size=216) < 0.7):
+            one, other = (find(bodies, ways, course, 5e-3, looked, only) for find in (alone, two))
+            assert len(one) > 1000 and {216, 217, 218} <= set(one.things.ravel())
+            assert all(np.array_equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
 
 
 def test_things_come_together_as_fast_as_their_points_do() -> None:

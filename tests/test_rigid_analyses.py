@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from fracsim.rigid.analyses import serve
+from fracsim.rigid.waiting import LENT
 
 
 class Script:
@@ -15,9 +16,18 @@ class Script:
     rank, size = 1, 2
 
     def __init__(self, *said: object) -> None:
-        self.said, self.answers = list(said), list[Any]()
+        self.said, self.answers, self.looked = list(said), list[Any](), 0
 
-    def bcast(self, _: object) -> object:
+    def send(self, offer: object, dest: int, tag: int) -> None:
+        assert dest == 0 and tag == LENT and offer
+
+    def iprobe(self, source: int, tag: int) -> bool:
+        """Only every other time that it looks."""
+        self.looked += 1
+        return self.looked % 2 == 0
+
+    def recv(self, source: int, tag: int) -> object:
+        assert self.iprobe(0, tag) is False
         return self.said.pop(0)
 
     def gather(self, found: object) -> None:

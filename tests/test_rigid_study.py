@@ -7,6 +7,7 @@ import json
 import subprocess
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -328,11 +329,11 @@ class OtherRank:
         self.other, self.asked = other, 0
         self._strikes: list[Strike] = []
 
-    def bcast(self, message: object) -> object:
+    def isend(self, message: object, rank: int, tag: int) -> SimpleNamespace:
         if not isinstance(message, str):
             self.other.take(message.news)  # type: ignore[attr-defined]
             self._strikes = message.strikes  # type: ignore[attr-defined]
-        return message
+        return SimpleNamespace(wait=lambda: None)
 
     def gather(self, mine: object) -> list[object]:
         self.asked += len(self._strikes[1::2])

@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from .breakable import Opened
 from .copies import Copies
+from .waiting import lend, tell, told
 
 Values = npt.NDArray[np.float64]
 
@@ -88,9 +89,9 @@ class Analyses:
             self._news += found if comm.size > 1 else []
             return found
         if self._begin is not None:
-            comm.bcast(self._begin)
+            tell(comm, self._begin)
             self._begin = None
-        comm.bcast(_Message(self._saved, self._news, strikes))
+        tell(comm, _Message(self._saved, self._news, strikes))
         parts = _gathered(comm, self._bodies, strikes)
         assert parts is not None
         for part in parts:
@@ -103,10 +104,11 @@ class Analyses:
 
 def serve(comm: MPI.Comm, make: Callable[[Any], Copies]) -> None:
     """On all other ranks: analyse what rank 0 says, until it sends None; `make`: of what `begin` is."""
-    if (begin := comm.bcast(None)) is None:
+    lend(comm)
+    if (begin := told(comm)) is None:
         return
     bodies: Copies | None = None
-    while (message := comm.bcast(None)) is not None:
+    while (message := told(comm)) is not None:
         try:
             bodies = bodies or make(begin)
             if message.saved is not None:

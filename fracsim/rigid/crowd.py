@@ -20,12 +20,14 @@ Which these are is looked at again after LOOK, 2 LOOK, 4 LOOK iterations. Newton
 factors of one great matrix each time, and which of a thousand hard contacts press it finds by trial.
 Gauss and Seidel's sweeps cost as much as these iterations and leave up to four times the error after as many.
 
-What is done to each contact in each iteration is in crowd.c, compiled where it is needed first.
+What is done to each contact in each iteration is in crowd.c, compiled where it is needed first: to one half of the
+contacts and to the other, by one thread or by two.
 """
 
 from __future__ import annotations
 
 import ctypes
+from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,8 +38,10 @@ import numpy.typing as npt
 
 from ..mesh.compiled import at, library
 from .contacts import Contacts
+from .waiting import Helper
 
 SOURCE = Path(__file__).with_suffix(".c")
+FEW = 1000  # contacts: fewer are not worth a second thread
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -45,8 +49,8 @@ Values = npt.NDArray[np.float64]
 class _Crowd(ctypes.Structure):
     """As crowd.c has it."""
 
-    _fields_ = (("count", ctypes.c_int64), ("bodies", ctypes.c_int64), ("contact", ctypes.c_void_p),
-                ("things", ctypes.c_void_p), ("mass", ctypes.c_void_p), ("inertia", ctypes.c_void_p))  # fmt: skip
+    _fields_ = (("count", c_int64), ("bodies", c_int64), ("contact", c_void_p),
+                ("things", c_void_p), ("mass", c_void_p), ("inertia", c_void_p))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,13 +79,20 @@ class Crowd:
         things = np.ascontiguousarray(np.minimum(contacts.things, len(mass)))
         return cls(rows, things, 1 / mass, np.ascontiguousarray(inverse))
 
-    def impulses(self, enough: float, most: int, start: Values) -> Values:
+    def impulses(self, enough: float, most: int, start: Values, helper: Helper | None = None) -> Values:
         """(k, 3) N s that second things receive, along the axes of the contacts; `enough`: m/s that velocities may be
-        off by; `most`: of iterations; `start`: (k, 3) N s from where to go on."""
-        p = np.array(start, order="C")
-        spent = library(SOURCE).impulses(self._given, ctypes.c_double(enough), ctypes.c_int64(most), at(p))
-        if spent < 0:
+        off by; `most`: of iterations; `start`: (k, 3) N s from where to go on; `helper`: a second thread, with which
+        all comes out the same to the last digit."""
+        p, loops = np.array(start, order="C"), _loops()
+        two = helper is not None and len(p) >= FEW
+        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), at(p), two))
+        if not now:
             raise MemoryError(f"no room for {len(p)} contacts")
+        if helper is not None and two:
+            helper.both(lambda: loops.impulses(now, 0), lambda: loops.impulses(now, 1))
+        else:
+            loops.impulses(now, 0)
+        loops.finished(now)
         return p
 
     def gained(self, impulses: Values) -> Values:
@@ -92,9 +103,9 @@ class Crowd:
 
     def bound(self) -> Values:
         """(k,) D."""
-        count, bodies = len(self.contacts), len(self.mass) + 1
-        d, room, rows = np.empty(count), [np.empty(many) for many in (36 * bodies, bodies, 2 * count)], np.arange(count)
-        library(SOURCE).bound(self._given, at(rows), ctypes.c_int64(count), at(d), *map(at, room))
+        d: Values = np.empty(len(self.contacts))
+        if library(SOURCE).bound(self._given, at(d)):
+            raise MemoryError(f"no room for {len(d)} contacts")
         return d
 
     @cached_property
@@ -104,8 +115,15 @@ class Crowd:
         return ctypes.byref(_Crowd(len(self.contacts), len(self.mass), *arrays))
 
 
+def _loops() -> ctypes.CDLL:
+    """The functions of crowd.c, one of which tells where something is."""
+    loops = library(SOURCE)
+    loops.begun.restype = c_void_p
+    return loops
+
+
 def projected(p: Values, mu: Values) -> Values:
     """(k, 3) the nearest of each cone |p_t| <= mu p_n."""
     near = np.array(p, order="C")
-    library(SOURCE).projected(ctypes.c_int64(len(mu)), at(near), at(mu))
+    library(SOURCE).projected(c_int64(len(mu)), at(near), at(mu))
     return near

@@ -24,6 +24,7 @@ from .pushing import Pushing
 from .siblings import Overlaps, Parting
 from .striking import Striking
 from .touches import Touches
+from .waiting import Helper
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -46,12 +47,14 @@ class Engine:
         names: Ints | None = None,
         outer: Sequence[Values] | None = None,
         turn: Values | None = None,
+        helper: Helper | None = None,
     ) -> None:
         """`parts`: convex parts of each body, `outer`: its outermost points (None: all corners), both turned by `turn`
-        (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers."""
+        (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers; `helper`: a
+        second thread (None: there is none)."""
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
-        self._finder, self._push = Finder(self._model), Pushing(self._model, rules)
+        self._finder, self._push = Finder(self._model, helper), Pushing(self._model, rules, helper)
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         known = np.arange(len(bodies)) if names is None else names
         self._parting = Parting.of(overlaps or Overlaps.none(), known, self._model.first, len(self._model.thing))

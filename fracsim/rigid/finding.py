@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from typing import Any
+
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -13,34 +16,38 @@ from .contacts import Contacts
 from .course import Course
 from .model import Model, orientation
 from .planes import Looked
+from .waiting import Helper
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
+FEW = 100  # things that look for others: fewer are not worth a second thread
+FIRST = 0.4  # of these: what they meet is half of all that is met, or so
 
-class Finder:
-    """Of the contacts of a model's bodies, and of what stands in their way."""
 
-    def __init__(self, model: Model) -> None:
-        self._model, self._count = model, len(model.mass)
-        self._data = mujoco.MjData(model.made)
-        self._kind = model.made.geom_contype.copy(), model.made.body_contype.copy()
+class _Search:
+    """MuJoCo's, in a model that nobody else looks in meanwhile."""
 
-    def __call__(
-        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None
-    ) -> Contacts:
-        """What comes together in a step, s, of a course, what stands being at `ways` (stands, 3), m; `looked`: at
-        corners over planes in it; `only`: (n,) of some bodies, what others have with one another and with what stands
-        is not looked for."""
-        model, made, data, n = self._model, self._model.made, self._data, self._count
-        reach, slide = course.reach, course.slide(step)
-        of_thing = np.concatenate([reach[0], slide[0]])
-        made.body_pos[1 : n + 1], made.body_pos[n + 1 :] = bodies.place, ways[model.driven]
-        made.body_quat[1 : n + 1] = orientation(bodies.turn)
-        made.geom_gap[:] = of_thing[model.thing]
-        made.body_margin[:] = np.concatenate([[slide[0].max(initial=0.0)], reach[0], slide[0][model.driven]])
-        self._look_at(only)
+    def __init__(self, model: Model, made: Any) -> None:
+        self._made, self._data, n = made, mujoco.MjData(made), len(model.mass)
+        self._thing, self._driven = model.thing, n + model.driven
+        body = np.concatenate([[-1], np.arange(n), self._driven])  # things; of what stands still the last flag
+        kinds = [(made.geom_contype, self._thing, False), (made.body_contype, body, False),
+                 (made.geom_conaffinity, self._thing, True), (made.body_conaffinity, body, True)]  # fmt: skip
+        self._kinds = [(kind, kind.copy(), of, hides) for kind, of, hides in kinds]
+
+    def __call__(self, places: Values, quat: Values, margin: Values, looks: Flags, hidden: Flags) -> list[Any]:
+        """Geoms (k, 2), points, axes, distances and friction of what things (things,) at some places find within the
+        sum of their margins, m. Of two things one `looks` (things + 1,), and neither is `hidden`; the last margin and
+        flags are those of all that stands still."""
+        made, data, n = self._made, self._data, len(quat)
+        made.body_pos[1 : n + 1], made.body_pos[n + 1 :] = places[:n], places[self._driven]
+        made.body_quat[1 : n + 1] = quat
+        made.geom_gap[:] = margin[self._thing]
+        made.body_margin[:] = np.concatenate([margin[-1:], margin[:n], margin[self._driven]])
+        for kind, usual, of, hides in self._kinds:
+            kind[:] = np.where((~hidden if hides else looks)[of], usual, 0)
         mujoco.mj_kinematics(made, data)
         mujoco.mj_collision(made, data)
         if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
@@ -48,25 +55,54 @@ class Finder:
                 f"{data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a larger "
                 "mesh.h has fewer"
             )
-        found, places = data.contact, np.concatenate([bodies.place, ways])
-        geoms = found.geom.astype(np.int64).reshape(-1, 2)
-        every = Contacts.found(
-            geoms, model.thing[geoms], found.pos.reshape(-1, 3).copy(), found.frame.reshape(-1, 3, 3).copy(),
-            found.dist.copy(), found.friction[:, 0].copy(), places
-        )  # fmt: skip
+        met = data.contact
+        return [met.geom.reshape(-1, 2).copy(), met.pos.reshape(-1, 3).copy(), met.frame.reshape(-1, 3, 3).copy(),
+                met.dist.copy(), met.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+
+
+class Finder:
+    """Of the contacts of a model's bodies, and of what stands in their way."""
+
+    def __init__(self, model: Model, helper: Helper | None = None) -> None:
+        """`helper`: a second thread, with which the same is found."""
+        self._model, self._count, self._helper = model, len(model.mass), helper
+        self._searches = [_Search(model, model.made)]
+
+    def __call__(
+        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None
+    ) -> Contacts:
+        """What comes together in a step, s, of a course, what stands being at `ways` (stands, 3), m; `looked`: at
+        corners over planes in it; `only`: (n,) of some bodies, what others have with one another and with what stands
+        is not looked for."""
+        model, places = self._model, np.concatenate([bodies.place, ways])
+        reach, slide = course.reach, course.slide(step)
+        margin = np.concatenate([reach[0], slide[0], [slide[0].max(initial=0.0)]])
+        looks = np.ones(len(margin), bool) if only is None else np.append(only, np.zeros(len(ways) + 1, bool))
+        met, *where = self._searched(places, orientation(bodies.turn), margin, looks)
+        geoms, (point, axes, gap, friction) = met.astype(np.int64), where
+        every = Contacts.found(geoms, model.thing[geoms], point, axes, gap, friction, places)
         for each in self._of_planes(bodies, ways, reach[1], slide[1], step, looked, only):
             every = every.and_more(each)
         return every
 
-    def _look_at(self, only: Flags | None) -> None:
-        """Things that have a kind look for those that take to it: what is not looked at has none."""
-        made, n = self._model.made, self._count
-        of_geom, of_body = self._kind
-        made.geom_contype[:], made.body_contype[:] = of_geom, of_body
-        if only is not None:
-            looks = np.append(only, np.zeros(len(self._model.thing) + 1, bool))
-            made.geom_contype[~looks[self._model.thing]] = 0
-            made.body_contype[0], made.body_contype[1 : n + 1][~only], made.body_contype[n + 1 :] = 0, 0, 0
+    def _searched(self, places: Values, quat: Values, margin: Values, looks: Flags) -> list[Any]:
+        """What things find that look for others, by the numbers of their bodies: those of a first share of them, and,
+        with a helper at once, those of the others among themselves."""
+        helper, hidden, mine = self._helper, np.zeros(len(looks), bool), np.flatnonzero(looks[: self._count])
+        if helper is None or len(mine) < FEW:
+            return self._searches[0](places, quat, margin, looks, hidden)
+        if len(self._searches) == 1:
+            self._searches.append(_Search(self._model, copy(self._model.made)))
+        first, second = self._searches
+        hidden[mine[: int(FIRST * len(mine))]] = True
+        parts = helper.both(
+            lambda: first(places, quat, margin, looks & hidden, np.zeros_like(hidden)),
+            lambda: second(places, quat, margin, looks & ~hidden, hidden),
+        )
+        found = [np.concatenate(both) for both in zip(*parts, strict=True)]
+        of = np.sort(self._model.made.geom_bodyid[found[0]].astype(np.int64), axis=1)
+        order = np.argsort(of[:, 0] * self._model.made.nbody + of[:, 1], kind="stable")
+        return [each[order] for each in found]
 
     def _of_planes(
         self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, looked: Looked,

@@ -16,6 +16,7 @@ from .model import Model, Rules
 from .motion import driven_on, forces, of_things
 from .newton import Newton
 from .touches import Touches
+from .waiting import Helper
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -37,8 +38,9 @@ def crowded(met: Event) -> bool:
 class Pushing:
     """Of the bodies of a model."""
 
-    def __init__(self, model: Model, rules: Rules) -> None:
-        self._model, self._rules = model, rules
+    def __init__(self, model: Model, rules: Rules, helper: Helper | None = None) -> None:
+        """`helper`: a second thread (None: there is none)."""
+        self._model, self._rules, self._helper = model, rules, helper
         self._newton: Newton | None = None
 
     def __call__(self, met: Event, ways: Values, *, rough: bool) -> tuple[Values, Touches, bool]:
@@ -95,7 +97,7 @@ class Pushing:
             crowd = Crowd.of(some, some.parting(*free), aim, model.mass, inverse)
             enough = NEARLY * self._rules.fast
             most = ROUGH if rough or number else max(MOST, WORK // max(len(rows), 1))
-            met.impulse[rows] = crowd.impulses(enough, most, met.impulse[rows])
+            met.impulse[rows] = crowd.impulses(enough, most, met.impulse[rows], self._helper)
             force = forces(model, bodies, crowd.gained(met.impulse[rows]), dt)
             missed = self._missed(met, met.near, of_things(self.driven_on(met, force), rates))
             met.near |= missed

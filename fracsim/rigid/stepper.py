@@ -22,6 +22,7 @@ from .model import Part, Rules
 from .obstacles import Others
 from .siblings import Overlaps
 from .touches import Touches
+from .waiting import Helper
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -92,9 +93,11 @@ class RigidStepper:
         hertz: Hertz,
         contact_time: float | None = None,
         analyses: Analyses | None = None,
+        helper: Helper | None = None,
     ) -> None:
-        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh."""
-        self.analyses = analyses or Analyses(copies)
+        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh; `helper`: a
+        second thread, None: there is none."""
+        self.analyses, self._helper = analyses or Analyses(copies), helper
         self.copies, self._geometry, self._density = copies, geometry, density
         self.others, self._rules, self._hertz, self._given = Others(obstacles), rules, hertz, contact_time
         self.blows, self.phases, self.overlaps = (
@@ -206,7 +209,7 @@ class RigidStepper:
         if others.free:
             turn = np.concatenate([turn, np.tile(np.eye(3), (len(others.free), 1, 1))])
         stands = others.stands(t)
-        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.names, outer, turn)
+        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.names, outer, turn, self._helper)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:

@@ -26,6 +26,7 @@ from ..rigid.free_body import Stiffness
 from ..rigid.geometry import Geometry
 from ..rigid.hertz import Hertz
 from ..rigid.placing import Place, Poses, motion, placed
+from ..rigid.waiting import lent
 from ..study import Contact, Study
 from ..study.check import checked_mesh
 from ..study.conditions import volume_loads
@@ -84,7 +85,8 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     hertz = Hertz(study.material.young, study.material.poisson)
     analyses = Analyses(copies, comm, (study, single, places))
     geometry = Geometry(single, poses)
-    stepper = RigidStepper(copies, geometry, density, obstacles, rules, hertz, contact.contact_time, analyses)
+    time, helper = contact.contact_time, lent(comm)
+    stepper = RigidStepper(copies, geometry, density, obstacles, rules, hertz, time, analyses, helper)
     first = stepper.start()
     _check_masses(first)
     at_rest, free = first.bodies.part(slice(stepper.count)), first.bodies.part(slice(stepper.count, None))
