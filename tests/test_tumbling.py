@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.tumbling import PART, rotated, tumbled
+from fracsim.rigid.tumbling import PART, orientation, rotated, tumbled
 
 Values = npt.NDArray[np.float64]
 TOP = np.diag([1.0, 2.0, 3.0])[None]  # kg m^2
@@ -75,3 +75,23 @@ def test_a_top_turns_as_euler_says() -> None:
         turn, spin, _ = tops(steps, 1.5)
         errors.append(float(np.abs(turn[0].T @ spin[0] - exact).max()))
     assert errors[1] < 0.05 and errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
+def test_a_rotation_is_its_quaternion() -> None:
+    """Of turns about all axes and by all angles, half a turn among them, that of SciPy but for its sign."""
+    rng = np.random.default_rng(4)
+    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(40, 3))])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    turns = np.concatenate([angle * axes for angle in (0.0, 1e-9, 0.3, 2.0, np.pi - 1e-9, np.pi, 4.0)])
+    found, known = orientation(Rotation.from_rotvec(turns).as_matrix()), Rotation.from_rotvec(turns)
+    same = np.abs(np.einsum("ni,ni->n", found, known.as_quat(scalar_first=True)))
+    assert np.allclose(same, 1.0, atol=1e-14) and np.allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-15)
+    assert np.allclose(Rotation.from_quat(found, scalar_first=True).as_matrix(), known.as_matrix(), atol=1e-14)
+
+
+def test_a_tensor_in_the_axes_of_a_body() -> None:
+    """R T R^T v of random bodies, by matrices in space."""
+    rng = np.random.default_rng(5)
+    turn, tensor, vector = Rotation.random(9, rng=rng).as_matrix(), rng.normal(size=(9, 3, 3)), rng.normal(size=(9, 3))
+    in_space = turn @ tensor @ np.swapaxes(turn, 1, 2)
+    assert np.allclose(rotated(turn, tensor, vector), (in_space @ vector[:, :, None])[:, :, 0], atol=1e-14)

@@ -53,9 +53,7 @@ class Contacts:
 
     def slipping(self, velocity: Values, spin: Values, chosen: Flags) -> Values:
         """(k,) how fast things slip along one another in chosen (k,) contacts, m/s; 0 in all others."""
-        slip = np.zeros(len(self))
-        slip[chosen] = np.linalg.norm(self.chosen(np.flatnonzero(chosen)).parting(velocity, spin)[:, 1:], axis=1)
-        return slip
+        return np.where(chosen, np.hypot(*self.parting(velocity, spin).T[1:]), 0.0)
 
     def parting(self, velocity: Values, spin: Values) -> Values:
         """(k, 3) velocities of the second things beside the first, along the axes, m/s."""

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from ..mechanics.contact.axes import frame
 from .bodies import Bodies
 from .contacts import Contacts
 from .course import Course
-from .model import Model, orientation
+from .model import Model
 from .planes import Looked
+from .tumbling import orientation
 from .waiting import Helper
 
 Ints = npt.NDArray[np.int64]
@@ -112,7 +112,7 @@ class Finder:
         planes, model, places, found = self._model.planes, self._model, np.concatenate([bodies.place, ways]), []
         for number, parts, gaps, points in planes.near(bodies, ways, reach, speeds, step, looked, only):
             geoms = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
-            axes = np.tile(frame(planes.normal[number])[:, [2, 0, 1]].T, (len(parts), 1, 1))
+            axes = np.tile(planes.across[number][:, [2, 0, 1]].T, (len(parts), 1, 1))
             friction = np.full(len(parts), planes.friction[number])
             found.append(Contacts.found(geoms, model.thing[geoms], points, axes, gaps, friction, places))
         return found

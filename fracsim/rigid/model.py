@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from .bodies import Bodies
 from .planes import Planes
 from .primitives import Primitive
+from .tumbling import orientation
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -210,8 +211,3 @@ def _add_parts(
             if quat is not None:
                 geom.quat = quat
     return len(parts)
-
-
-def orientation(turn: Values) -> Values:
-    """(n, 4) of rotations (n, 3, 3), the scalar first."""
-    return Rotation.from_matrix(turn).as_quat(scalar_first=True) if len(turn) else np.empty((0, 4))

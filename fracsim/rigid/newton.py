@@ -15,7 +15,8 @@ import numpy.typing as npt
 from ..errors import NotConverged
 from .bodies import Bodies
 from .contacts import Contacts
-from .model import Model, Rules, orientation
+from .model import Model, Rules
+from .tumbling import orientation
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

@@ -8,6 +8,7 @@ looked at once more with these.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -33,10 +34,10 @@ def _first(of: Ints, value: Values, many: int) -> Flags:
     return np.asarray(rank < many)
 
 
-def _bearing(of: Ints, arm: Values, normal: Values, later: Values) -> Flags:
+def _bearing(of: Ints, arm: Values, across: Values, later: Values) -> Flags:
     """(k,) which corners of bodies (k,) at `arm` (k, 3) from their centres bear: those `later` (k,) lowest and those
-    farthest out in every direction along the plane with a normal (3,); all of a body that has few."""
-    across = frame(normal)
+    farthest out in every direction along the plane with axes (3, 3), the last one its normal; all of a body that has
+    few."""
     along = arm @ across[:, 0], arm @ across[:, 1]
     sector = np.floor((np.arctan2(*along) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64)
     group = SECTORS * of + np.minimum(sector, SECTORS - 1)
@@ -72,6 +73,11 @@ class Planes:
     part: Ints
     extent: Values
 
+    @cached_property
+    def across(self) -> list[Values]:
+        """(3, 3) axes of each, the last one its normal."""
+        return [frame(normal) for normal in self.normal]
+
     def looked(self) -> Looked:
         """As a step begins: nothing has been missed in it."""
         none = np.zeros((len(self.stand), len(self.corners)), bool)
@@ -86,7 +92,7 @@ class Planes:
             rows = np.flatnonzero((gap < -deep) & ~looked.at[number, near])
             if len(rows):
                 of = self.of[near[rows]]
-                bears = _bearing(of, self._arms(bodies, near[rows]), normal, gap[rows])
+                bears = _bearing(of, self._arms(bodies, near[rows]), self.across[number], gap[rows])
                 looked.always[number, near[rows[bears]]] = found[of] = True
         return found
 
@@ -127,7 +133,7 @@ class Planes:
                 way = -step * np.einsum("ki,i->k", bodies.velocity_at(x, of), normal)
                 soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
                 kept = _first(of, gap, NEAREST) | always[near]
-                kept[soon] |= _bearing(of[soon], arms[soon], normal, (gap - way)[soon])
+                kept[soon] |= _bearing(of[soon], arms[soon], self.across[number], (gap - way)[soon])
                 seen[near[kept]] = True
                 points = x[kept] - gap[kept, None] / 2 * normal
                 found.append((number, self.part[near[kept]], gap[kept], points))

@@ -77,3 +77,31 @@ void tumbled(int64_t n, const double *turn, const double *inverse, const double 
             turned(after, inverse, momentum, *time / parts, rounds, same, after);
     }
 }
+
+/* R T R^T v of n bodies. */
+void rotations(int64_t n, const double *turn, const double *tensor, const double *vector, double *result)
+{
+    for (int64_t i = 0; i < n; i++) rotated(turn + 9 * i, tensor + 9 * i, vector + 3 * i, result + 3 * i);
+}
+
+/* Quaternions (n, 4) of n rotations, the scalar first: from the largest of its parts, of which none is lost. */
+void orientations(int64_t n, const double *turn, double *quat)
+{
+    for (int64_t each = 0; each < n; each++, turn += 9, quat += 4) {
+        int i = 0;
+        for (int k = 1; k < 3; k++)
+            if (turn[4 * k] > turn[4 * i]) i = k;
+        int j = (i + 1) % 3, k = (i + 2) % 3;
+        double trace = turn[0] + turn[4] + turn[8], q[4] = {1 + trace}; /* all of them times four times the largest */
+        if (trace > turn[4 * i]) {
+            q[1] = turn[7] - turn[5], q[2] = turn[2] - turn[6], q[3] = turn[3] - turn[1];
+        } else {
+            q[0] = turn[3 * k + j] - turn[3 * j + k];
+            q[1 + i] = 1 + 2 * turn[4 * i] - trace;
+            q[1 + j] = turn[3 * j + i] + turn[3 * i + j];
+            q[1 + k] = turn[3 * k + i] + turn[3 * i + k];
+        }
+        double size = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        for (int a = 0; a < 4; a++) quat[a] = q[a] / size;
+    }
+}

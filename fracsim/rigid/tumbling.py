@@ -40,5 +40,13 @@ def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Valu
 def rotated(turn: Values, tensor: Values, vector: Values) -> Values:
     """(n, 3) R T R^T v of tensors in the axes of bodies (n, 3, 3), inertia or its inverse, and vectors in space (n, 3):
     spins, or angular momenta."""
-    across = np.swapaxes(turn, 1, 2) @ vector[:, :, None]
-    return np.asarray((turn @ (tensor @ across))[:, :, 0])
+    given, result = [np.ascontiguousarray(each) for each in (turn, tensor, vector)], np.empty(vector.shape)
+    library(SOURCE).rotations(c_int64(len(turn)), *map(at, given), at(result))
+    return result
+
+
+def orientation(turn: Values) -> Values:
+    """(n, 4) of rotations (n, 3, 3) quaternions, the scalar first."""
+    turn, quat = np.ascontiguousarray(turn), np.empty((len(turn), 4))
+    library(SOURCE).orientations(c_int64(len(turn)), at(turn), at(quat))
+    return quat
