@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics import compiled as compiling
 from fracsim.mechanics import lanes
 from fracsim.mechanics.lanes import MatrixLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
+from fracsim.mesh import compiled as compiling
 from support.scenes import Values
 from test_dead_cells import damaged
 
