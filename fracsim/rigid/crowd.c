@@ -12,6 +12,7 @@
 #include <string.h>
 
 enum { CHECK = 10, LOOK = 15, SQUARINGS = 6, PATIENCE = 5000 };
+enum { TAKEN = 1, DONE = 2, STAGES = 4 };
 
 typedef struct {
     double axes[9], arms[6], given[3], friction; /* rows of axes; arms from what first and second turn about */
@@ -143,7 +144,9 @@ typedef struct {
 } Row;
 
 /* What is worked on in two halves, by one thread or by two: sums are the same to the last digit. */
-typedef struct {
+typedef struct State State;
+typedef void (*Work)(State *, int);
+struct State {
     const Crowd *crowd;
     double *p, *change;         /* (count, 3) of all contacts */
     double *d, *w;              /* (count,), (count, 2) */
@@ -154,31 +157,36 @@ typedef struct {
     double *beta;               /* (most,) by age */
     double worst[2], enough;    /* m/s that velocities are off by, its square, of each half; and may be */
     Row *row;                   /* some of count */
-    int64_t some, limit, spent;
-    int missed, two;            /* threads */
-    atomic_int come, round;
-} State;
+    int64_t some, limit;
+    int missed;
+    Work work;                   /* what is done to both halves, */
+    atomic_int_fast64_t offer;   /* the STAGES of the second: offered, TAKEN, DONE; -1 in the end */
+};
 
-/* All threads have come this far. */
-static void meet(State *now)
+/* Do something to both halves. A second thread does the second one, if it is there before the first is through with its
+   own: where cores have more to do, nobody waits for a thread that does not run. */
+static void share(State *now, Work work)
 {
-    if (now->two) {
-        int round = atomic_load(&now->round);
-        if (atomic_fetch_add(&now->come, 1) == 1) {
-            atomic_store(&now->come, 0);
-            atomic_fetch_add(&now->round, 1);
-        } else
-            for (int waited = 0; atomic_load(&now->round) == round; waited++)
-                if (waited > PATIENCE) sched_yield();
-    }
+    now->work = work;
+    int_fast64_t open = atomic_load(&now->offer) / STAGES * STAGES + STAGES;
+    atomic_store(&now->offer, open);
+    work(now, 0);
+    if (atomic_compare_exchange_strong(&now->offer, &(int_fast64_t){open}, open + TAKEN)) work(now, 1);
+    else for (int waited = 0; atomic_load(&now->offer) != open + DONE; waited++)
+        if (waited > PATIENCE) sched_yield();
 }
 
-/* Do something to one half, or, where there is no other thread, to both; then wait for the other. */
-static void share(State *now, int half, void (*work)(State *, int))
+/* What a second thread does, until there is no more to do. */
+void help(State *now)
 {
-    if (now->two) work(now, half);
-    else for (int each = 0; each < 2; each++) work(now, each);
-    meet(now);
+    for (int waited = 0; atomic_load(&now->offer) >= 0; waited++) {
+        int_fast64_t open = atomic_load(&now->offer);
+        if (open > 0 && open % STAGES == 0 && atomic_compare_exchange_strong(&now->offer, &open, open + TAKEN)) {
+            now->work(now, 1);
+            atomic_store(&now->offer, open + DONE);
+            waited = 0;
+        } else if (waited > PATIENCE) sched_yield();
+    }
 }
 
 static int64_t begins(int64_t count, int half) { return half * count / 2; }
@@ -298,28 +306,27 @@ static void iterated(State *now, int half)
     now->worst[half] = worst;
 }
 
-/* Iterations, at most so many; how many it took. Every thread does the same. */
-static void solved(State *now, int half)
+/* Iterations, at most so many; how many it took. */
+static int64_t solved(State *now)
 {
     int64_t spent = 0;
     for (int done = 0; spent < now->limit;) {
         int64_t until = spent + (spent > LOOK ? spent : LOOK);
-        if (!half) look(now);
-        meet(now);
+        look(now);
         if (!now->missed && done) break;
-        share(now, half, squares);
-        share(now, half, largests);
-        share(now, half, bounds);
-        share(now, half, taken);
+        share(now, squares);
+        share(now, largests);
+        share(now, bounds);
+        share(now, taken);
         for (done = 0; !done && spent < until && spent < now->limit; spent++) {
-            share(now, half, ahead);
-            share(now, half, moved);
-            share(now, half, iterated);
+            share(now, ahead);
+            share(now, moved);
+            share(now, iterated);
             done = fmax(now->worst[0], now->worst[1]) < now->enough * now->enough && (spent + 1) % CHECK == 0;
         }
-        share(now, half, handed);
+        share(now, handed);
     }
-    if (!half) now->spent = spent;
+    return spent;
 }
 
 /* Nesterov's (pace - 1) / pace', pace' = (1 + sqrt(1 + 4 pace^2)) / 2 from pace = 1 on. */
@@ -342,8 +349,8 @@ void finished(State *now)
     free(now);
 }
 
-/* What `two` threads or one work on; NULL where there is no memory for it. */
-State *begun(const Crowd *crowd, double enough, int64_t most, double *p, int two)
+/* What is to be solved; NULL where there is no memory for it. */
+State *begun(const Crowd *crowd, double enough, int64_t most, double *p)
 {
     int64_t k = crowd->count, n = crowd->bodies + 1;
     State *now = calloc(1, sizeof(State));
@@ -354,7 +361,7 @@ State *begun(const Crowd *crowd, double enough, int64_t most, double *p, int two
         finished(now);
         return NULL;
     }
-    now->crowd = crowd, now->p = p, now->enough = enough, now->limit = most, now->two = two;
+    now->crowd = crowd, now->p = p, now->enough = enough, now->limit = most;
     now->age = now->rows + k, now->d = room + 3 * k, now->w = now->d + k, room += 6 * k;
     for (int half = 0; half < 2; half++, room += 43 * n)
         now->level[half] = room, now->back[half] = room + 6 * n, now->square[half] = room + 7 * n;
@@ -363,22 +370,23 @@ State *begun(const Crowd *crowd, double enough, int64_t most, double *p, int two
     return now;
 }
 
-/* The same from impulses p (count, 3) on, which it changes: all of it, or of two threads what one does. */
-int64_t impulses(State *now, int half)
+/* The same from impulses p (count, 3) on, which it changes; how many iterations it took. */
+int64_t impulses(State *now)
 {
-    solved(now, half);
-    return now->spent;
+    int64_t spent = solved(now);
+    atomic_store(&now->offer, -1);
+    return spent;
 }
 
 /* D (count,) of all contacts; -1 where there is no memory for it. */
 int64_t bound(const Crowd *crowd, double *d)
 {
-    State *now = begun(crowd, 0, 0, d, 0);
+    State *now = begun(crowd, 0, 0, d);
     if (!now) return -1;
     for (now->some = 0; now->some < crowd->count; now->some++) now->rows[now->some] = now->some;
-    share(now, 0, squares);
-    share(now, 0, largests);
-    share(now, 0, bounds);
+    share(now, squares);
+    share(now, largests);
+    share(now, bounds);
     memcpy(d, now->d, crowd->count * sizeof(double));
     finished(now);
     return 0;

@@ -84,14 +84,13 @@ class Crowd:
         off by; `most`: of iterations; `start`: (k, 3) N s from where to go on; `helper`: a second thread, with which
         all comes out the same to the last digit."""
         p, loops = np.array(start, order="C"), _loops()
-        two = helper is not None and len(p) >= FEW
-        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), at(p), two))
+        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), at(p)))
         if not now:
             raise MemoryError(f"no room for {len(p)} contacts")
-        if helper is not None and two:
-            helper.both(lambda: loops.impulses(now, 0), lambda: loops.impulses(now, 1))
+        if helper is not None and len(p) >= FEW:
+            helper.both(lambda: loops.impulses(now), lambda: loops.help(now))
         else:
-            loops.impulses(now, 0)
+            loops.impulses(now)
         loops.finished(now)
         return p
 
