@@ -109,11 +109,13 @@ class Engine:
         return after, every, now, done
 
     def depth(self, bodies: Bodies) -> list[tuple[int, int, float]]:
-        """(thing, thing, depth in m) of what is in one another, the deepest place of each pair."""
+        """(thing, thing, depth in m) of what is in one another by more than hulls of pieces are from birth, the deepest
+        place of each pair."""
         rest, looked = still(len(self._way), self._count), self._model.planes.looked()
         contacts = self._finder(bodies, self._way, rest, self._rules.step, looked)
+        gap, _ = self._parting(contacts.geoms, contacts.things, contacts.gap)
         count = int(contacts.things.max(initial=0)) + 1
         code, place = np.unique(np.sort(contacts.things, axis=1) @ np.array([count, 1]), return_inverse=True)
         depth: Values = np.zeros(len(code))
-        np.maximum.at(depth, place, -contacts.gap)
+        np.maximum.at(depth, place, -gap)
         return [(int(each) // count, int(each) % count, float(depth[k])) for k, each in enumerate(code) if depth[k] > 0]

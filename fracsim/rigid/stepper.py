@@ -213,7 +213,7 @@ class RigidStepper:
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
-        """(thing, thing, depth in m) of what is in one another."""
+        """(thing, thing, depth in m) of what is in one another by more than hulls of pieces are from birth."""
         return (self._engine or self._made(state.t, state.bodies)).depth(state.bodies)
 
     def _given_by(self, touches: Touches, t: float) -> tuple[Values, Values]:

@@ -1,0 +1,82 @@
+"""No piece passes through another at 20 m/s: after every step, by barycentric coordinates and VTK's distances, which
+share nothing with the engine, and by what the engine finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import pyvista
+
+pytest.importorskip("mujoco", reason="an environment made without a network")
+
+from fracsim.mesh.small_matrices import barycentric_gradients
+from fracsim.mesh.split.build import split
+from fracsim.rigid.stepper import RigidState, RigidStepper
+from support.falling import DOWN, stepper_of
+from support.solids import copies
+from test_struck_bodies import bar
+
+Values = npt.NDArray[np.float64]
+Depths = dict[tuple[int, int], float]
+SPEED, STEP, STEPS, NONE = 20.0, 1e-3, 150, 1e-3
+
+
+def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
+    """Of pairs of pieces, how far corners of the drawn surface of one, crack faces as well, that are in a whole cell of
+    the other are from its surface, m: they come free of one another by no shorter way."""
+    body, bodies, found = stepper.copies.copy(0), state.bodies, dict[tuple[int, int], float]()
+    domain, of_node = body.graph.domain, body.pieces.of_node
+    made = split(stepper._geometry.skeleton, *body.damage())
+    x, own, owner = bodies.to_space(made.points, made.piece_of_point), made.piece_of_point, made.elements[:, 0]
+    of_cell = of_node[domain.cell_nodes]
+    whole = np.all(of_cell == of_cell[:, :1], axis=1)
+    for piece in range(len(bodies)):
+        corners, X = domain.nodes[domain.cell_nodes[whole & (of_cell[:, 0] == piece)]], bodies.to_rest(x, piece)
+        if not len(corners):
+            continue
+        near = np.flatnonzero(np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1))
+        near = near[own[near] != piece]
+        shares = np.einsum("ckd,ncd->nck", barycentric_gradients(corners), X[near, None] - corners[:, 0])
+        shares[:, :, 0] += 1.0
+        inside = near[(shares.min(axis=2) > 0).any(axis=1)]
+        if not len(inside):
+            continue
+        surface = pyvista.make_tri_mesh(x, made.elements[own[owner] == piece])
+        depth = np.abs(pyvista.PolyData(x[inside]).compute_implicit_distance(surface)["implicit_distance"])
+        for other in np.unique(own[inside][depth > NONE]):
+            pair = min(int(other), piece), max(int(other), piece)
+            found[pair] = max(found.get(pair, 0.0), float(depth[own[inside] == other].max()))
+    return found
+
+
+def from_birth(stepper: RigidStepper) -> Depths:
+    """Of pairs of pieces, how far their hulls may lie in one another, as they do from birth, m."""
+    overlaps, found = stepper.overlaps, dict[tuple[int, int], float]()
+    for pair, depth in zip(np.searchsorted(stepper.shapes.names, overlaps.names), overlaps.depth, strict=True):
+        key = int(pair[0]), int(pair[1])
+        found[key] = max(found.get(key, 0.0), float(depth))
+    return found
+
+
+@pytest.mark.slow
+def test_pieces_do_not_pass_through_one_another_at_twenty_metres_a_second() -> None:
+    """Two bars of 3 m that meet and break: no surface is in another piece by a millimetre more than hulls of these two
+    are from birth, and the engine finds nothing in anything by more than v dt / 5 beyond that."""
+    mesh = copies(bar(0.0), 2)
+    mesh.points[len(mesh.points) // 2 :] += [1.0, 0.2, 1.3]
+    stepper = stepper_of(mesh, 2e5, STEP, gravity=0 * DOWN, obstacles=[], surfaces=20)
+    velocity: Values = np.array([[0.0, 0.0, SPEED / 2], [0.0, 0.0, -SPEED / 2]])
+    state = stepper.start()
+    state = replace(state, bodies=replace(state.bodies, velocity=velocity))
+    for _ in range(STEPS):
+        state, _ = stepper.advance(state)
+        allowed, told = from_birth(stepper), {pair[:2]: pair[2] for pair in stepper.depths(state)}
+        assert max(told.values(), default=0.0) < SPEED * STEP / 5
+        for pair, depth in in_others(stepper, state).items():
+            assert depth < allowed.get(pair, 0.0) + told.get(pair, 0.0) + NONE
+    assert len(state.bodies) > 10
+    moved = replace(state.bodies, place=0.5 * state.bodies.place)
+    assert max(in_others(stepper, replace(state, bodies=moved)).values()) > 0.1, "it would be seen"
