@@ -17,17 +17,25 @@ from fracsim.rigid.events import Kin
 from fracsim.rigid.model import Rules
 from fracsim.rigid.newton import HARD
 from fracsim.rigid.primitives import primitive
-from fracsim.rigid.siblings import Overlaps
 from support.falling import CUBE, DOWN, MASS, cubes, floor
 
+Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 FREE = 0 * DOWN
 BALL = primitive(Sphere(0.5, 3), "ball")
 
 
-def one_step(bodies: Bodies, parts: list[list[object]], rules: Rules, family: Overlaps | None = None) -> Bodies:
-    """Over the floor where there is weight."""
-    return Engine(bodies, parts, [floor()], rules, family).advance(bodies, None, lambda each: each)[0]  # type: ignore[arg-type]
+def breaks(each: Ints) -> Ints:
+    """All may break, and are of bodies of their own."""
+    return each
+
+
+KINS: list[Kin] = [lambda each: 0 * each, lambda each: 0 * each - 1, lambda each: -2 - each]
+
+
+def one_step(bodies: Bodies, parts: list[list[object]], rules: Rules, *, kin: Kin | None = breaks) -> Bodies:
+    """Over the floor."""
+    return Engine(bodies, parts, [floor()], rules).advance(bodies, None, kin)[0]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("step", [0.4, 0.3, 0.22])
@@ -42,20 +50,32 @@ def test_a_row_of_balls_hands_on_what_the_first_one_has(step: float) -> None:
     assert after.place[:, 0] == pytest.approx([1.0, 3.0, 4.0 + 10 * (step - 0.2)], abs=step * gives)
 
 
-@pytest.mark.parametrize("thick", [0.01, 0.1])
-@pytest.mark.parametrize("below", [0.02, 0.5])
-def test_a_ball_does_not_stop_over_a_plate_that_gives_way(thick: float, below: float, solver: None) -> None:
-    """A plate in the air over a floor, both nearer than a ball comes in the step: it takes the plate along, and what
-    ends on the floor is the plate, with the ball on it. Contacts give way by a share 1 - HARD of what they take, in
-    the speed of the lighter one."""
+def assert_taken_along(thick: float, below: float, kin: Kin | None) -> None:
+    """A ball that flies at a plate in the air over a floor, both nearer than it comes in the step, takes the plate
+    along, and what ends on the floor is the plate, with the ball on it. Contacts give way by a share 1 - HARD of what
+    they take, in the speed of the lighter one."""
     step, over = 0.1, 0.3
     gives = 2 * (1 - HARD) * 20.0 * (1 + 10)
     bodies = cubes([[0.0, 0, below + thick / 2], [0.0, 0, below + thick + over + 0.5]])
     bodies = replace(bodies, velocity=np.array([[0.0, 0, 0], [0, 0, -20.0]]), mass=np.array([MASS / 10, MASS]))
     plate = CUBE * np.array([1.0, 1.0, thick])
-    after = one_step(bodies, [[plate], [BALL]], Rules(step, FREE, 0.0))
+    after = one_step(bodies, [[plate], [BALL]], Rules(step, FREE, 0.0), kin=kin)
     assert after.place[:, 2] == pytest.approx([thick / 2, thick + 0.5], abs=step * gives)
     assert np.abs(after.velocity).max() < gives
+
+
+@pytest.mark.parametrize("thick", [0.01, 0.1])
+@pytest.mark.parametrize("below", [0.02, 0.5])
+def test_a_ball_does_not_stop_over_a_plate_that_gives_way(thick: float, below: float, solver: None) -> None:
+    """Where it may break."""
+    assert_taken_along(thick, below, breaks)
+
+
+@pytest.mark.parametrize("kin", [None, *KINS])
+@pytest.mark.parametrize("below", [0.02, 0.5])
+def test_nor_over_one_that_does_not_where_contacts_are_few(below: float, kin: Kin | None) -> None:
+    """What does not break, pieces of one body, and what breaks no more."""
+    assert_taken_along(0.1, below, kin)
 
 
 def test_events_of_a_step_keep_momentum_and_gain_no_energy(solver: None) -> None:
@@ -77,16 +97,16 @@ def test_events_of_a_step_keep_momentum_and_gain_no_energy(solver: None) -> None
     assert before < 0.5 * first.kinetic
 
 
-@pytest.mark.parametrize("kin", [lambda each: 0 * each, lambda each: 0 * each - 1, lambda each: -2 - each])
-def test_other_steps_are_not_taken_apart(kin: Kin, solver: None) -> None:
-    """Of two blocks, one of which flies into the other over a floor behind: pieces of one body, what does not break,
-    and what breaks no more, come to the digits that they come to where nothing is known of what breaks."""
+@pytest.mark.parametrize("kin", KINS)
+def test_other_steps_of_a_crowd_are_not_taken_apart(kin: Kin, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two blocks, one of which flies into the other over a floor behind, as if they were many: these come to the
+    digits that they come to where nothing is known of what breaks."""
+    monkeypatch.setattr("fracsim.rigid.pushing.CROWD", 0)
     bodies = cubes([[0.0, 0, 0.6], [0.3, 0, 1.8]])
     bodies = replace(bodies, velocity=np.array([[0.0, 0, 0], [0, 0, -20.0]]))
-    ends = [
-        Engine(bodies, [[CUBE]] * 2, [floor()], Rules(0.1, FREE)).advance(bodies, None, of)[0] for of in (None, kin)
-    ]
-    apart = one_step(bodies, [[CUBE]] * 2, Rules(0.1, FREE))
+    rules = Rules(0.1, FREE)
+    ends = [one_step(bodies, [[CUBE]] * 2, rules, kin=of) for of in (None, kin)]
+    apart = one_step(bodies, [[CUBE]] * 2, rules)
     for one, other in zip(*(vars(each).values() for each in ends), strict=True):
         assert np.array_equal(one, other)
     assert not np.array_equal(apart.velocity, ends[0].velocity)

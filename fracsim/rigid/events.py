@@ -1,9 +1,9 @@
 """Events of a step that is taken apart: what strikes bodies first, then what they meet with what that left them.
 
-Else all that meets in a step acts at once. A step is taken apart where that would be wrong most: something strikes a
-body that may break (or, if it breaks no more itself, lies on pieces of one), and would go on into something else behind
-it, which would stop it in the air. Pieces of one body are no such thing for one another, or heaps would be taken apart
-at every step.
+Else all that meets in a step acts at once. A step is taken apart where something strikes a body and would go on into
+something else behind it, which would stop it in the air. In a crowd, where every event is dear, only where that would
+be wrong most: the body may break (or is of pieces of one, and what strikes it breaks no more); pieces of one body are
+no such thing for one another there, or heaps would be taken apart at every step.
 
 What strikes at less than a hundredth of the greatest speed does not count (solutions are no more exact), nor what met
 in the event before, where nothing has moved since.
@@ -106,9 +106,10 @@ class Event:
         return Stage(self.stage.gravity, self.stage.parting, np.zeros(len(self.bodies)), events - 1, quick)
 
 
-def behind(event: Event, waits: Flags, near: float, count: int, kin: Kin) -> bool:
-    """Whether what moves (bodies below `count`) strikes a body that may break, or is within `near` of it, m, and would
-    go on into something behind it that is not of the same body: a contact that `waits` (k,)."""
+def behind(event: Event, waits: Flags, near: float, count: int, kin: Kin | None) -> bool:
+    """Whether what moves (bodies below `count`) strikes a body, or is within `near` of it, m, and would go on into
+    something behind it: a contact that `waits` (k,). `kin`: only where that body may break, and what is behind it is
+    not of the same."""
     if not np.any(waits):
         return False
     closing, contacts = event.meeting.closing, event.contacts
@@ -123,8 +124,8 @@ def behind(event: Event, waits: Flags, near: float, count: int, kin: Kin) -> boo
     then = np.flatnonzero(late & (first[np.minimum(own, count)] >= 0))
     now = first[own[then]]
     on = (np.einsum("ki,ki->k", way[then], way[now]) > 0) & (other[then] != other[now])
-    if not np.any(on):
-        return False
+    if kin is None or not np.any(on):
+        return bool(np.any(on))
     mine, screen, beyond = (_kin(of[on], count, kin) for of in (own[now], other[now], other[then]))
     gives_way = (screen >= 0) | ((screen < -1) & (mine == -1))
     return bool(np.any(gives_way & (screen != mine) & (screen != beyond)))

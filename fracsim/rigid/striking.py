@@ -81,12 +81,13 @@ class Striking:
         return self._event(bodies, contacts, stage, course, struck=struck)[0]
 
     def _goes_on(self, met: Event) -> bool:
-        """Whether the step is to be taken apart."""
-        if self._kin is None:
+        """Whether the step is to be taken apart: in a crowd only for what may break."""
+        many = crowded(met)
+        if many and self._kin is None:
             return False
         rules, meeting = self._rules, met.meeting
         waits = later(meeting.gap, meeting.closing, rules.step, rules.fast)
-        return behind(met, waits, rules.fast * rules.step, self._count, self._kin)
+        return behind(met, waits, rules.fast * rules.step, self._count, self._kin if many else None)
 
     def _event(
         self, start: Bodies, before: Contacts, stage: Stage, course: Course, again: Again | None = None,
