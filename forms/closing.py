@@ -11,6 +11,10 @@ force jumps as an edge closes, since T^-1 couples it to the others (tried: Newto
 spring for each edge is the least that has a continuous force: nothing while open, no jump at closing, no loss over a
 cycle. Stretch - 1 in place of Green's strain was tried too: where debris passes through itself an edge goes through no
 length at all, and its force flips.
+
+With quadratic displacement F differs from point to point, and the middle of a broken edge is free. An edge is as long
+as its ends are far apart: (x_j - x_i) = F_m (X_j - X_i) with F_m in its middle, since the slope of a parabola there is
+that of its chord. F is linear in a cell, F_m = F + grad grad u . (X_m - X): each point of it knows of every edge.
 """
 
 from __future__ import annotations
@@ -37,15 +41,28 @@ def spring_modulus(energy: Any, dim: int, edges: int) -> Scalar:
     return (energy.lmbda + 2 * energy.mu) / (edges * MEAN_COS4[dim])
 
 
+def bends_of(u: Expr, place: Expr, edges: Any) -> list[Expr]:
+    """grad grad u . (X_m - X) of the middle m of each edge, (d, d); `place`: (d,) X in the reference cell, the
+    corners of which are 0 and the unit vectors. Cells have straight sides."""
+    J = ufl.Jacobian(ufl.domain.extract_unique_domain(u))
+    corners = [ufl.as_vector([1.0 if i == k else 0.0 for i in range(len(place))]) for k in range(-1, len(place))]
+    slope = ufl.grad(ufl.grad(u))
+    return [ufl.dot(slope, J * ((corners[i] + corners[j]) / 2 - place)) for i, j in edges]
+
+
 @dataclass(frozen=True)
 class Closing(Around):
-    """A damaged energy `whole` times `chi`, and `share` of the springs of broken edges (integrity 0, else 1)."""
+    """A damaged energy `whole` times `chi`, and `share` of the springs of broken edges (integrity 0, else 1).
+
+    `bends`: what F in the middle of each edge has beyond F, with quadratic displacement (`bends_of`).
+    """
 
     whole: Energy
     chi: Any
     share: Any
     integrity: Any
     edges: Any
+    bends: Any = None
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Energy density in J/m^3."""
@@ -53,10 +70,13 @@ class Closing(Around):
 
     def _springs(self, F: Expr) -> Expr:
         squares = [
-            (1 - self.integrity[number]) * ufl.min_value(self._strain(F, edge), 0) ** 2
+            (1 - self.integrity[number]) * ufl.min_value(self._strain(self._in_middle(F, number), edge), 0) ** 2
             for number, edge in enumerate(edge_vectors(self.integrity, self.edges))
         ]
         return spring_modulus(self, F.ufl_shape[0], len(self.edges)) / 2 * sum(squares[1:], squares[0])
+
+    def _in_middle(self, F: Expr, number: int) -> Expr:
+        return F if self.bends is None else F + self.bends[number]
 
     def _strain(self, F: Expr, edge: Expr) -> Expr:
         """s of an edge d of the reference cell."""

@@ -109,7 +109,6 @@ def test_vtk_reads_curved_cells(tmp_path: Path) -> None:
     ("tables", "key"),
     [
         ({"fracture": {"strength": 1.0, "approach": "edge"}}, "fracture.approach"),
-        ({"fracture": {"strength": 1.0, "unilateral": True}}, "fracture.unilateral"),
         ({"fracture": {"strength": 1.0, "energy": 1.0}}, "fracture.energy"),
     ],
 )

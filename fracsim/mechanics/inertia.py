@@ -18,6 +18,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from ..mesh.dolfinx_calls import assemble_matrix
+from ..mesh.domain import Domain
 from .kernels import compile_form
 from .term import Level, Term
 from .vectors import Assembler
@@ -168,6 +169,11 @@ def lumped_mass(assembler: Assembler, density: Expr) -> Values:
 
 # shares of corners and of middles of edges in the mass of a cell with quadratic displacement, by dimension
 SHARES = {2: (1 / 19, 16 / 57), 3: (1 / 36, 4 / 27)}
+
+
+def share_of_corner(domain: Domain) -> float:
+    """Of the lumped mass of a cell."""
+    return SHARES[domain.dim][0] if domain.order == 2 else 1 / (domain.dim + 1)
 
 
 def _shared_by_diagonal(assembler: Assembler, density: Expr) -> Values:

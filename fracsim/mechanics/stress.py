@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
+import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -106,10 +107,18 @@ class Stress(Term):
             whole = EdgeProjected(cast(Strained, whole), self.integrity, edges, self._floor)
         if not weakening.closes:
             return whole
-        from ..forms.closing import Closing
+        from ..forms.closing import Closing, bends_of
 
         share = 1.0 if self.chi is None else 1 - self.chi
-        return Closing(whole, self._floored(self.chi), share, self.integrity, edges)
+        bends = bends_of(self.u, self._place_in_cell(), edges) if self.domain.order == 2 else None
+        return Closing(whole, self._floored(self.chi), share, self.integrity, edges, bends)
+
+    def _place_in_cell(self) -> fem.Function:
+        """(d,) coordinates in the reference cell."""
+        mesh, d = self.domain.mesh, self.domain.dim
+        place = fem.Function(fem.functionspace(mesh, ("DG", 1, (d,))), name="place")
+        place.x.array.reshape(-1, d + 1, d)[:] = basix.geometry(mesh.basix_cell())
+        return place
 
     def _whole_cells(self, name: str, components: int) -> fem.Function:
         """A DG0 field of ones: nothing is broken yet."""
@@ -195,7 +204,7 @@ class Stress(Term):
         """Virtual work of the stress, as flow within the step leaves it."""
         flow = self._flow_form
         if flow is None:
-            return internal_work(self.energy, self.u, w, dx, chi=self.remaining_stiffness_of_energy, rotation=self.R)
+            return self._work_of(self.energy, self.remaining_stiffness_of_energy, w, dx)
         return flow.work(self.u, w, dx, chi=self.remaining_stiffness, rotation=self.R) + self._springs(w, dx)
 
     def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
@@ -212,7 +221,12 @@ class Stress(Term):
         if not self.closes:
             return 0
         alone: Energy = replace(self.energy, chi=0)  # type: ignore[type-var]
-        return internal_work(alone, self.u, w, dx)
+        return self._work_of(alone, 1.0, w, dx)
+
+    def _work_of(self, energy: Energy, chi: Expr | float, w: Expr, dx: ufl.Measure) -> ufl.Form:
+        if self.closes and self.domain.order == 2:  # what presses on an edge is no stress of the points where psi is
+            return ufl.derivative(elastic_energy(energy, self.u, dx, chi=chi, rotation=self.R), self.u, w)
+        return internal_work(energy, self.u, w, dx, chi=chi, rotation=self.R)
 
     def stored(self) -> float:
         """int psi dX at the current u, this rank's share, J."""

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fracture.edge_stress import edge_vectors
+from ..mechanics.inertia import share_of_corner
 from ..mechanics.material import PerCell
 from ..mechanics.stress import Stress
 from ..mesh.simplices import local_edges
@@ -74,7 +75,7 @@ def spring_frequencies(stress: Stress, cells: npt.NDArray[np.int64], broken: npt
     shortest = np.where(broken, square, np.inf).min(axis=1)
     k = _of(cells, spring_modulus(material, d, edges.shape[1]))
     rows = np.where(broken, broken @ np.abs(_joined(d)), 0.0).max(axis=1)
-    return np.asarray((d + 1) / _of(cells, material.density) * k / shortest * rows)
+    return np.asarray(k / shortest * rows / (share_of_corner(domain) * _of(cells, material.density)))
 
 
 def _joined(dim: int) -> Values:
