@@ -4,7 +4,8 @@
 
 Each rung is the bar of `make bench` (24 n^3 tetrahedra, one Newton iteration and CG to 1e-6 a step) with one feature
 more. It is timed step by step in turn with the elastic bar in one process; the elastic bar itself in turn with the bare
-loop of bench.py, which knows no features at all. Start-up, modules, fields and memory: in a process of its own.
+loop of bench.py, which knows no features at all, with fracsim's assembly of the tangent. Start-up,
+modules, fields and memory: in a process of its own.
 """
 
 from __future__ import annotations
@@ -250,7 +251,7 @@ def _block(name: str, n: int) -> tuple[list[tuple[float, float]], str]:
         else:
             from ..bench import Bare
 
-            steps.append(Bare(n, runs[0].scene.domain, records=bool(rung.after)).step)
+            steps.append(Bare(n, runs[0].scene.domain, records=bool(rung.after), in_lanes=True).step)
         pairs = [_timed_pair(runs[0].comm, steps, number) for number in range(rung.first + STEPS)]
         newton = " / ".join(str(run.scene.stepper.solver.snes.its) for run in runs)
     return pairs[rung.first :], newton
@@ -302,7 +303,8 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         f"of the ratio are more than {STEADY:.0%} apart; each timed in turn with a step of what it is compared with in "
         "one process; ratio: the median of those of single steps; ± half the distance between the quartiles; Newton: "
         "iterations of both in the last step. The elastic scene is compared with the same loop written bare in "
-        "DOLFINx, without and with the energy that every run records; 'plasticity' (every cell yields) with 'newton', "
+        "DOLFINx, with fracsim's assembly of the tangent, without and with the energy that every run records; "
+        "'plasticity' (every cell yields) with 'newton', "
         "the elastic scene with as many Newton iterations as a step needs, which both do there. After thirty steps "
         "('plasticity-later') the elastic bar, whose forces grow while flow bounds the others, comes to need one "
         "iteration less for the same relative residual: that price of flow is the iteration's. 'cut': a plane through "
