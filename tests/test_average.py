@@ -137,6 +137,22 @@ def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
         assert len(average.reaching(values, size, 1.01 * size.max(), active)[0]) == 0
 
 
+def test_weights_are_those_of_now_where_few_rows_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell that has no row itself, beyond R of the hot one, comes apart: averages between the two leave it out."""
+    body = Body(MESHES["2d-unstructured"])
+    count, radius = len(body.volumes), 2.7 * H
+    monkeypatch.setattr(average_module, "AT_ONCE", 0)
+    few = body.average(radius, "linear")
+    size = np.random.default_rng(3).uniform(0.1, 0.3, count)
+    size[17] = 5.0
+    far = np.linalg.norm(body.centroids - body.centroids[17], axis=1)
+    for active in (np.ones(count, bool), ~((far > radius) & (far < 1.5 * radius))):
+        values = np.where(active, size, 0.0)[:, None]
+        cells, found = few.reaching(values, values[:, 0], 0.3, active)
+        np.testing.assert_allclose(found, brute_force(body, radius, "linear", values, active)[cells], rtol=1e-12)
+    assert len(cells) > 5 and not np.isin(np.flatnonzero(~active), few._rows.made[0].cells).any()
+
+
 def test_rows_are_made_where_stress_is_high(monkeypatch: pytest.MonkeyPatch) -> None:
     """One hot cell: rows of the cells within R of it and no others, kept from pass to pass, the same to a bit."""
     body = Body(MESHES["2d-unstructured"])

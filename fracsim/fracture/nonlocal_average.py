@@ -165,8 +165,14 @@ class _AllRows:
 
     def around(self, places: Flags) -> Flags:
         """(centres,) which of those that have rows may have any of some near cells (near,) within the radius: what is
-        near one of them it is near to."""
+        near one of them it is near to. Own cells among these are to have rows.
+
+        Two cells that are R apart to the last digit may be near for one of them alone, which counts where the kernel
+        does not end at 0 there.
+        """
         count, marks = len(self._centres), np.zeros(len(places), bool)
+        if KERNELS[self._kernel](np.ones(1))[0]:
+            return ~marks[:count]
         for rows in self.made:
             rows.mark(places, marks)
         return marks[:count] | self._border if places[count:].any() else marks[:count]
@@ -189,9 +195,11 @@ class _AllRows:
         """Sums of the weights of near cells with 1 in `active` (near, 1), of each block `made`; None: of all."""
         if active is None:
             return [rows.full for rows in self.made]
-        changed = (active != self._active)[:, 0]
-        if changed.any():
-            near, self._active = self.around(changed), active
+        changed, self._active = (active != self._active)[:, 0], active
+        if changed.any() and self._missing.any():  # what has changed may be near rows and have none itself
+            self._sums = []
+        elif changed.any():
+            near = self.around(changed)
             for rows, sums in zip(self.made, self._sums, strict=False):
                 some = np.flatnonzero(near[rows.cells])
                 sums[some] = rows.times(active, some)[:, 0]

@@ -105,8 +105,8 @@ class CellForm(fem.Form):
     def only(self, chosen: npt.NDArray[np.bool_]) -> Iterator[None]:
         """Integrate over the cells of the measure that are flagged, for as long as it lasts (not collective)."""
         kept, dead, self._dead = self._bound, self._dead, None
-        self._bound = self._over(chosen)
         try:
+            self._bound = self._over(chosen)
             yield
         finally:
             self._bound, self._dead = kept, dead
