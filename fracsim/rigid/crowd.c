@@ -153,7 +153,7 @@ struct State {
     int64_t *age, *rows;        /* (count,) by contact; some of them */
     double *level[2], *back[2]; /* of each half: (bodies + 1, 6) what is given to bodies, (bodies + 1,) how far p turned
                                    back in the last iteration */
-    double *square[2], *most;   /* of each half: (bodies + 1, 36), see `bound`; (bodies + 1,) */
+    double *square[2], *most;   /* of each half: (bodies + 1, 36), see `squares`; (bodies + 1,) */
     double *beta;               /* (most,) by age */
     double worst[2], enough;    /* m/s that velocities are off by, its square, of each half; and may be */
     Row *row;                   /* some of count */
@@ -162,6 +162,13 @@ struct State {
     Work work;                   /* what is done to both halves, */
     atomic_int_fast64_t offer;   /* the STAGES of the second: offered, TAKEN, DONE; -1 in the end */
 };
+
+/* Look again, and after a while let others have the core. */
+static void patient(int *waited)
+{
+    if (*waited < PATIENCE) ++*waited;
+    else sched_yield();
+}
 
 /* Do something to both halves. A second thread does the second one, if it is there before the first is through with its
    own: where cores have more to do, nobody waits for a thread that does not run. */
@@ -172,20 +179,19 @@ static void share(State *now, Work work)
     atomic_store(&now->offer, open);
     work(now, 0);
     if (atomic_compare_exchange_strong(&now->offer, &(int_fast64_t){open}, open + TAKEN)) work(now, 1);
-    else for (int waited = 0; atomic_load(&now->offer) != open + DONE; waited++)
-        if (waited > PATIENCE) sched_yield();
+    else for (int waited = 0; atomic_load(&now->offer) != open + DONE;) patient(&waited);
 }
 
 /* What a second thread does, until there is no more to do. */
 void help(State *now)
 {
-    for (int waited = 0; atomic_load(&now->offer) >= 0; waited++) {
+    for (int waited = 0; atomic_load(&now->offer) >= 0;) {
         int_fast64_t open = atomic_load(&now->offer);
         if (open > 0 && open % STAGES == 0 && atomic_compare_exchange_strong(&now->offer, &open, open + TAKEN)) {
             now->work(now, 1);
             atomic_store(&now->offer, open + DONE);
             waited = 0;
-        } else if (waited > PATIENCE) sched_yield();
+        } else patient(&waited);
     }
 }
 
