@@ -240,10 +240,11 @@ def test_short_branches_open_and_do_not_slide() -> None:
 def test_a_strip_branches_where_it_stores_enough_for_two() -> None:
     """One that stores less than 2 G_c a metre has one crack, for two would take more than there is; with 2.5 it has
     two. None runs with 0.95, and with 1.5 the crack cannot but go as fast as a crack may: at half of c_R."""
-    stored = (0.95, 1.5, 1.8, 2.5)
+    stored = (0.95, 1.5, 1.95, 2.5)
     found = [run_of_a_strip(each, "explicit", "unstructured", 12, branching=True) for each in stored]
     assert [each.tips for each in found] == [1, 1, 1, 2]
     assert found[0].length < 1e-9
+    assert run_of_a_strip(1.8, "explicit", "unstructured", 24, branching=True).tips == 1
     implicit = run_of_a_strip(1.5, "newmark", "unstructured", 12, branching=True)
     assert [found[1].speed, implicit.speed] == pytest.approx([0.5, 0.5], rel=0.05)
     assert implicit.tips == 1

@@ -1,14 +1,15 @@
 """Cracks that carry their speed, and branch where it does not take up what flows to them (in the plane, with inertia).
 
     v = c_R (1 - G_c / G*),   G* = G / (1 - v / c_R)     up to c_R / 2, taken up over R / c_R
-    G >= 2 G_c                                           the crack branches
+    mean of G over R / c_R >= 2 G_c                      the crack branches
 
 G* is what would flow to the tip if it stood (Freund 1972); R / c_R is the time of a Rayleigh wave through its disc.
 Where G is G_c, G* grows with the speed, and is that of two cracks at half of c_R. From there on the crack could become
 two that set off from rest (Eshelby 1970), and in glass and PMMA it sheds short side branches, which take up what flows,
 instead of getting faster (Sharon and Fineberg 1999). So here it goes no faster, and G grows over G_c. Where that is
 2 G_c, two cracks that run at half of c_R take it up: the crack becomes these, and they keep its speed. In a strip that
-stores less than 2 G_c a metre so much never flows.
+stores less than 2 G_c a metre so much does not flow; at single looks, between the cuts of two cells, G is up to a
+quarter over what flows.
 
 A tip cuts a cell as it comes to it. By G >= G_c at each look it ran on at c_R and stood in turn, since what it has cut
 is let go over R / c_R: G went from 0.4 to 2.2 G_c, and at which look a crack branched was chance. Only where no other
@@ -43,10 +44,11 @@ class Carried(IntEnum):
 
     SLOW = 0  # 1 - v / c_R
     LEFT = 1  # m to go before it is there
-    AT = 2  # s, when that was so; NaN: nobody has looked
+    FLOW = 2  # mean of G / G_c, of late
+    AT = 3  # s, when that was so; NaN: nobody has looked
 
 
-STANDS = 1.0, 0.0, np.nan
+STANDS = 1.0, 0.0, 0.0, np.nan
 
 
 def slower(slow: Values, flow: Values, time: Values) -> Values:
@@ -55,14 +57,19 @@ def slower(slow: Values, flow: Values, time: Values) -> Values:
     G_c / G* = slow / flow is what it is to be, and between that of a crack that stands and FASTEST.
     """
     wanted = slow / np.maximum(flow, slow)
-    return np.maximum(wanted + (slow - wanted) * np.exp(-time), FASTEST)
+    return np.maximum(later(slow, wanted, time), FASTEST)
+
+
+def later(before: Values, wanted: Values, time: Values) -> Values:
+    """(n,) what was `before` goes to what is `wanted`, over 1 of `time`."""
+    return np.asarray(wanted + (before - wanted) * np.exp(-time))
 
 
 class RunningTips(CrackTips):
     """Cells that running cracks, which may branch, cut next. In steps that see no waves they go as `CrackTips` do.
 
     Attributes:
-        carried: (edges, 3) of the tip that came in by each local edge (`Carried`).
+        carried: (edges, 4) of the tip that came in by each local edge (`Carried`).
     """
 
     forks = True
@@ -71,7 +78,8 @@ class RunningTips(CrackTips):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.carried = np.tile(STANDS, (len(self._graph.broken), 1))
-        self._due = np.empty(0, bool)
+        self._due: Flags = np.empty(0, bool)
+        self._flow: Values = np.empty(0)
 
     def memory(self) -> object:
         """Where cracks cut, and how they run."""
@@ -86,17 +94,18 @@ class RunningTips(CrackTips):
     def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
         """(n,) which tips have come to the end of what they cut last; in long steps, reach G_c."""
         entry, rate = self._graph.cell_edges[tips.cell, self._entry(tips.cell)], self._rate[tips.cell]
-        slow, left, at = self.carried[entry].T
+        slow, left, flow, at = self.carried[entry].T
         time = np.where(np.isnan(at), 0.0, self._now - at)
         slow = np.where(tips.mature & (size > 0), slower(slow, size / toughness, rate * time), 1.0)
+        self._flow = later(flow, size / toughness, rate * time)
         left = left - (1 - slow) * rate * self.disc * self._h[tips.cell] * time
-        self.carried[entry] = np.column_stack([slow, left, np.full(len(at), self._now)])
+        self.carried[entry] = np.column_stack([slow, left, self._flow, np.full(len(at), self._now)])
         self._due = (slow < 1) & (left <= 0)
         return np.where(self._sees_waves(tips), self._due, size >= toughness)
 
-    def _forked(self, size: Values, toughness: Values, tips: Tips) -> Flags:
+    def _forked(self, tips: Tips) -> Flags:
         """(n,) which tips go on as two."""
-        return tips.alone & (size >= TIPS * toughness) & self._sees_waves(tips)
+        return tips.alone & (self._flow >= TIPS) & self._sees_waves(tips)
 
     def _sees_waves(self, tips: Tips) -> Flags:
         """(n,) whether a Rayleigh wave stays in the disc of a tip within a step."""

@@ -181,12 +181,13 @@ class CrackTips:
             mature &= size > 0  # a force back is that of other tips in the disc
             turns, abreast = mature & np.any(turned, axis=1), np.any(tips.parts, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
-            if self.forks:
-                branches = turns & self._forked(size, toughness, tips)
-                ahead = np.where(branches[:, None], tips.course, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
+        enough = self._enough(size, toughness, tips)
+        if self.forks:
+            branches = turns & self._forked(tips)
+            ahead = np.where(branches[:, None], tips.course, ahead)
         stays = (tips.waits & (size < TIPS * toughness)) | self.barred[tips.cell]
-        may = np.flatnonzero((~mature | self._enough(size, toughness, tips)) & ~stays)
+        may = np.flatnonzero((~mature | enough) & ~stays)
         if not len(may):
             return self._none(0)
         mean = seen.means(may)
@@ -208,8 +209,8 @@ class CrackTips:
         """(n,) which tips, on which a force of `size` (n,) acts, reach their G_c (collective)."""
         return size >= toughness
 
-    def _forked(self, size: Values, toughness: Values, tips: Tips) -> Flags:
-        """(n,) which tips go on as two."""
+    def _forked(self, tips: Tips) -> Flags:
+        """(n,) which tips go on as two, once `_enough` was asked."""
         return np.zeros(len(tips), bool)
 
     @staticmethod
