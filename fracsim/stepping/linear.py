@@ -81,7 +81,8 @@ class Linear:
         options.check(given, self._set_up_at_rest)
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
-            ksp, options, keep=self.iterative, may_change=_may_change(balance, given), loosen=self._loosen,
+            ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
+            large=self._blocks is not None, loosen=self._loosen,
             bring=self.stiffness.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
