@@ -18,4 +18,5 @@ return_mapping      flow at the end of a step
 rotation, spectrum  polar rotation of every cell; eigenvalues and powers of many tensors
 kernels             compiled forms and expressions
 vectors, tangent    assembling
+lanes, products     forms several cells at a time; products with blocks of the tangent: in C (compiled)
 """

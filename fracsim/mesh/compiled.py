@@ -54,19 +54,19 @@ def built(name: str, text: str, more: list[str]) -> ctypes.CDLL:
     return ctypes.CDLL(str(made))
 
 
-_told: list[Exception] = []  # why functions were not there
+_told: list[str] = []  # functions that were not there
 
 
 def built_together(comm: MPI.Comm, name: str, text: str, more: list[str]) -> ctypes.CDLL | None:
     """The same on all ranks; None where there is no compiler that takes it on one of them, which is told once: FFCx's
     kernels may be there from before, and others do the same without it, later (collective)."""
     made = _tried(comm, name, text, more)
-    if not comm.allreduce(isinstance(made, Exception), op=MPI.LOR):
+    first = comm.allreduce(comm.rank if isinstance(made, Exception) else comm.size, op=MPI.MIN)
+    if first == comm.size:
         return made
-    if isinstance(made, Exception):
-        if not _told:
-            print(f"fracsim: note: this run takes longer than it could: {made}", file=sys.stderr)
-        _told.append(made)
+    if comm.rank == first and not _told:
+        print(f"fracsim: note: this run takes longer than it could: {made}", file=sys.stderr)
+    _told.append(name)
     return None
 
 
