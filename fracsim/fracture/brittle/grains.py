@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.distance import cdist
 
 from .body import Body
 from .one_by_one import one_by_one
@@ -87,7 +88,7 @@ def least(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]
     rows = max(CHUNK // len(seeds), 1)
     for first in range(0, len(points), rows):
         part = slice(first, first + rows)
-        every = np.linalg.norm(points[part, None] - seeds, axis=2) * weights
+        every = cdist(points[part], seeds) * weights
         label[part] = every.argmin(axis=1)
         energy[part] = every.min(axis=1)
     return label, energy
