@@ -113,7 +113,7 @@ def volume_in_single(mesh: Any) -> float:
     corners = number.reshape(-1)[mesh.faces]
     flat = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
     sides = np.sort(np.concatenate([np.roll(corners[~flat], n, axis=1)[:, :2] for n in range(3)]), axis=1)
-    assert not np.any(np.unique(sides, axis=0, return_counts=True)[1] % 2) and np.count_nonzero(flat) < 0.05 * len(flat)
+    assert not np.any(np.unique(sides, axis=0, return_counts=True)[1] % 2) and np.count_nonzero(flat) < 0.1 * len(flat)
     return float(np.linalg.det(points[corners]).sum() / 6)
 
 
