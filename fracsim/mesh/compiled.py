@@ -22,8 +22,6 @@ from ..errors import InputError
 
 # roots set no errno, and what is done to three numbers alike is done at once: 0.65 of the time, within IEEE's rules
 FASTER = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
-
-
 # a product is rounded before it is added to, as it is in arrays
 AS_ARRAYS = ["-ffp-contract=off"]
 

@@ -17,9 +17,9 @@ links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahed
 77, and a fresh set-up costs the same. A compact body gains nothing (9 for 9), and its set-up would cost up to half as
 much again. Where it is large, too, its finest level is smoothed by one step with the inverse of each node's block
 instead of two with the diagonal, as products with that level are the larger part of a solve: the sheet takes as many
-iterations for a force at random (25), 31 to 37 for 27 to 30 in its steps, each of three products instead of five.
-A compact one would take 12 or 13 for 9 or
-10, in as long. On coarser levels such blocks may be singular, of aggregates of a node or two.
+iterations for a force at random (25), 31 to 37 for 27 to 30 in its steps, each of three products instead of five. A
+compact one would take 12 or 13 for 9 or 10, in as long. On coarser levels such blocks may be singular, of aggregates of
+a node or two.
 """
 
 from __future__ import annotations

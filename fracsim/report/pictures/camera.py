@@ -44,7 +44,7 @@ def scope_of(shot: Shot, look: Look) -> Scope:
     points = worth_seeing(drawn_of(shot, look))
     near = corners_near(points, shot.beside)
     flat = bool(np.ptp(points[:, 2]) == 0)
-    planes = {} if flat else planes_of(study_of(shot.folder))
+    planes = planes_of(study_of(shot.folder)) if near and not flat else {}
     bodies = [near[file] for file, name in zip(shot.beside, shot.names, strict=True) if name not in planes]
     everything = np.concatenate([points, *near.values()])
     bounds = np.stack([everything.min(axis=0), everything.max(axis=0)], axis=1).reshape(-1)
