@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fracsim.mechanics.contact.placed import Placed
+from fracsim.mechanics.contact.placed import Placed, second_order_turn
 from fracsim.mechanics.contact.pose import Pose, turning
 from fracsim.mechanics.contact.shapes import Shape
 from support.laws import rotation
@@ -96,14 +96,21 @@ def test_derivatives_by_the_pose(shape: Shape) -> None:
     np.testing.assert_allclose(placed.normal(x), differences(placed.distance, x), atol=1e-8)
     np.testing.assert_allclose(placed.curvature(x), differences(placed.normal, x), atol=1e-6)
 
-    H, h = placed.by_pose_twice(x), 1e-4  # second differences: round-off 1e-16 / h^2, truncation h^2
+
+@both
+def test_the_second_derivative_of_a_turn(dim: int) -> None:
+    """Of n . exp(-w) y by w, by central differences: round-off 1e-16 / h^2, truncation h^2."""
+    n, y = np.random.default_rng(6).normal(size=(2, 20, dim))
+    H, h, p = second_order_turn(n, y), 1e-4, 1 if dim == 2 else 3
     np.testing.assert_allclose(H, H.transpose(0, 2, 1), atol=1e-13)
-    for i in range(p):
-        for j in range(p):
-            a, b = h * steps[i], h * steps[j]
-            corners = [after(q).distance(x) for q in (a + b, a - b, b - a, -a - b)]
-            second = (corners[0] - corners[1] - corners[2] + corners[3]) / (4 * h**2)
-            np.testing.assert_allclose(H[:, i, j], second, atol=2e-6 * max(1, np.abs(H).max()))
+
+    def turned(w: Values) -> Values:
+        return np.asarray(np.einsum("ni,ij,nj->n", n, expm(-generator(w)), y))
+
+    for i, j in np.ndindex(p, p):
+        a, b = h * np.eye(p)[[i, j]]
+        second = (turned(a + b) - turned(a - b) - turned(b - a) + turned(-a - b)) / (4 * h**2)
+        np.testing.assert_allclose(H[:, i, j], second, atol=1e-6 * np.abs(H).max())
 
 
 def test_the_sign_of_the_moment() -> None:

@@ -73,16 +73,6 @@ class Placed:
         H, G = self.curvature(x), turning(x - self.pose.centre)
         return np.concatenate([-H, H @ G - turning(self.normal(x))], axis=2)
 
-    def by_pose_twice(self, x: Values) -> Values:
-        """(n, p, p) second derivative with respect to q, symmetric."""
-        y, n, H = x - self.pose.centre, self.normal(x), self.curvature(x)
-        G = turning(y)
-        mixed = turning(n) - H @ G
-        twice = G.transpose(0, 2, 1) @ H @ G + second_order_turn(n, y)
-        upper = np.concatenate([H, mixed], axis=2)
-        lower = np.concatenate([mixed.transpose(0, 2, 1), twice], axis=2)
-        return np.concatenate([upper, lower], axis=1)
-
 
 def second_order_turn(n: Values, y: Values) -> Values:
     """(n, p, p) second derivative of n . exp(-w) y at w = 0."""
