@@ -16,6 +16,7 @@ import dolfinx
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
@@ -57,14 +58,13 @@ class LocalSurface:
         area = _areas(made, self._skeleton)
         self._touching = np.flatnonzero(area > 0)
         self.area, self._made = area[self._touching], made
-        rows, nodes, values = _entries(made, self._touching)
-        matrices = [self._mean(self._touching, rows, nodes, values)]
-        if self._domain.comm.allreduce(len(made.follow.turning)) > 0:
-            matrices.append(self._arms(made, pattern, rows, nodes, values, self._touching))
-        self.columns, (mean, *arms) = _on_columns(matrices)
+        means = self._means(made)
+        turning = self._domain.comm.allreduce(len(made.follow.turning)) > 0
+        arms = self._arms(made, pattern) if turning else csr_matrix(means.shape)
+        self.columns, (means, arms) = _on_columns([means, arms])
         middle = middles(made.points, made.follow)[self._touching]
         out = made.points[self._touching] - middle
-        self.at = Places(mean, middle, arms[0] if arms else csr_matrix(mean.shape), out)
+        self.at = Places(means, middle, arms, out)
 
     def identity(self, points: Ints | None = None) -> Values:
         """(k, 2 d + 1) rows that tell `points` (k,), or the copies `at.copies`, from all others, whatever breaks
@@ -78,62 +78,72 @@ class LocalSurface:
         real = measure > 0
         return np.searchsorted(self._touching, elements[real]), measure[real]
 
-    def _mean(self, touching: Ints, rows: Ints, nodes: Ints, values: Values) -> PETSc.Mat:
-        """(points, nodes) mean over the parents of each point."""
-        return self._matrix(len(touching), 1, rows, self._global(nodes), values)
+    def _means(self, made: Split) -> csr_matrix:
+        """(points, nodes of all ranks) means over the parents of each point."""
+        start, of = _parents_of(made, self._touching)
+        return self._wide(start, self._global(made.follow.parents[of]), _shares(start))
 
-    def _arms(
-        self, made: Split, pattern: npt.NDArray[np.uint8], rows: Ints, nodes: Ints, values: Values, touching: Ints
-    ) -> PETSc.Mat:
-        """(points, nodes) arms times the averages of gradients around the parents (collective)."""
-        d = self._domain.dim
-        arm = made.follow.arm[_of_points(made, touching)]
-        gradients = self._gradients(pattern)
-        by = np.repeat(rows, d), (d * self._global(nodes)[:, None] + np.arange(d)).reshape(-1)
-        arms = self._matrix(len(touching), d, *by, (values[:, None] * arm).reshape(-1))
-        result = arms.matMult(gradients)
-        for used in (arms, gradients):
+    def _arms(self, made: Split, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
+        """(points, nodes of all ranks) arms times the averages of gradients, means over the parents (collective)."""
+        comm, d = self._domain.comm, self._domain.dim
+        start, of = _parents_of(made, self._touching)
+        parents, arm = made.follow.parents[of], made.follow.arm[of]
+        arms = self._wide(d * start, _by_axis(self._global(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d)
+        count = arms.shape[0]
+        left = _assembled(comm, (count, d * self._domain.node_count), arms, offset(comm, count) + np.arange(count))
+        right = self._gradients(pattern, parents[np.any(arm != 0, axis=1)])
+        product = left.matMult(right)
+        rows, nodes, values = product.getValuesCSR()
+        for used in (left, right, product):
             used.destroy()
-        return result
+        return self._wide(rows, nodes, values)
 
-    def _gradients(self, pattern: npt.NDArray[np.uint8]) -> PETSc.Mat:
-        """(d nodes, nodes) d/dX_j of a nodal field, averaged over the intact cells around each node (collective)."""
+    def _gradients(self, pattern: npt.NDArray[np.uint8], parents: Ints) -> PETSc.Mat:
+        """(d nodes, nodes) d/dX_j of a nodal field, averaged over the intact cells around each node that is one of the
+        `parents` on any rank (collective)."""
         domain, d = self._domain, self._domain.dim
-        cells = np.flatnonzero(~is_split(d)[pattern])
-        corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells]
-        share = volume[:, None] / self._summed(corners, volume)[corners]
-        number = self._global(corners.reshape(-1)).reshape(corners.shape)
-        entries = gradient_entries(domain.nodes[corners], share, number)
-        return self._matrix(domain.node_count * d, 1, *entries, local=False)
+        wanted = self._summed(parents, 1.0) > 0
+        cells = np.flatnonzero(~is_split(d)[pattern] & wanted[domain.cell_nodes].any(axis=1))
+        corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
+        # sums around other nodes lack cells, and their rows are of no use
+        around = np.maximum(self._summed(corners, volume), np.finfo(float).tiny)
+        rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
+        nodes = self._global(np.arange(len(domain.nodes)))
+        shape = d * len(nodes), self._domain.space.dofmap.index_map.size_global
+        entries = csr_matrix((values, (rows, nodes[columns])), shape=shape)
+        return _assembled(domain.comm, (d * domain.node_count, domain.node_count), entries, _by_axis(nodes, d))
 
-    def _summed(self, corners: Ints, volume: Values) -> Values:
-        """(nodes,) volume of the cells around each node, on all ranks, m^d (collective)."""
+    def _summed(self, nodes: Ints, values: Values | float) -> Values:
+        """(nodes,) sums of the values at each node, on all ranks (collective)."""
         result = la.vector(self._domain.space.dofmap.index_map, 1, np.float64)
-        np.add.at(result.array, corners, volume[:, None])
+        every = np.broadcast_to(values, nodes.shape).reshape(-1)
+        result.array[:] = np.bincount(nodes.reshape(-1), every, len(result.array))
         result.scatter_reverse(la.InsertMode.add)
         result.scatter_forward()
-        return np.maximum(result.array, np.finfo(float).tiny)
+        return np.asarray(result.array)
 
     def _global(self, nodes: Ints) -> Ints:
         return self._domain.space.dofmap.index_map.local_to_global(nodes.astype(np.int32)).astype(np.int64)
 
-    def _matrix(
-        self, count: int, width: int, rows: Ints, columns: Ints, values: Values, *, local: bool = True
-    ) -> PETSc.Mat:
-        """A matrix of `count` rows of this rank and `width` columns a node from its entries, summed; `local`: rows are
-        numbered from this rank's first (collective)."""
-        owned = self._domain.node_count * width
-        matrix = PETSc.Mat().create(self._domain.comm)
-        matrix.setSizes(((count, PETSc.DETERMINE), (owned, PETSc.DETERMINE)))
-        matrix.setType(PETSc.Mat.Type.AIJ)
-        first = offset(self._domain.comm, count) if local else 0
-        matrix.setUp()  # PETSc counts entries itself: rows of other ranks have them, too
-        here, place = np.unique(rows + first, return_inverse=True)
-        summed = csr_matrix((values, (place.reshape(-1), columns)), shape=(len(here), matrix.size[1]))
-        indices = [each.astype(PETSc.IntType) for each in (summed.indptr, summed.indices, here)]
-        matrix.setValuesIJV(indices[0], indices[1], summed.data, PETSc.InsertMode.ADD_VALUES, indices[2])
-        matrix.assemble()
-        return matrix
+    def _wide(self, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
+        """Rows with `width` columns for each node of all ranks."""
+        shape = len(start) - 1, width * self._domain.space.dofmap.index_map.size_global
+        return csr_matrix((values, columns, start), shape=shape)
+
+
+def _assembled(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number: Ints) -> PETSc.Mat:
+    """A matrix with so many rows and columns of this rank: sums of the `rows`, of all ranks, with the same `number`
+    (collective)."""
+    matrix = PETSc.Mat().create(comm)
+    matrix.setSizes(((owned[0], PETSc.DETERMINE), (owned[1], PETSc.DETERMINE)))
+    matrix.setType(PETSc.Mat.Type.AIJ)
+    matrix.setUp()  # PETSc counts entries itself: rows of other ranks have them, too
+    used = np.flatnonzero(np.diff(rows.indptr))
+    start = np.append(rows.indptr[used], rows.nnz)
+    indices = [each.astype(PETSc.IntType) for each in (start, rows.indices, number[used])]
+    matrix.setValuesIJV(indices[0], indices[1], rows.data, PETSc.InsertMode.ADD_VALUES, indices[2])
+    matrix.assemble()
+    return matrix
 
 
 def _mesh_of(domain: Domain) -> MeshData:
@@ -160,34 +170,36 @@ def _touched(made: Split, skeleton: Skeleton) -> tuple[Ints, Values]:
 def _areas(made: Split, skeleton: Skeleton) -> Values:
     """(points,) a d-th of the measure of the elements around each."""
     elements, measure = _touched(made, skeleton)
-    result = np.zeros(len(made.points))
-    np.add.at(result, elements, measure[:, None] / skeleton.dim)
-    return result
+    shares = np.repeat(measure / skeleton.dim, skeleton.dim)
+    return np.asarray(np.bincount(elements.reshape(-1), shares, len(made.points)), np.float64)
 
 
-def _of_points(made: Split, points: Ints) -> Ints:
-    """Places of the parents of some points in `follow.parents`, in their order."""
-    start, count = made.follow.start[points], np.diff(made.follow.start)[points]
-    return np.repeat(start - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
+def _parents_of(made: Split, points: Ints) -> tuple[Ints, Ints]:
+    """Of k points: (k + 1,) where the parents of each begin, and the places of these in `follow.parents`."""
+    begin, count = made.follow.start[points], np.diff(made.follow.start)[points]
+    start = np.concatenate([[0], np.cumsum(count)])
+    return start, np.repeat(begin - start[:-1], count) + np.arange(start[-1])
 
 
-def _entries(made: Split, points: Ints) -> tuple[Ints, Ints, Values]:
-    """(row, local node, 1 / number of parents) of each parent of some points."""
-    count = np.diff(made.follow.start)[points]
-    rows = np.repeat(np.arange(len(points)), count)
-    return rows, made.follow.parents[_of_points(made, points)], np.repeat(1.0 / count, count)
+def _shares(start: Ints) -> Values:
+    """1 / number of the parents of a point, for each of them."""
+    count = np.diff(start)
+    return np.repeat(1.0 / count, count)
 
 
-def _on_columns(matrices: list[PETSc.Mat]) -> tuple[Ints, list[csr_matrix]]:
-    """The columns that are used, and this rank's rows of the matrices on them; the matrices are given back."""
-    found = [each.getValuesCSR() for each in matrices]
+def _by_axis(numbers: Ints, d: int) -> Ints:
+    """d n + j, of numbers n and axes j."""
+    return (d * numbers[:, None] + np.arange(d)).reshape(-1)
+
+
+def _on_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
+    """The columns that are used, and the matrices on them."""
+    used = np.zeros(matrices[0].shape[1], bool)
     for each in matrices:
-        each.destroy()
-    columns, place = np.unique(np.concatenate([columns for _, columns, _ in found]), return_inverse=True)
-    places = np.split(place.reshape(-1), np.cumsum([len(columns) for _, columns, _ in found])[:-1])
-    shape = len(found[0][0]) - 1, len(columns)
-    each = zip(found, places, strict=True)
-    return columns, [csr_matrix((entries, at, start), shape=shape) for (start, _, entries), at in each]
+        used[each.indices] = True
+    columns, place = np.flatnonzero(used), np.cumsum(used) - 1
+    shape = matrices[0].shape[0], len(columns)
+    return columns, [csr_matrix((each.data, place[each.indices], each.indptr), shape=shape) for each in matrices]
 
 
 class Following:
