@@ -40,8 +40,8 @@ def around(scene: Scene, point: Values, radius: float) -> Values:
     """(3,) what an advance around a point makes of crack, m."""
     criterion, graph = scene.fracture.criterion, scene.fracture.graph
     rows = criterion.sight._front.rows(np.flatnonzero(graph.split), criterion.cut)
-    many = np.ones(len(rows))
-    return np.asarray(advance(rows, many[:, None] * point, radius * many).sum(axis=0))
+    every = np.zeros(len(rows), int), np.arange(len(rows))
+    return np.asarray(advance(rows, every, point[None], np.array([radius]))[0])
 
 
 def half(at: float, end: float = 0.5) -> dict[str, Any]:

@@ -9,24 +9,25 @@ front through the same area (divergence theorem), and an advance by q e makes th
 
 from __future__ import annotations
 
+from ctypes import c_int64
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from ...mesh.compiled import at, library
 from ...mesh.domain import Domain
 from ...mesh.edges import EdgeGraph
 from ...mesh.simplices import local_edges
 from ..cracks import ends_in_order
-from .force import plateau
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 WIDTH = 16  # numbers that say the polygon of a cell: four corners, and which of its sides count
-# Gauss's rule of three points on [0, 1]
-_AT, _WEIGHT = np.array([0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5]), np.array([5, 8, 5]) / 18
+SOURCE = Path(__file__).with_suffix(".c")
 
 
 @cache
@@ -87,13 +88,12 @@ class Front:
         return np.concatenate([self.places(edges, cut).reshape(len(cells), 12), counts], axis=1)
 
 
-def advance(rows: Values, points: Values, radius: Values) -> Values:
-    """(n, 3) int q nu ds round the polygons `rows` (n, WIDTH), q of places (n, 3) and radii (n,), m."""
-    corners, counts = rows[:, :12].reshape(-1, 4, 3), rows[:, 12:]
-    sides = np.roll(corners, -1, axis=1) - corners
-    area = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])  # twice that of the polygon
-    length = np.linalg.norm(area, axis=1)
-    normal = area / np.where(length > 0, length, 1.0)[:, None]
-    apart = corners[None] + _AT[:, None, None, None] * sides[None] - points[:, None]
-    q = np.einsum("g,gnk->nk", _WEIGHT, plateau(np.linalg.norm(apart, axis=3), radius[:, None]))
-    return np.asarray(np.einsum("nk,nki->ni", q * counts, np.cross(sides, normal[:, None])))
+def advance(polygons: Values, pairs: tuple[Ints, Ints], places: Values, radius: Values) -> Values:
+    """(n, 3) sums of int q nu ds round polygons (m, WIDTH), q of places (n, 3) and radii (n,), m.
+
+    `pairs`: (k,) places and (k,) polygons; each pair is added in turn.
+    """
+    given = [np.ascontiguousarray(each) for each in (polygons, pairs[1], pairs[0], places, radius)]
+    made: Values = np.zeros(places.shape)
+    library(SOURCE).advance(c_int64(len(pairs[0])), *map(at, given), at(made))
+    return made

@@ -263,10 +263,9 @@ class Neighbourhoods:
         tips.behind[rows] = self._behind(pairs, cells, point, disc)
         tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < full[pairs.place]))
         if point.shape[1] == 3:
-            sides = np.zeros((len(r), 3))
             near = np.flatnonzero(pairs.distance < r * (1 + 1 / LEAST_DISC))
-            sides[near] = advance(crack.polygon[cells[near]], point[pairs.place[near]], r[near])
-            tips.ahead[rows] = along_the_surface(pairs.sum(sides), tips.surface[rows], disc)
+            sides = advance(crack.polygon, (pairs.place[near], cells[near]), point, disc)
+            tips.ahead[rows] = along_the_surface(sides, tips.surface[rows], disc)
         else:
             self._look_aside(rows, disc)
 
