@@ -168,7 +168,7 @@ def test_an_analysis_that_fails_ends_the_run_with_its_reason(tmp_path: Path) -> 
 def test_copies_stand_on_a_grid_and_move_as_they_were_told(tmp_path: Path) -> None:
     """Twelve bodies, of which the second entry turns about its middle."""
     six = {"copies": [2, 3, 1], "spacing": [1.0, 0.5, 1.0], "velocity": [0.0, 0.0, 1.0]}
-    tower = {"position": [0.0, 0.0, 2.0], "copies": [1, 1, 6], "spacing": [1.0, 1.0, 0.4], "spin": [0.0, 0.0, 3.0]}
+    tower = {"position": [0.0, 0.0, 2.0], "copies": [1, 1, 6], "spacing": [0.0, 0.0, 0.4], "spin": [0.0, 0.0, 3.0]}
     summary = run_study(
         MPI.COMM_SELF,
         study(body=[six, tower], obstacle=None, load=None, time={"scheme": "rigid", "step": 1e-3, "end": 5e-3}),
@@ -230,6 +230,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "flow rate": (SOFTENING | {"plasticity": HARD | {"flow_rate": 2.0}}, "flow_rate is"),
     "shell that flows": (SOFTENING | {"mesh": ORNAMENT, "plasticity": HARD}, "shells"),
     "spacing": ({"body": [{"copies": [2, 1, 1]}]}, "spacing"),
+    "no spacing": ({"body": [{"copies": [1, 2, 1], "spacing": [1.0, 0.0, 1.0]}]}, "lie in one another"),
     "body elsewhere": ({"time": NEWMARK}, r"\[\[body\]\] is for"),
     "time elsewhere": ({"time": NEWMARK, "body": None, "contact": {"contact_time": 1.0}}, "contact_time is for"),
 }  # fmt: skip

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Len
 from pydantic import Field, Strict, model_validator
 
-from .values import Finite, Positive, Table
+from .values import Finite, Table
 
 if TYPE_CHECKING:
     from .whole import Study
 
 InSpace = Annotated[list[Finite], Len(3, 3)]
 Counts = Annotated[list[Annotated[int, Strict(), Ge(1)]], Len(3, 3)]
-Gaps = Annotated[list[Positive], Len(3, 3)]
+Gaps = Annotated[list[Annotated[Finite, Ge(0)]], Len(3, 3)]
 NOUGHT, ONCE = (0.0, 0.0, 0.0), (1, 1, 1)
 
 
@@ -26,13 +26,22 @@ class Body(Table):
     velocity: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m/s
     spin: InSpace = Field(default_factory=lambda: [*NOUGHT])  # rad/s, about the centre of the mesh
     copies: Counts = Field(default_factory=lambda: [*ONCE])  # along x, y, z
-    spacing: Gaps | None = None  # m, between copies
+    spacing: Gaps | None = None  # m, between copies; of any size where there is one
 
     @model_validator(mode="after")
     def _copies_have_room(self) -> Body:
-        if max(self.copies) > 1 and self.spacing is None:
+        spacing = self.spacing or NOUGHT
+        if any(count > 1 and not gap for count, gap in zip(self.copies, spacing, strict=True)):
             raise ValueError(f"copies = {self.copies} lie in one another: give spacing = [x, y, z] in m")
         return self
+
+
+def of_rigid(data: dict[str, Any]) -> dict[str, Any]:
+    """The tables of a study; where bodies are rigid and nobody says which energy, it is the one there is for them."""
+    time, material = data.get("time"), data.get("material")
+    if not (isinstance(time, dict) and time.get("scheme") == "rigid" and isinstance(material, dict)):
+        return data
+    return data | {"material": {"energy": "linear"} | material}
 
 
 def check_rigid(study: Study) -> None:

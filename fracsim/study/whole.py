@@ -10,7 +10,7 @@ from .body import Damping, Material, Mesh
 from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .materials import filled
-from .moving import Body, check_rigid
+from .moving import Body, check_rigid, of_rigid
 from .order import check_order
 from .running import FRACTURE_FIELDS, Output, Probe, Time
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
@@ -49,8 +49,8 @@ class Study(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _materials_by_name(cls, data: Any) -> Any:
-        return filled(data) if isinstance(data, dict) else data
+    def _what_is_not_said(cls, data: Any) -> Any:
+        return of_rigid(filled(data)) if isinstance(data, dict) else data
 
     @field_validator("probe", "obstacle")
     @classmethod
