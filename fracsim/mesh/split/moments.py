@@ -9,11 +9,16 @@ s = sum x_i,
 
 from __future__ import annotations
 
+from ctypes import c_int64
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from ..compiled import at, library
+
+SOURCE = Path(__file__).with_suffix(".c")
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -49,19 +54,12 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Moments:
     """Moments of `count` bodies from the points (n, d) of their closed surfaces and the elements (m, d), each of the
     body that `body` (m,) says."""
     d = points.shape[1]
-    corners = points[elements]
-    many = np.maximum(np.bincount(body, minlength=count), 1)
-    near = _sums(body, corners.mean(axis=1), count) / many[:, None]  # each body about a point of its own: less cancels
-    x = corners - near[body, None]
-    cone, middle = cones(x), x.sum(axis=1)
-    volume = _sums(body, cone[:, None], count)[:, 0]
-    first = _sums(body, cone[:, None] * middle, count) / (d + 1)
-    both = np.einsum("mki,mkj->mij", x, x) + np.einsum("mi,mj->mij", middle, middle)
-    second = _sums(body, (cone[:, None, None] * both).reshape(len(cone), -1), count) / ((d + 1) * (d + 2))
-    arm = np.divide(first, volume[:, None], out=np.zeros_like(first), where=volume[:, None] > 0)
-    about = second.reshape(-1, d, d) - np.einsum("n,ni,nj->nij", volume, arm, arm)
-    return Moments(volume, near + arm, about)
-
-
-def _sums(body: Ints, values: Values, count: int) -> Values:
-    return np.stack([np.bincount(body, each, count).astype(float) for each in values.T], axis=1)
+    given = [np.ascontiguousarray(points), *(np.ascontiguousarray(each, np.int64) for each in (elements, body))]
+    many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
+    near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # each about a point of its own
+    sums = library(SOURCE).sums
+    sums(*map(c_int64, (len(elements), d, count)), *map(at, (*given, many, near, volume, first, second)))
+    arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
+    across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]
+    about = second.reshape(-1, d, d) / ((d + 1) * (d + 2)) - across
+    return Moments(volume[:, 0], near + arm, about)
