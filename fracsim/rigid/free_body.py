@@ -6,6 +6,15 @@ in the configuration at rest, with the body's stress as it is assembled for defo
 cells of the mesh with the share of each that is its own: a cell that a crack runs through belongs to the pieces on both
 sides, to each with its share of stiffness and mass. What a piece solves with beyond its own nodes (B07's virtual nodes)
 are the other nodes of these cells, in a system of its own, so that no piece feels another.
+
+A small body's preconditioner is an incomplete factor, which is made in no time; multigrid's coarse spaces are most of
+what a first solve takes (s of processor time, first and later ones; parts of a wall, a slender figure, a thick slab):
+
+    nodes   786            886            1,320          1,683          2,498
+    factor  0.006, 0.007   0.013, 0.012   0.028, 0.027   0.043, 0.042   0.081, 0.090
+    grids   0.024, 0.006   0.024, 0.008   0.044, 0.016   0.068, 0.030   0.092, 0.040
+
+Most pieces are solved for once or twice: those of FEW nodes take a factor. A mesh of more has it made for all copies.
 """
 
 from __future__ import annotations
@@ -37,6 +46,8 @@ DEFAULTS: Options = {
     "pc_gamg_threshold": 0.0,  # no aggregates across cells of other pieces, which carry nothing
     "mg_coarse_pc_type": "svd",  # the coarsest matrix has the rigid modes too: it is singular
 }
+FEW = 1500  # nodes of a body: fewer are preconditioned by an incomplete factor
+FACTOR: Options = {"pc_type": "icc"}
 
 
 class Stiffness:
@@ -107,7 +118,7 @@ class FreeBody:
     """
 
     def __init__(self, stiffness: Stiffness, share: Values, given: Options | None = None) -> None:
-        """`given`: PETSc options over DEFAULTS."""
+        """`given`: PETSc options over DEFAULTS, and FACTOR of what is small."""
         domain = stiffness.stress.domain
         assert domain.comm.size == 1
         alive = np.flatnonzero(share)
@@ -121,7 +132,7 @@ class FreeBody:
         each = (share * stiffness.density * domain.volumes)[alive] / corners.shape[1]
         mass = np.bincount(corners.ravel(), np.repeat(each, corners.shape[1]), minlength=len(domain.nodes))
         self.relief = Relief(mass[self.nodes].astype(float), modes)
-        self._solver(DEFAULTS | (given or {}))
+        self._solver(DEFAULTS | (FACTOR if len(self.nodes) < FEW else {}) | (given or {}))
 
     def _solver(self, options: Options) -> None:
         self.matrix.setNullSpace(self._null)
