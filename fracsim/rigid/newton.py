@@ -31,7 +31,7 @@ FIELDS = ("dim", "solref", "solreffriction", "solimp", "includemargin", "efc_add
           "vert", "adhesion", "surfacevel")  # fmt: skip
 STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
           mujoco.mj_fwdConstraint)  # fmt: skip
-AT_ONCE = 20  # iterations of Newton's method: what takes more is solved with softer contacts first,
+AT_ONCE = 60  # iterations of Newton's method: what takes more is solved with softer contacts first,
 SOFTER = (100.0, 10.0, 1.0)  # times what they give way by, each from where the last came to
 ISLAND = 300  # rows of an island: three times its contacts
 
@@ -47,7 +47,6 @@ class Newton:
         things = int(np.concatenate([model.thing, moving]).max(initial=0)) + 1
         self._geom = np.zeros(things, int)  # all that stands still is one
         self._geom[moving] = 1 + np.arange(len(moving))
-        self._jammed = False  # whether contacts of this step were too many to be solved at once
 
     def begin(self, bodies: Bodies, ways: Values, rates: Values, contacts: Contacts, gravity: Values) -> None:
         """A step of the bodies, of what is driven at `ways` (driven, 3) at `rates` (driven, 3), and these contacts,
@@ -62,7 +61,6 @@ class Newton:
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM):
             stage(made, data)
         self._fill(contacts)
-        self._jammed = False
         data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
 
     def _fill(self, contacts: Contacts) -> None:
@@ -86,15 +84,14 @@ class Newton:
         """Forces and moments (n, 6) that kept (k,) contacts give, which may come nearer by aims (k,) m, these in the
         axes of the bodies, N and N m; the forces (k, 3) of contacts along their axes, N; and which (k,) press.
 
-        Which of many contacts press Newton's method finds by trial: it flips some at every iteration. Soft ones, taken
-        first, tell it sooner, and each harder set takes a dozen.
+        Which of many contacts press Newton's method finds by trial: it flips some at every iteration. Where it has not
+        found them after many, soft ones, taken first, tell it sooner, and each harder set takes a dozen. A later look
+        begins where the last one came to, and is mostly done at once.
         """
         data = self._data
         data.contact.dist[:], data.contact.exclude[:] = aim, ~kept
-        if not self._jammed:
-            self._press(1.0, AT_ONCE)
-            self._jammed = not self._simple()
-        if self._jammed:
+        self._press(1.0, AT_ONCE)
+        if not self._simple():
             for softer in SOFTER:
                 self._press(softer, ITERATIONS)
         pressed = kept & (data.efc_force[data.contact.efc_address] > 0)
@@ -107,8 +104,9 @@ class Newton:
         made, data = self._made, self._data
         made.opt.iterations = most
         mujoco.mj_makeConstraint(made, data)
-        data.efc_R[:] *= softer
-        data.efc_D[:] /= softer
+        if softer > 1:
+            data.efc_R[:] *= softer
+            data.efc_D[:] /= softer
         for stage in STAGES:
             stage(made, data)
         data.qacc_warmstart[:] = data.qacc
