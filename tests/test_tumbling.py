@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.tumbling import PART, orientation, rotated, tumbled
+from fracsim.rigid.tumbling import PART, driven, orientation, rotated, tumbled
 
 Values = npt.NDArray[np.float64]
 TOP = np.diag([1.0, 2.0, 3.0])[None]  # kg m^2
@@ -95,3 +95,23 @@ def test_a_tensor_in_the_axes_of_a_body() -> None:
     turn, tensor, vector = Rotation.random(9, rng=rng).as_matrix(), rng.normal(size=(9, 3, 3)), rng.normal(size=(9, 3))
     in_space = turn @ tensor @ np.swapaxes(turn, 1, 2)
     assert np.allclose(rotated(turn, tensor, vector), (in_space @ vector[:, :, None])[:, :, 0], atol=1e-14)
+
+
+def test_what_drives_bodies_changes_their_momenta_by_what_it_gives() -> None:
+    """m dv = dt (F + m g), d(R I R^T w) = dt R M, by dense matrices; what spins by more than it may keeps its axis, and
+    what nothing acts on its spin."""
+    rng = np.random.default_rng(4)
+    turn = Rotation.random(6, random_state=4).as_matrix()
+    half = rng.normal(size=(6, 3, 3))
+    inertia, mass = half @ np.swapaxes(half, 1, 2) + 3 * np.eye(3), rng.uniform(1, 2, 6)
+    velocity, spin, force = (rng.normal(size=(6, k)) for k in (3, 3, 6))
+    force[0], spin[0], force[1, 3:] = 0.0, 50.0, 1e4
+    gravity, dt, most = np.array([0.0, 0.0, -9.81]), 0.01, 10.0
+    motion = driven(turn, inertia, np.linalg.inv(inertia), mass, (velocity, spin), force, gravity, dt, most)
+    pushed = mass[:, None] * (motion[0] - velocity) / dt - mass[:, None] * gravity
+    assert np.allclose(pushed, force[:, :3], atol=1e-10)
+    own = turn @ inertia @ np.swapaxes(turn, 1, 2)
+    given = (own @ spin[:, :, None] + dt * turn @ force[:, 3:, None])[:, :, 0]
+    free = np.linalg.solve(own, given[:, :, None])[:, :, 0]
+    assert np.allclose(np.delete(motion[1], 1, axis=0), np.delete(free, 1, axis=0), rtol=1e-12, atol=1e-12)
+    assert np.allclose(motion[1][1], most * free[1] / np.linalg.norm(free[1])) and np.linalg.norm(free[1]) > most

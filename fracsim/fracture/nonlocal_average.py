@@ -20,7 +20,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.compiled import at, library
+from ..mesh.compiled import address, at, library
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
 
@@ -108,7 +108,7 @@ class _Rows:
         """`weights`: (n, near)."""
         self.cells, self.full = cells, np.asarray(weights.sum(axis=1))[:, 0]
         self._kept = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
-        self._given = _Given(*map(at, self._kept))
+        self._given = _Given(*map(address, self._kept))
         self._all = np.arange(len(cells))
 
     def above(self, some: Ints, pull: Values, weight: Values, bound: float) -> Ints:

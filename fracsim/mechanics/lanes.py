@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem, la
 
-from ..mesh.compiled import at, built_together
+from ..mesh.compiled import address, at, built_together
 from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
 
 Values = npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ class Lanes:
         """What C's `add` returns."""
         cells, geometry, (w, c) = cells_of(self._form), self._form.mesh.geometry, packed(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, w, c
-        form = _Form(len(cells), w.shape[1], len(c), *map(at, arrays))
+        form = _Form(len(cells), w.shape[1], len(c), *map(address, arrays))
         result: int = self._code.add(byref(form), *map(at, given))
         return result
 

@@ -94,9 +94,17 @@ def machine_flags() -> list[str]:
     return ["-O3", "-march=native", "-ffp-contract=fast", "-g0", f"-DFRACSIM_CPU=0x{tag}"]
 
 
-def at(values: npt.NDArray[Any]) -> ctypes.c_void_p:
+def at(values: npt.NDArray[Any]) -> Any:
     """Where an array begins, which is to be contiguous; it lives as long as this."""
-    place = ctypes.c_void_p(values.__array_interface__["data"][0])  # a fifth of the time of ctypes.data_as
+    try:
+        return ctypes.byref(ctypes.c_char.from_buffer(values))  # a tenth of the time of ctypes.data_as
+    except (TypeError, ValueError):  # what may not be written to, or has no entries
+        return address(values)
+
+
+def address(values: npt.NDArray[Any]) -> ctypes.c_void_p:
+    """The same for a structure to hold."""
+    place = ctypes.c_void_p(values.__array_interface__["data"][0])
     place.array = values  # type: ignore[attr-defined]
     return place
 

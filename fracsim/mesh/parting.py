@@ -17,7 +17,7 @@ import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from .compiled import at, library
+from .compiled import address, at, library
 from .domain import Domain
 from .edges import EdgeGraph
 from .pieces import Pieces, find_pieces, followed
@@ -97,7 +97,7 @@ class Parting:
         graph, room, parts = self._graph, self._room, c_int64()
         room.nodes[: len(ends)] = ends
         edges = graph.edges_at
-        given = _Given(*map(at, (graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared)))
+        given = _Given(*map(address, (graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared)))
         sizes = byref(given), c_int64(len(ends)), c_int64(far)
         count = self._code(*sizes, *map(at, (room.nodes, room.place, room.part, room.goes_on)), byref(parts))
         return room.nodes[:count], room.part[:count], room.goes_on[: parts.value]

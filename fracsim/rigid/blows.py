@@ -92,14 +92,16 @@ class Blows:
         """`step`: s; `fast`: what pushes by less, times the mass of the lighter thing, passes no blow on, m/s."""
         self._step, self._fast, self._time, self._spread = step, fast, time, spread
         self._known = _Known.nothing()
+        self._seen: _Seen | None = None
 
     def look(self, touches: Touches, bodies: Bodies, names: Ints) -> list[Strain]:
         """The strains of a step that began with these bodies, by their names (n,), ascending."""
         self._align(names)
-        speed, time = self._struck(touches, bodies, names)
+        seen = self._see(touches, bodies, names)
+        speed, time = self._struck(seen, bodies, names)
         known, n = self._known, len(names)
         known.quiet = np.where(speed > 0, 0, np.minimum(known.quiet + 1, NEVER))
-        received = _at_rest(touches, bodies, self._spread)
+        received = seen.received
         size = np.linalg.norm(received.impulses, axis=1) / self._step
         borne = np.bincount(received.body, size, n)
         loaded = (known.quiet > SETTLED) & (borne > GROWN * known.borne)
@@ -115,9 +117,8 @@ class Blows:
     def keep(self, touches: Touches, bodies: Bodies, names: Ints) -> None:
         """What a step came to in the end, for the next one to compare with."""
         self._align(names)
-        known = self._known
-        known.pairs, _, known.pushed = self._by_pairs(touches, names)
-        received = _at_rest(touches, bodies, self._spread)
+        known, seen = self._known, self._see(touches, bodies, names)
+        known.pairs, known.pushed, received = seen.pairs, seen.push, seen.received
         known.on, known.where = names[received.body], received.points
         known.gave, known.spread = received.impulses, received.spread
 
@@ -149,21 +150,18 @@ class Blows:
 
     # --- who is struck ---
 
-    def _by_pairs(self, touches: Touches, names: Ints) -> tuple[Ints, Values, Values]:
-        """Codes (p,) of pairs that touch, ascending; the fastest meeting of each in m/s, and what it gave in N s."""
-        both = np.stack([touches.first, touches.second], axis=1)
-        known = np.concatenate([names, STANDS + np.arange(int(both.max(initial=0)) + 1)])
-        both = np.sort(known[both], axis=1)
-        code, place = np.unique(both @ np.array([2 * STANDS, 1]), return_inverse=True)
-        closing: Values = np.zeros(len(code))
-        np.maximum.at(closing, place, touches.closing)
-        push = np.bincount(place, np.linalg.norm(touches.impulse, axis=1), len(code))
-        return code, closing, push.astype(float)
+    def _see(self, touches: Touches, bodies: Bodies, names: Ints) -> _Seen:
+        """What a step did, which is looked at and, where nothing breaks, kept."""
+        seen = self._seen
+        if seen is None or seen.touches is not touches or seen.bodies is not bodies:
+            received = _at_rest(touches, bodies, self._spread)
+            self._seen = seen = _Seen(touches, bodies, *_by_pairs(touches, names), received)
+        return seen
 
-    def _struck(self, touches: Touches, bodies: Bodies, names: Ints) -> tuple[Values, Values]:
+    def _struck(self, seen: _Seen, bodies: Bodies, names: Ints) -> tuple[Values, Values]:
         """(n + 1,) speed of the blow that bodies are under, m/s, 0 of none, and (n + 1,) its time, s."""
         n, known = len(names), self._known
-        code, closing, push = self._by_pairs(touches, names)
+        code, closing, push = seen.pairs, seen.closing, seen.push
         pairs = np.stack([code // (2 * STANDS), code % (2 * STANDS)], axis=1)
         things = np.where(pairs < STANDS, np.searchsorted(names, pairs), n + pairs - STANDS)
         at = np.minimum(np.searchsorted(known.pairs, code), max(len(known.pairs) - 1, 0))
@@ -233,6 +231,31 @@ class _Received:
     points: Values
     impulses: Values
     spread: Values
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What touched among bodies in a step: codes `pairs` (p,), ascending, the fastest meeting of each `closing` (p,) in
+    m/s, what it gave, `push` (p,) in N s, and what the bodies `received`."""
+
+    touches: Touches
+    bodies: Bodies
+    pairs: Ints
+    closing: Values
+    push: Values
+    received: _Received
+
+
+def _by_pairs(touches: Touches, names: Ints) -> tuple[Ints, Values, Values]:
+    """Codes (p,) of pairs that touch, ascending; the fastest meeting of each in m/s, and what it gave in N s."""
+    both = np.stack([touches.first, touches.second], axis=1)
+    known = np.concatenate([names, STANDS + np.arange(int(both.max(initial=0)) + 1)])
+    both = np.sort(known[both], axis=1)
+    code, place = np.unique(both @ np.array([2 * STANDS, 1]), return_inverse=True)
+    closing: Values = np.zeros(len(code))
+    np.maximum.at(closing, place, touches.closing)
+    push = np.bincount(place, np.linalg.norm(touches.impulse, axis=1), len(code))
+    return code, closing, push.astype(float)
 
 
 def _at_rest(touches: Touches, bodies: Bodies, spread: Spread) -> _Received:

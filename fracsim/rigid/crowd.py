@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.compiled import at, library
+from ..mesh.compiled import address, at, library
 from .contacts import Contacts
 from .waiting import Helper
 
@@ -110,7 +110,7 @@ class Crowd:
     @cached_property
     def _given(self) -> Any:
         """For C; the arrays are this crowd's, and stay as long as it."""
-        arrays = map(at, (self.contacts, self.things, self.mass, self.inertia))
+        arrays = map(address, (self.contacts, self.things, self.mass, self.inertia))
         return ctypes.byref(_Crowd(len(self.contacts), len(self.mass), *arrays))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -36,7 +37,7 @@ class Rules:
     friction: float = 0.0
     restitution: float = 0.0
 
-    @property
+    @cached_property
     def fast(self) -> float:
         """m/s: what comes together faster than resting contact explains, 2 g dt, strikes."""
         return max(2 * float(np.linalg.norm(self.gravity)) * self.step, SLOW)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from .bodies import Bodies
 from .model import Model
-from .tumbling import rotated, tumbled
+from .tumbling import driven, rotated, tumbled
 
 Values = npt.NDArray[np.float64]
 
@@ -30,13 +30,10 @@ def flown(model: Model, bodies: Bodies, time: Values) -> Bodies:
 def driven_on(model: Model, bodies: Bodies, force: Values, gravity: Values, dt: float) -> Bodies:
     """The bodies where they are, with the motion that forces and moments (n, 6), these in their own axes, and `gravity`
     (3,) give them in dt."""
-    momentum = rotated(bodies.turn, model.inertia, bodies.spin)
-    momentum += dt * np.einsum("nij,nj->ni", bodies.turn, force[:, 3:])
-    velocity = bodies.velocity + dt * (gravity + force[:, :3] / model.mass[:, None])
-    spin = rotated(bodies.turn, model.inverse, momentum)
-    size, most = np.linalg.norm(spin, axis=1), np.maximum(TURN / dt, np.linalg.norm(bodies.spin, axis=1))
-    fast = np.any(force, axis=1) & (size > most)
-    spin[fast] *= (most[fast] / size[fast])[:, None]
+    motion = bodies.velocity, bodies.spin
+    velocity, spin = driven(
+        bodies.turn, model.inertia, model.inverse, model.mass, motion, force, gravity, dt, TURN / dt
+    )
     return replace(bodies, velocity=velocity, spin=spin)
 
 

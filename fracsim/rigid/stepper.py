@@ -82,6 +82,8 @@ class RigidStepper:
     """
 
     shapes: Shapes
+    _mass: Values  # of all things, and half their sizes
+    _size: Values
 
     def __init__(
         self,
@@ -114,6 +116,7 @@ class RigidStepper:
         damage = {number: each.damage() for number, each in self.copies.damaged.items()}
         points = {number: each.points for number, each in self.copies.shapes.items()}
         self.shapes, self._engine = self._geometry.shapes(damage, points), None
+        self._mass, self._size = self._weights()
 
     def start(self) -> RigidState:
         """The bodies where the mesh has them, at rest."""
@@ -268,13 +271,12 @@ class RigidStepper:
         """s, of things (k,) that meet others (k,) at speeds (k,), m/s."""
         if self._given is not None:
             return np.full(len(first), self._given)
-        mass, size = self._weights()
-        both = self._both_give(first, second)
+        mass, size, both = self._mass, self._size, self._both_give(first, second)
         return self._hertz(reduced(mass[first], mass[second]), reduced(size[first], size[second]), speed, both)
 
     def _spread(self, first: Ints, second: Ints) -> Values:
         """a^3 / F, m^3/N, of things (k,) that touch others (k,)."""
-        _, size = self._weights()
+        size = self._size
         return self._hertz.spread(reduced(size[first], size[second]), self._both_give(first, second))
 
     def _both_give(self, first: Ints, second: Ints) -> Flags:

@@ -84,6 +84,30 @@ void rotations(int64_t n, const double *turn, const double *tensor, const double
     for (int64_t i = 0; i < n; i++) rotated(turn + 9 * i, tensor + 9 * i, vector + 3 * i, result + 3 * i);
 }
 
+/* Velocities and spins (n, 3) of n bodies, (n, 6) in `motion`, after a time in which `gravity` and forces and moments
+   (n, 6), these in their own axes, act on them where they are. These set none spinning by more than `most`, rad/s. */
+void driven(int64_t n, const double *turn, const double *inertia, const double *inverse, const double *mass,
+            const double *velocity, const double *spin, const double *force, const double *gravity, double time,
+            double most, double *motion)
+{
+    for (int64_t each = 0; each < n; each++, turn += 9, velocity += 3, spin += 3, force += 6, motion += 6) {
+        const double *moment = force + 3;
+        double momentum[3], size = 0, before = 0;
+        int acts = 0;
+        for (int i = 0; i < 6; i++) acts |= force[i] != 0;
+        rotated(turn, inertia + 9 * each, spin, momentum);
+        for (int i = 0; i < 3; i++) {
+            motion[i] = velocity[i] + time * (gravity[i] + force[i] / mass[each]);
+            momentum[i] += time * (turn[3 * i] * moment[0] + turn[3 * i + 1] * moment[1] + turn[3 * i + 2] * moment[2]);
+        }
+        rotated(turn, inverse + 9 * each, momentum, motion + 3);
+        for (int i = 0; i < 3; i++) size += motion[3 + i] * motion[3 + i], before += spin[i] * spin[i];
+        double allowed = fmax(most, sqrt(before));
+        if (acts && sqrt(size) > allowed)
+            for (int i = 3; i < 6; i++) motion[i] *= allowed / sqrt(size);
+    }
+}
+
 /* Quaternions (n, 4) of n rotations, the scalar first: from the largest of its parts, of which none is lost. */
 void orientations(int64_t n, const double *turn, double *quat)
 {

@@ -45,6 +45,19 @@ def rotated(turn: Values, tensor: Values, vector: Values) -> Values:
     return result
 
 
+def driven(
+    turn: Values, inertia: Values, inverse: Values, mass: Values, motion: tuple[Values, Values], force: Values,
+    gravity: Values, dt: float, most: float,
+) -> tuple[Values, Values]:  # fmt: skip
+    """(n, 3) velocities and (n, 3) spins after dt, s, from those before, `motion`, of bodies with masses (n,) that turn
+    where they are by `gravity` (3,) and forces and moments (n, 6), these in their own axes; no moment sets one spinning
+    by more than `most`, rad/s."""
+    arrays = (turn, inertia, inverse, mass, *motion, force, gravity)
+    given, after = [np.ascontiguousarray(each, float) for each in arrays], np.empty((len(mass), 6))
+    library(SOURCE).driven(c_int64(len(mass)), *map(at, given), c_double(dt), c_double(most), at(after))
+    return np.ascontiguousarray(after[:, :3]), np.ascontiguousarray(after[:, 3:])
+
+
 def orientation(turn: Values) -> Values:
     """(n, 4) of rotations (n, 3, 3) quaternions, the scalar first."""
     turn, quat = np.ascontiguousarray(turn), np.empty((len(turn), 4))
