@@ -99,11 +99,26 @@ class Flights(Obstacles):
 
 def columns_of(free: Iterable[Flying], comm: MPI.Intracomm) -> dict[str, Callable[[], Values]]:
     """Columns of history.csv that tell how obstacles fly, each with a function that gives this rank's share, (1,)."""
-    return {name: partial(_reading, each, k, comm) for each in free for k, name in enumerate(columns(each.body))}
+    tellers = [(_Teller(each, comm), columns(each.body)) for each in free]
+    return {name: partial(teller, place) for teller, names in tellers for place, name in enumerate(names)}
 
 
-def _reading(each: Flying, place: int, comm: MPI.Intracomm) -> Values:
-    return np.zeros(1) if comm.rank else each.body.told(each.flight)[place : place + 1]
+class _Teller:
+    """What an obstacle tells of how it flies: asked for each column, found once for each flight."""
+
+    def __init__(self, flying: Flying, comm: MPI.Intracomm) -> None:
+        self._flying, self._root = flying, comm.rank == 0
+        self._flight: Flight | None = None
+        self._told: Values = np.empty(0)
+
+    def __call__(self, place: int) -> Values:
+        """(1,) the column there; 0 where it is not this rank's to tell."""
+        if not self._root:
+            return np.zeros(1)
+        if self._flight is not self._flying.flight:
+            self._flight = self._flying.flight
+            self._told = self._flying.body.told(self._flight)
+        return self._told[place : place + 1]
 
 
 def columns(body: FreeObstacle) -> list[str]:
