@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import pyvista
+from scipy.spatial import cKDTree
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
@@ -39,9 +40,7 @@ def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
             continue
         near = np.flatnonzero(np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1))
         near = near[own[near] != piece]
-        shares = np.einsum("ckd,ncd->nck", barycentric_gradients(corners), X[near, None] - corners[:, 0])
-        shares[:, :, 0] += 1.0
-        inside = near[(shares.min(axis=2) > 0).any(axis=1)]
+        inside = near[in_cells(X[near], corners)]
         if not len(inside):
             continue
         surface = pyvista.make_tri_mesh(x, made.elements[own[owner] == piece])
@@ -49,6 +48,18 @@ def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
         for other in np.unique(own[inside][depth > NONE]):
             pair = min(int(other), piece), max(int(other), piece)
             found[pair] = max(found.get(pair, 0.0), float(depth[own[inside] == other].max()))
+    return found
+
+
+def in_cells(X: Values, corners: Values) -> npt.NDArray[np.bool_]:
+    """(n,) which of the points (n, 3) are in one of the cells with corners (c, 4, 3), by barycentric coordinates."""
+    middle, found = corners.mean(axis=1), np.zeros(len(X), bool)
+    radius = np.linalg.norm(corners - middle[:, None], axis=2).max()
+    near = cKDTree(X).sparse_distance_matrix(cKDTree(middle), radius, output_type="ndarray")
+    point, cell = near["i"], near["j"]
+    shares = np.einsum("nkd,nd->nk", barycentric_gradients(corners)[cell], X[point] - corners[cell, 0])
+    shares[:, 0] += 1.0
+    found[point[shares.min(axis=1) > 0]] = True
     return found
 
 
