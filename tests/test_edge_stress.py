@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
-from fracsim.fracture.edge_stress import carried_by, frobenius_norm, greatest_pull, normal_stress
+from fracsim.fracture.edge_stress import Simplices, frobenius_norm, greatest_pull
 from fracsim.mesh.simplices import local_edges
 from fracsim.mesh.small_matrices import barycentric_gradients
 from support.laws import T_stress, Tensor, rotation
@@ -37,6 +39,30 @@ def as_matrix(components: Tensor) -> Tensor:
         return np.array([[xx, xy], [xy, yy]])
     xx, yy, zz, xy, xz, yz = components
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def normal_stress(components: Tensor, corners: Tensor) -> Tensor:
+    """(n, k) of simplices with (n, d + 1, d) corners under (n, 3 or 6) stress."""
+    return simplices(corners).normal_stress(np.arange(len(corners)), components)
+
+
+def carried_by(components: Tensor, corners: Tensor, intact: Tensor) -> Tensor:
+    """(n, 3 or 6) what the edges of simplices carry that are (n, k) intact, whether they hold them together or not."""
+    n, k = intact.shape
+    pattern = (~intact @ (1 << np.arange(k))).astype(np.uint8)
+    edges = np.arange(n * k, dtype=np.int32).reshape(n, k)
+    damage = SimpleNamespace(
+        cell_edges=edges, integrity=intact.ravel().astype(float), pattern=pattern, damaged=np.ones(n, bool),
+        split=np.zeros(n, bool),
+    )  # fmt: skip
+    return simplices(corners).carried(components, damage)
+
+
+def simplices(corners: Tensor) -> Simplices:
+    """Those of (n, d + 1, d) corners, half of the way to which they have moved."""
+    nodes = np.arange(corners.size // corners.shape[2], dtype=np.int32).reshape(corners.shape[:2])
+    rest = np.ascontiguousarray(corners.reshape(-1, corners.shape[2]) / 2)
+    return Simplices(nodes, rest, rest.copy())
 
 
 def flags_of(patterns: Tensor, edges: int) -> Tensor:

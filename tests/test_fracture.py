@@ -19,7 +19,7 @@ from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
 from fracsim.fracture.breaking import Breaking
 from fracsim.fracture.criterion import OverloadedEdges
-from fracsim.fracture.edge_stress import normal_stress
+from fracsim.fracture.edge_stress import Simplices
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import Strength, hashed
 from fracsim.mechanics.kernels import CellExpression
@@ -235,7 +235,7 @@ def test_eq_28_on_random_damage() -> None:
     deform(scene, np.eye(3) + random.uniform(-0.1, 0.1, (3, 3)))
     stress = cauchy_of(scene)()
     np.testing.assert_allclose(stress, np.tile(stress[0], (len(stress), 1)), atol=1e-14)
-    load = np.abs(normal_stress(stress, cell_corners(scene)))
+    load = np.abs(along_edges(scene, stress))
     expected = np.ones(len(load))
     for _ in range(4):
         graph.break_edges(random.random(len(graph.broken)) < 0.15)
@@ -327,8 +327,7 @@ def broken_by(fracture: Breaking) -> npt.NDArray[np.bool_]:
 
 def along_edges(scene: Scene, stress: Values) -> Values:
     """(cells, k) normal stress along the edges of the deformed cells."""
-    u = scene.balance.u.x.array.reshape(-1, scene.domain.dim)
-    return normal_stress(stress, (scene.domain.nodes + u)[scene.domain.cell_nodes])
+    return Simplices.of(scene.balance.stress).normal_stress(np.arange(len(stress)), stress)
 
 
 def strain_field(scene: Scene, dim: int) -> Values:

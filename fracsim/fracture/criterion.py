@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from ..mesh.ranks import total
-from .edge_stress import carried_by, greatest_pull, normal_stress
+from .edge_stress import Simplices, greatest_pull
 from .strength import Strength
 
 Values = npt.NDArray[np.float64]
@@ -57,32 +57,27 @@ class CarriedStress:
 
     def __init__(self, stress: Stress, graph: EdgeGraph, average: Average | None, *, whole_tensor: bool) -> None:
         """`whole_tensor`: more is asked of it than the normal stress along intact edges."""
-        self._stress, self._graph, self._average = stress, graph, average
-        self._dim, self._comm = stress.domain.dim, stress.domain.comm
+        self._cells, self._graph, self._average, self._comm = Simplices.of(stress), graph, average, stress.domain.comm
         # by edges and locally there is no need: an intact edge has the same normal stress in the whole tensor
         self._leaves_out = whole_tensor or average is not None
 
     def __call__(self, stress: Values) -> tuple[Values, Flags | None]:
         """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
         graph = self._graph
-        damaged = np.flatnonzero(graph.damaged)
-        if not total(self._comm, len(damaged))[0]:
+        if not total(self._comm, int(graph.damaged.any()))[0]:
             return stress, None
-        active = ~graph.split
-        split = graph.split[damaged]
-        carried, whole = stress.copy(), damaged[~split]
-        carried[damaged[split]] = 0.0
         if self._leaves_out:
-            corners = self._stress.corners(whole)
-            carried[whole] = carried_by(stress.take(whole, axis=0), corners, graph.intact(whole))
-        return carried, active
+            return self._cells.carried(stress, graph), ~graph.split
+        carried = stress.copy()
+        carried[graph.split] = 0.0
+        return carried, ~graph.split
 
     def reaching(self, carried: Values, active: Flags | None, bound: float) -> tuple[npt.NDArray[np.int64], Values]:
         """Cells whose averaged stress may reach a bound in Pa along some direction, and that stress (collective).
 
         No average pulls harder than the average of the pulls: most cells are passed over after one product.
         """
-        size, bound = greatest_pull(carried, self._dim), bound * (1 - ROUND_OFF)
+        size, bound = greatest_pull(carried, self._cells.dim), bound * (1 - ROUND_OFF)
         if self._average is not None:
             return self._average.reaching(carried, size, bound, active)
         cells = np.flatnonzero(size >= bound)
@@ -104,7 +99,7 @@ class OverloadedEdges:
         self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, cap: float | None = None
     ) -> None:
         """`cap`: share of all edges that may fail in one pass, those loaded most first."""
-        self.strength, self._stress, self._graph = strength, stress, graph
+        self.strength, self._cells, self._graph = strength, Simplices.of(stress), graph
         self._carried = CarriedStress(stress, graph, average, whole_tensor=False)
         self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
 
@@ -116,11 +111,11 @@ class OverloadedEdges:
 
     def overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[Edges, Values]:
         """Intact local edges of some cells whose normal stress in their stress (n, 3 or 6) reaches the strength."""
-        size = greatest_pull(averaged, self._stress.domain.dim)  # most cells are passed over
+        size = greatest_pull(averaged, self._cells.dim)  # most cells are passed over
         may = size >= self.strength.weakest_of(cells) * (1 - ROUND_OFF)
         cells, averaged = cells[may], averaged[may]
         edges = self._graph.cell_edges[cells]
-        along = normal_stress(averaged, self._stress.corners(cells))
+        along = self._cells.normal_stress(cells, averaged)
         strength = self.strength(cells, edges)
         over = (along >= strength) & ~self._graph.broken[edges]
         return edges[over], along[over] / strength[over]
@@ -128,7 +123,7 @@ class OverloadedEdges:
     def _strongest(self, edges: Edges, load: Values, most: int) -> tuple[Edges, Values]:
         """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
         keys = self._graph.edge_keys(edges.astype(np.int64))
-        every = np.concatenate(self._stress.domain.comm.allgather(np.column_stack([keys, -load])))
+        every = np.concatenate(self._graph.domain.comm.allgather(np.column_stack([keys, -load])))
         order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
         _, first = np.unique(every[order, :2], axis=0, return_index=True)
         chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)

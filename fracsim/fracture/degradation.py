@@ -18,7 +18,7 @@ from ..forms.kinematics import deformation_gradient
 from ..mechanics.kernels import CellExpression
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from .edge_stress import share_carried
+from .edge_stress import Simplices
 
 Values = npt.NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class Chi:
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         assert stress.chi is not None
-        self._stress, self._graph = stress, graph
+        self._cells, self._graph = Simplices.of(stress), graph
         self._chi: Values = stress.chi.x.array
         self._volumes = stress.domain.volumes
 
@@ -77,19 +77,11 @@ class Chi:
 
     def _lower(self, stress: Values, psi: Values) -> tuple[float, float, bool]:
         """Energy released on this rank in J, most that chi of a cell fell, and whether it fell to 0 in any."""
-        graph, chi = self._graph, self._chi
-        cells = np.flatnonzero(graph.damaged & (chi[: len(psi)] > 0))
+        cells, lost = self._cells.lower(self._chi, stress, self._graph)
         if not len(cells):
             return 0.0, 0.0, False
-        share = share_carried(stress.take(cells, axis=0), self._stress.corners(cells), graph.cell_integrity(cells))
-        share[graph.split[cells]] = 0.0
-        lost = np.maximum(chi[cells] - share, 0.0)
-        changed = lost > 0
-        cells, lost = cells[changed], lost[changed]
-        chi[cells] -= lost
-        chi[cells[graph.split[cells]]] = 0.0
         released = float(np.sum(self._volumes[cells] * lost * psi[cells]))
-        return released, float(np.max(lost, initial=0.0)), not chi[cells].all()
+        return released, float(np.max(lost)), not self._chi[cells].all()
 
     def restore(self) -> None:
         """chi itself is in the checkpoint."""

@@ -15,17 +15,20 @@ it is needed first, they take a tenth of the time of arrays.
 
 from __future__ import annotations
 
-from ctypes import c_int64
+from ctypes import CDLL, Structure, byref, c_int64, c_void_p
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from ..mechanics.stress import Stress
 from ..mesh.compiled import at, library
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -48,29 +51,92 @@ def greatest_pull(components: Values, dim: int) -> Values:
 
     A convex function of s that grows in proportion to it: that of an average is at most the average of it.
     """
-    return _of_each("pull", dim, (len(components),), components)
-
-
-def normal_stress(components: Values, corners: Values) -> Values:
-    """(n, k) normal stress n . s . n along the edges of simplices with (n, d + 1, d) corners, in the unit of s; n is
-    the unit vector of an edge."""
-    return _of_each("normal", corners.shape[2], components.shape, components, corners)
-
-
-def share_carried(components: Values, corners: Values, integrity: Values) -> Values:
-    """(n,) sum of integrity |n . s . n| over the edges of a cell, as a share of that of whole ones (M22 eq. 28);
-    `integrity`: (n, k). 1 where nothing is loaded."""
-    return _of_each("share", corners.shape[2], (len(components),), components, corners, integrity)
-
-
-def carried_by(components: Values, corners: Values, intact: Flags) -> Values:
-    """(n, 3 or 6) components of the part of s that the intact edges ((n, k) flags) carry; zero in flat cells."""
-    return _of_each("carried", corners.shape[2], components.shape, components, corners, intact)
-
-
-def _of_each(function: str, dim: int, shape: tuple[int, ...], *given: npt.NDArray[Any]) -> Values:
-    """What a function of edge_stress.c makes of each cell."""
-    found, arrays = np.empty(shape), [np.ascontiguousarray(each) for each in given]
-    code = getattr(library(SOURCE, as_arrays=True), function)
-    code(c_int64(dim), c_int64(shape[0]), *map(at, arrays), at(found))
+    found = np.empty(len(components))
+    _code().pull(c_int64(dim), c_int64(len(components)), at(np.ascontiguousarray(components)), at(found))
     return found
+
+
+class _Given(Structure):
+    """As edge_stress.c has it."""
+
+    _fields_ = (("count", c_int64), *((name, c_void_p) for name in ("nodes", "rest", "moved")))
+
+
+class _Damage(Structure):
+    """The same."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("edges", "integrity", "pattern", "damaged", "split"))
+
+
+class Damage(Protocol):
+    """Edges of cells and their damage (mesh.edges)."""
+
+    @property
+    def cell_edges(self) -> npt.NDArray[np.int32]: ...
+    @property
+    def integrity(self) -> Values: ...
+    @property
+    def pattern(self) -> npt.NDArray[np.uint8]: ...
+    @property
+    def damaged(self) -> Flags: ...
+    @property
+    def split(self) -> Flags: ...
+
+
+class Simplices:
+    """Cells whose edges feel a stress, as they lie when they are asked.
+
+    Attributes:
+        dim: 2 or 3.
+    """
+
+    def __init__(self, nodes: npt.NDArray[np.int32], rest: Values, moved: Values | None = None) -> None:
+        """(cells, d + 1) `nodes` at `rest` (nodes, d), m, and by how much these have `moved` from there."""
+        self.dim, self._count = rest.shape[1], len(nodes)
+        self._kept = at(nodes), at(rest), None if moved is None else at(moved)
+        self._all = byref(_Given(len(nodes), *self._kept))
+
+    @classmethod
+    def of(cls, stress: Stress) -> Simplices:
+        """Cells in the configuration that a stress belongs to."""
+        domain = stress.domain
+        return cls(domain.cell_nodes, domain.nodes, None if stress.energy.linear else stress.u.x.array)
+
+    def normal_stress(self, cells: Ints, components: Values) -> Values:
+        """(n, k) normal stress n . s . n along the edges of cells (n,) under s (n, 3 or 6), in its unit; n is the unit
+        vector of an edge."""
+        found = np.empty(components.shape)
+        given = at(np.ascontiguousarray(cells)), self._all, at(np.ascontiguousarray(components)), at(found)
+        _code().normal(c_int64(self.dim), c_int64(len(cells)), *given)
+        return found
+
+    def carried(self, components: Values, damage: Damage) -> Values:
+        """(cells, 3 or 6) the part of s (cells, 3 or 6) that the intact edges of cells carry; zero in those that have
+        come apart and in flat ones."""
+        s, found = np.ascontiguousarray(components), np.empty(components.shape)
+        _code().carried(c_int64(self.dim), self._all, _damage(damage), at(s), at(found))
+        return found
+
+    def lower(self, chi: Values, components: Values, damage: Damage) -> tuple[Ints, Values]:
+        """Lower chi (cells,) of damaged cells to the sum of integrity |n . s . n| over their edges, as a share of that
+        of whole ones (M22 eq. 28), 1 where nothing is loaded; of those that have come apart to 0.
+
+        Returns (n,) cells that lost anything, and how much.
+        """
+        cells, lost = np.empty(self._count, np.int64), np.empty(self._count)
+        given = at(np.ascontiguousarray(components)), at(chi), at(cells), at(lost)
+        many = _code().lower(c_int64(self.dim), self._all, _damage(damage), *given)
+        return cells[:many], lost[:many]
+
+
+def _damage(of: Damage) -> Any:
+    """Damage as C has it: its arrays live as long as they do in Python."""
+    of_cells = at(of.pattern), at(of.damaged), at(of.split)
+    return byref(_Damage(at(of.cell_edges), at(of.integrity), *of_cells))
+
+
+@cache
+def _code() -> CDLL:
+    code = library(SOURCE, as_arrays=True)
+    code.lower.restype = c_int64
+    return code

@@ -21,7 +21,7 @@ from ..mesh.around import CellsAround
 from ..mesh.edges import EdgeGraph
 from ..mesh.simplices import is_split, local_edges
 from .criterion import OverloadedEdges
-from .edge_stress import normal_stress
+from .edge_stress import Simplices
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -39,7 +39,7 @@ class Holding:
     """
 
     def __init__(self, failing: OverloadedEdges, stress: Stress, graph: EdgeGraph, limit: float = LIMIT) -> None:
-        self._failing, self._stress, self._graph, self._limit = failing, stress, graph, limit
+        self._failing, self._cells, self._graph, self._limit = failing, Simplices.of(stress), graph, limit
         self.strength = failing.strength
         domain = graph.domain
         self._map = domain.space.dofmap.index_map
@@ -88,7 +88,7 @@ class Holding:
     def _own_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
         """(n,) the greatest load over strength of the failing edges (n, edges) of cells, by what these feel
         themselves."""
-        along = normal_stress(stress[cells], self._stress.corners(cells))
+        along = self._cells.normal_stress(cells, stress[cells])
         strength = self.strength(cells, self._graph.cell_edges[cells])
         return np.asarray(np.where(fails, along / strength, 0.0).max(axis=1, initial=0.0))
 

@@ -22,7 +22,7 @@ from ..mesh.edges import EdgeGraph
 from ..mesh.ranks import total
 from ..mesh.simplices import is_split
 from ..meshes.components import components
-from .edge_stress import normal_stress
+from .edge_stress import Simplices
 from .strength import Strength
 
 Ints = npt.NDArray[np.int64]
@@ -38,7 +38,7 @@ class Joining:
         self, stress: Stress, graph: EdgeGraph, strength: Strength, held: Flags, *, cracks: bool = False
     ) -> None:
         """`held`: (nodes,) whose motion is prescribed, ghosts too; `cracks` cut what fails: it joins last."""
-        self._stress, self._graph, self._strength, self._held = stress, graph, strength, held
+        self._cells, self._graph, self._strength, self._held = Simplices.of(stress), graph, strength, held
         self._cracks = cracks
         self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
         self._around = CellsAround(graph.domain)
@@ -82,7 +82,7 @@ class Joining:
         feel themselves; -max where there is none."""
         graph = self._graph
         cells = np.flatnonzero(~graph.split & without[graph.cell_nodes].any(axis=1))
-        along = normal_stress(stress[cells], self._stress.corners(cells))
+        along = self._cells.normal_stress(cells, stress[cells])
         result = np.full(len(graph.broken), -np.finfo(float).max)
         np.maximum.at(result, graph.cell_edges[cells], along / self._strength(cells, graph.cell_edges[cells]))
         return np.asarray(result[edges])

@@ -11,7 +11,8 @@ and fewer have come apart since the last one: only rows near these are looked at
 from __future__ import annotations
 
 from collections.abc import Callable
-from ctypes import Structure, byref, c_double, c_int64, c_void_p
+from ctypes import CDLL, Structure, byref, c_double, c_int64, c_void_p
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -81,20 +82,27 @@ class NonlocalAverage:
         self._rows.make(hot)
         may = self._rows.around(hot)
         weighing = self._rows.sums(None if active is None else self._exchange(active[:, None].astype(float)))
-        found: list[Ints] = [np.empty(0, np.int64)]
-        averages: list[Values] = [np.empty((0, n))]
-        for rows, weight in zip(self._rows.made, weighing, strict=True):
-            some = rows.above(np.flatnonzero(may[rows.cells]), pull, weight, bound * (1 - 1e-12))
-            found.append(rows.cells[some])
-            averages.append(rows.times(near, some) / weight[some, None])
-        order = np.argsort(np.concatenate(found))
-        return np.concatenate(found)[order], np.concatenate(averages)[order]
+        blocks = [
+            rows.reaching(may, pull, weight, bound * (1 - 1e-12), near)
+            for rows, weight in zip(self._rows.made, weighing, strict=True)
+        ]
+        found = np.concatenate([np.empty(0, np.int64), *(cells for cells, _ in blocks)])
+        averages = np.concatenate([np.empty((0, n)), *(averages for _, averages in blocks)])
+        order = np.argsort(found)
+        return found[order], averages[order]
 
 
 class _Given(Structure):
     """As nonlocal_average.c has it."""
 
     _fields_ = (("start", c_void_p), ("place", c_void_p), ("weight", c_void_p))
+
+
+@cache
+def _code() -> CDLL:
+    code = library(SOURCE, as_arrays=True)
+    code.reaching.restype = c_int64
+    return code
 
 
 class _Rows:
@@ -111,24 +119,27 @@ class _Rows:
         self._given = _Given(*map(address, self._kept))
         self._all = np.arange(len(cells))
 
-    def above(self, some: Ints, pull: Values, weight: Values, bound: float) -> Ints:
-        """(m,) those of some rows whose average of `pull` (near,) reaches a bound; `weight`: (n,) sums of weights."""
-        code, found = library(SOURCE, as_arrays=True).above, np.empty(len(some), np.int64)
-        code.restype = c_int64
-        given = map(at, (some, np.ascontiguousarray(pull), weight))
-        return found[: code(byref(self._given), c_int64(len(some)), *given, c_double(bound), at(found))]
+    def reaching(self, may: Flags, pull: Values, weight: Values, bound: float, values: Values) -> tuple[Ints, Values]:
+        """(m,) cells, of those that `may` (own cells,), whose average of `pull` (near,) reaches a bound, and their
+        averages (m, k) of values (near, k); `weight`: (n,) sums of weights."""
+        width, count = values.shape[1], len(self.cells)
+        found, averages = np.empty(count, np.int64), np.empty((count, width))
+        given = at(self.cells), at(may), at(np.ascontiguousarray(pull)), at(weight), c_double(bound)
+        told = c_int64(width), at(np.ascontiguousarray(values)), at(found), at(averages)
+        many = _code().reaching(byref(self._given), c_int64(count), *given, *told)
+        return found[:many], averages[:many]
 
     def mark(self, places: Flags, marks: Flags) -> None:
         """Mark those near (near,) the own cells that are among some `places` (near,)."""
         sizes = c_int64(len(self.cells)), at(self.cells)
-        library(SOURCE, as_arrays=True).mark(byref(self._given), *sizes, at(places), at(marks))
+        _code().mark(byref(self._given), *sizes, at(places), at(marks))
 
     def times(self, values: Values, some: Ints | None = None) -> Values:
         """(n, k) sums over the weights of near values (near, k), of all rows or of some of them."""
         some = self._all if some is None else some
         found, values = np.empty((len(some), values.shape[1])), np.ascontiguousarray(values)
         sizes = c_int64(len(some)), at(some), c_int64(values.shape[1])
-        library(SOURCE, as_arrays=True).times(byref(self._given), *sizes, at(values), at(found))
+        _code().times(byref(self._given), *sizes, at(values), at(found))
         return found
 
 
