@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics import lanes
-from fracsim.mechanics.lanes import MatrixLanes, VectorLanes, compiled, in_lanes
+from fracsim.mechanics import kernels, lanes
+from fracsim.mechanics.kernels import jit_options
+from fracsim.mechanics.lanes import ExpressionLanes, MatrixLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
 from fracsim.mesh import compiled as compiling
-from support.scenes import Values
+from fracsim.mesh.dolfinx_calls import evaluate, source_of
+from support.scenes import Values, make_scene
 from test_dead_cells import damaged
 
+MATERIAL = {"young": 1e3, "poisson": 0.3, "density": 10.0}
 SIDE = [{"on": "left", "displacement": [0.1, "free", "free"]}]
 
 
@@ -69,6 +72,45 @@ def test_forces_as_one_by_one(case: str, dim: int) -> None:
         one, other = theirs.array_r, ours.array_r
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-14 * np.abs(other).max())
         assert np.abs(other).max() > 0
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("energy", ("linear", "corotated", "stvk", "neo-hookean"))
+def test_expressions_as_one_by_one(energy: str, dim: int) -> None:
+    """Stress and energy of a body that moves at random, of a number of cells that is no multiple of the lanes, are
+    DOLFINx's to the last digit; the fields they are made of are looked up anew."""
+    mesh = {"builder": "box", "size": [1.0, 0.7, 0.5][:dim], "h": 0.2}
+    scene, _ = make_scene(mesh=mesh, material=MATERIAL | {"energy": energy}, fracture={"strength": 1.0})
+    expression, balance = scene.fracture._evaluate, scene.balance
+    compiled_one = expression._compiled
+    lanes = ExpressionLanes.of(compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options()))
+    assert lanes is not None and expression._lanes is None
+    rng = np.random.default_rng(5)
+    for _ in range(2):
+        balance.displace(rng.uniform(-0.02, 0.02, balance.owned))
+        cells = rng.permutation(len(expression._all))[: -3 + len(expression._all) // 4 * 4].astype(np.int32)
+        ours, theirs = np.full((2, len(cells), expression.width), np.nan)
+        lanes(cells, ours)
+        evaluate(compiled_one, expression.mesh, cells, theirs)
+        np.testing.assert_array_equal(ours, theirs)
+        assert np.abs(theirs).max() > 0
+
+
+def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same where the size of a body decides, and crushed cells are counted as before."""
+    found = []
+    for many in (1, 10**9):
+        monkeypatch.setattr(kernels, "MANY_CELLS", many)
+        scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.7], "h": 0.2}, fracture={"strength": 1.0})
+        u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned)
+        u[3] = np.nan
+        scene.balance.displace(u)
+        assert (scene.fracture._evaluate._lanes is None) == (many > 1)
+        found.append((*map(np.copy, scene.fracture.evaluate()), scene.fracture.not_finite))
+    (ours, energy, crushed), (theirs, expected, count) = found
+    np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(energy, expected)
+    assert crushed == count > 0
 
 
 def test_what_is_no_number_is_told() -> None:

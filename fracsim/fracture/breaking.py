@@ -90,7 +90,7 @@ class Breaking:
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
         tensor = symmetric_components(cauchy_stress(energy, F, stress.R))
         both = ufl.as_vector([*tensor, energy.psi(F, stress.R)])  # one kernel: F is worked out once
-        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count)
+        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, often=True)
         self._memory: Damage | None = None
 
     @property
@@ -104,7 +104,7 @@ class Breaking:
         if not np.isfinite(values.sum()):  # a crushed cell: J = 0
             self.not_finite += int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
             np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        return np.ascontiguousarray(values[:, :-1]), values[:, -1]
+        return values[:, :-1], values[:, -1]
 
     def begin(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""

@@ -1,5 +1,6 @@
 /* What fracture.edge_stress does to cells. A cell has d + 1 corners of d coordinates, PAIRS edges in DOLFINx's order, the
-   broken ones of which are bits of its pattern, and as many components of a stress s. Sums are taken in the order of
+   broken ones of which are bits of its pattern, and as many components of a stress s, which is one after the other or
+   `stride` apart. Sums are taken in the order of
    arrays, to the last digit. */
 
 #include <math.h>
@@ -91,7 +92,8 @@ INLINE double share_of(int d, const double *s, const double *corners, const int3
 }
 
 INLINE int64_t lower_of(
-    int d, const Simplices *all, const Graph *graph, const double *s, double *chi, int64_t *found, double *lost)
+    int d, const Simplices *all, const Graph *graph, int64_t stride, const double *s, double *chi, int64_t *found,
+    double *lost)
 {
     int64_t many = 0;
     for (int64_t cell = 0; cell < all->count; cell++) {
@@ -99,7 +101,7 @@ INLINE int64_t lower_of(
         double corners[12], share = 0;
         if (!graph->split[cell]) {
             corners_of(d, all, cell, corners);
-            share = share_of(d, s + PAIRS(d) * cell, corners, graph->edges + PAIRS(d) * cell, graph->integrity);
+            share = share_of(d, s + stride * cell, corners, graph->edges + PAIRS(d) * cell, graph->integrity);
         }
         if (!(chi[cell] - share > 0)) continue;
         lost[many] = chi[cell] - share;
@@ -112,9 +114,11 @@ INLINE int64_t lower_of(
 /* s: (cells, PAIRS). chi (cells,) of damaged cells falls to what they carry, where that is less; returns how many it
    has, the first ones of `found`, and how much they `lost`. */
 int64_t lower(
-    int64_t d, const Simplices *all, const Graph *graph, const double *s, double *chi, int64_t *found, double *lost)
+    int64_t d, const Simplices *all, const Graph *graph, int64_t stride, const double *s, double *chi, int64_t *found,
+    double *lost)
 {
-    return d == 2 ? lower_of(2, all, graph, s, chi, found, lost) : lower_of(3, all, graph, s, chi, found, lost);
+    if (d == 2) return lower_of(2, all, graph, stride, s, chi, found, lost);
+    return lower_of(3, all, graph, stride, s, chi, found, lost);
 }
 
 /* Rows of the cofactors of the edges from corner 0, and their determinant. */
@@ -167,9 +171,10 @@ INLINE void carried_by(int d, const double *s, const double *corners, int patter
     }
 }
 
-INLINE void carried_of(int d, const Simplices *all, const Graph *graph, const double *s, double *found)
+INLINE void carried_of(
+    int d, const Simplices *all, const Graph *graph, int64_t stride, const double *s, double *found)
 {
-    for (int64_t cell = 0; cell < all->count; cell++, s += PAIRS(d), found += PAIRS(d)) {
+    for (int64_t cell = 0; cell < all->count; cell++, s += stride, found += PAIRS(d)) {
         bool damaged = graph->damaged[cell];
         for (int c = 0; c < PAIRS(d); c++) found[c] = damaged ? 0.0 : s[c];
         if (!damaged || graph->split[cell]) continue;
@@ -180,10 +185,11 @@ INLINE void carried_of(int d, const Simplices *all, const Graph *graph, const do
 }
 
 /* s, found: (cells, PAIRS), the latter what is left of s where broken edges and cells that have come apart carry none. */
-void carried(int64_t d, const Simplices *all, const Graph *graph, const double *s, double *found)
+void carried(
+    int64_t d, const Simplices *all, const Graph *graph, int64_t stride, const double *s, double *found)
 {
-    if (d == 2) carried_of(2, all, graph, s, found);
-    else carried_of(3, all, graph, s, found);
+    if (d == 2) carried_of(2, all, graph, stride, s, found);
+    else carried_of(3, all, graph, stride, s, found);
 }
 
 INLINE void pull_of(int d, int64_t count, const double *s, double *found)

@@ -113,8 +113,8 @@ class Simplices:
     def carried(self, components: Values, damage: Damage) -> Values:
         """(cells, 3 or 6) the part of s (cells, 3 or 6) that the intact edges of cells carry; zero in those that have
         come apart and in flat ones."""
-        s, found = np.ascontiguousarray(components), np.empty(components.shape)
-        _code().carried(c_int64(self.dim), self._all, _damage(damage), at(s), at(found))
+        found = np.empty(components.shape)
+        _code().carried(c_int64(self.dim), self._all, _damage(damage), *_rows(components), at(found))
         return found
 
     def lower(self, chi: Values, components: Values, damage: Damage) -> tuple[Ints, Values]:
@@ -124,9 +124,16 @@ class Simplices:
         Returns (n,) cells that lost anything, and how much.
         """
         cells, lost = np.empty(self._count, np.int64), np.empty(self._count)
-        given = at(np.ascontiguousarray(components)), at(chi), at(cells), at(lost)
+        given = *_rows(components), at(chi), at(cells), at(lost)
         many = _code().lower(c_int64(self.dim), self._all, _damage(damage), *given)
         return cells[:many], lost[:many]
+
+
+def _rows(values: Values) -> tuple[c_int64, c_void_p]:
+    """How far rows are apart that may be the first columns of a table, and where they begin."""
+    if values.strides[1] != values.itemsize:
+        values = np.ascontiguousarray(values)
+    return c_int64(values.strides[0] // values.itemsize), at(values)
 
 
 def _damage(of: Damage) -> Any:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import basix
 import basix.ufl
@@ -24,9 +24,12 @@ from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
 
 from ..mesh.compiled import machine_flags
-from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels
+from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels, source_of
 from ..mesh.domain import Domain
 from ..mesh.ranks import raise_together
+
+if TYPE_CHECKING:
+    from .lanes import ExpressionLanes
 
 keep_kernels()
 
@@ -43,6 +46,7 @@ PATIENCE = 60  # s that a process waits for a kernel that another one compiles; 
 
 
 MANY = 10_000  # dofs from which on it pays to compile a form once more, for 1 to 2 s, for several cells at a time
+MANY_CELLS = 5_000  # from which on it does for what is asked in every step: half a second, and a third of the time
 
 
 class OfLarge[Lanes]:
@@ -185,9 +189,11 @@ class CellExpression:
     """
 
     def __init__(
-        self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int, points: npt.NDArray[np.float64] | None = None
-    ) -> None:
-        """`points`: (count, d) of the reference cell; None: by the fields that the expression is made of."""
+        self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int, points: npt.NDArray[np.float64] | None = None,
+        *, often: bool = False,
+    ) -> None:  # fmt: skip
+        """`points`: (count, d) of the reference cell; None: by the fields that the expression is made of. `often`: it
+        is asked for in every step, so that compiling it once more may pay (collective)."""
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
@@ -198,6 +204,8 @@ class CellExpression:
             lambda: fem.Expression(labelled_anew(expression), points, comm=comm, jit_options=jit_options()),
         )
         self._all = np.arange(cells, dtype=np.int32)
+        pays = often and self.count == 1 and comm.allreduce(cells) >= MANY_CELLS
+        self._lanes = self._in_lanes() if pays else None
         self._values: npt.NDArray[np.float64] | None = None
 
     def __call__(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
@@ -210,8 +218,18 @@ class CellExpression:
         if cells is None:
             if self._values is None:
                 self._values = np.empty((len(self._all), self.count * self.width))
+            if self._lanes is not None:
+                self._lanes(self._all, self._values)
+                return self._values
             return evaluate(self._compiled, self.mesh, self._all, self._values)
         return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.count * self.width)))
+
+
+    def _in_lanes(self) -> ExpressionLanes | None:
+        from .lanes import ExpressionLanes
+
+        source = source_of(self._compiled, self.mesh, jit_options())
+        return ExpressionLanes.of(self._compiled, self.mesh, source)
 
 
 def point_expression(domain: Domain, expression: Expr) -> CellExpression:

@@ -1,6 +1,7 @@
 /* Cells of a form, LANES at a time (mechanics.lanes, which puts FFCx's kernel where it says so below).
 
-   RANK: 2 of a matrix, 1 of a vector.    NODES, D: nodes of a cell, dofs of a node.    CORNERS: points of a cell. */
+   RANK: 2 of a matrix, 1 of a vector, 0 of an expression.    NODES, D: nodes of a cell, dofs of a node; of an expression
+   its components, and 1.    CORNERS: points of a cell. */
 
 #include <math.h>
 #include <stdbool.h>
@@ -15,12 +16,34 @@ static inline void kernel(real* restrict A, const real* restrict w, const real* 
     const real* restrict coordinate_dofs)
 // kernel
 
-/* What a form is integrated over, and with: numbers (count, width) of its fields in cells, and constants. */
+/* A function in the cells of an expression: dofs (cells, nodes), and some numbers at each of them. */
+typedef struct {
+  const int32_t* dofs;
+  const double* values;
+} Field;
+
+/* What a form is integrated over, and with: numbers (count, width) of its fields in cells, and constants. An expression
+   has its fields instead. */
 typedef struct {
   int64_t count, width, size;
   const int32_t *cells, *dofs, *corners;
   const double *x, *w, *c;
+  const Field* fields;
 } Form;
+
+#if RANK == 0
+/* Numbers of a field in a cell, into one lane. */
+static inline double* taken(const Field* field, int nodes, int size, int64_t cell, double* lane)
+{
+  for (int node = 0; node < nodes; ++node)
+    for (int i = 0; i < size; ++i, lane += LANES)
+      *lane = field->values[size * (int64_t)field->dofs[nodes * cell + node] + i];
+  return lane;
+}
+
+#define TAKE(number, nodes, size) lane = taken(form->fields + number, nodes, size, cell, lane);
+static inline void look_up(const Form* form, int64_t cell, double* lane) { FIELDS }
+#endif
 
 /* A of LANES cells from the first on, the last of which may be one again; returns how many are not. */
 static inline int values(const Form* form, int64_t first, const real* constants, real* numbers, real* A)
@@ -30,7 +53,11 @@ static inline int values(const Form* form, int64_t first, const real* constants,
   for (int lane = 0; lane < LANES; ++lane)
   {
     const int64_t at = first + (lane < left ? lane : 0);
+#if RANK == 0
+    look_up(form, form->cells[at], (double*)numbers + lane);
+#else
     for (int i = 0; i < form->width; ++i) numbers[i][lane] = form->w[form->width * at + i];
+#endif
     const int32_t* cell = form->corners + (int64_t)CORNERS * form->cells[at];
     for (int i = 0; i < CORNERS; ++i)
       for (int axis = 0; axis < 3; ++axis) points[3 * i + axis][lane] = form->x[3 * (int64_t)cell[i] + axis];
@@ -40,7 +67,20 @@ static inline int values(const Form* form, int64_t first, const real* constants,
   return left;
 }
 
-#if RANK == 1
+#if RANK == 0
+/* What the expression is in each cell, b: (count, SIZE). */
+void fill(const Form* form, double* b)
+{
+  real constants[form->size + 1], numbers[form->width + 1], A[SIZE];
+  for (int i = 0; i < form->size; ++i) constants[i] = zero + form->c[i];
+  for (int64_t first = 0; first < form->count; first += LANES)
+  {
+    const int left = values(form, first, constants, numbers, A);
+    for (int lane = 0; lane < left; ++lane)
+      for (int i = 0; i < SIZE; ++i) b[SIZE * (first + lane) + i] = A[i][lane];
+  }
+}
+#elif RANK == 1
 /* Add to b what cells give. */
 void add(const Form* form, double* b)
 {

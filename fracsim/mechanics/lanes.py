@@ -1,4 +1,4 @@
-"""Forms of several cells at a time: FFCx's kernel with numbers of LANES lanes, and adding what it makes (lanes.c).
+"""Forms and expressions of several cells at a time: FFCx's kernel with numbers of LANES lanes, and adding what it makes (lanes.c).
 
 FFCx writes C for one cell, and the tangent of a hyperelastic tetrahedron is 2,000 products and sums of scalars, of
 which a processor does one at a time; DOLFINx then looks up the place of each of 16 blocks. Here the same C is compiled
@@ -10,16 +10,19 @@ DOLFINx's work.
 from __future__ import annotations
 
 import re
-from ctypes import CDLL, Structure, byref, c_int64, c_void_p
+from collections.abc import Mapping
+from ctypes import CDLL, Structure, byref, c_int64, c_void_p, cast
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem, la
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
 
 from ..mesh.compiled import address, at, built_together
-from ..mesh.dolfinx_calls import cells_of, identity_rows, integrals, nodes_of_cells, packed
+from ..mesh.dolfinx_calls import cells_of, constants_of, fields_of, identity_rows, integrals, nodes_of_cells, packed
 
 Values = npt.NDArray[np.float64]
 
@@ -30,6 +33,10 @@ _LANE_BY_LANE = """
 static inline real lanes_{0}(real x) {{ for (int i = 0; i < LANES; ++i) x[i] = {0}(x[i]); return x; }}
 #define {0} lanes_{0}
 """
+_POWERS = """ // by a number
+static inline real lanes_pow(real x, double n) { for (int i = 0; i < LANES; ++i) x[i] = pow(x[i], n); return x; }
+#define pow lanes_pow
+"""
 
 
 class _Form(Structure):
@@ -38,7 +45,14 @@ class _Form(Structure):
     _fields_ = (
         *((name, c_int64) for name in ("count", "width", "size")),
         *((name, c_void_p) for name in ("cells", "dofs", "corners", "x", "w", "c")),
+        ("fields", c_void_p),
     )  # fmt: skip
+
+
+class _Field(Structure):
+    """The same."""
+
+    _fields_ = (("dofs", c_void_p), ("values", c_void_p))
 
 
 class Lanes:
@@ -100,6 +114,40 @@ class MatrixLanes(Lanes):
         identity_rows(matrix, self._form, bcs)
 
 
+class ExpressionLanes:
+    """An expression, at a point of each cell."""
+
+    @classmethod
+    def of(cls, expression: fem.Expression, mesh: Mesh, source: Path) -> Self | None:
+        """That of FFCx's kernel in `source`, where it can be done (collective)."""
+        kernel = in_lanes(source.read_text())
+        if kernel is None:
+            return None
+        maps = [field.function_space.dofmap for field in fields_of(expression)]
+        takes = (f"TAKE({number},{each.list.shape[1]},{each.bs})" for number, each in enumerate(maps))
+        sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
+        code = _built(mesh.comm, kernel, sizes | {"FIELDS": "".join(takes)}, "-O3")
+        return None if code is None else cls(expression, mesh, code)
+
+    def __init__(self, expression: fem.Expression, mesh: Mesh, code: CDLL) -> None:
+        """`code`: what `of` has made of the expression."""
+        self._expression, self._geometry, self._code = expression, mesh.geometry, code
+        fields = fields_of(expression)
+        self._kept = [(address(field.function_space.dofmap.list), address(field.x.array)) for field in fields]
+        self._fields = (_Field * len(fields))(*(_Field(*each) for each in self._kept))
+        self._width = sum(each.dofmap.list.shape[1] * each.dofmap.bs for each in (f.function_space for f in fields))
+
+    def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
+        """Fill values (cells, components) with those of cells."""
+        c = constants_of(self._expression)
+        of_mesh = address(self._geometry.dofmap), address(self._geometry.x)
+        form = _Form(
+            len(cells), self._width, len(c), address(cells), None, *of_mesh, None, address(c),
+            cast(self._fields, c_void_p),
+        )  # fmt: skip
+        self._code.fill(byref(form), at(values))
+
+
 # --- compiling ------------------------------------------------------------------------------------------------------
 
 
@@ -116,20 +164,24 @@ def compiled(form: fem.Form) -> CDLL | None:
     kernel = in_lanes(source.with_name(source.name.split(".")[0] + ".c").read_text())
     if kernel is None:
         return None
-    functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS)
+    return _built(form.mesh.comm, kernel, sizes)
+
+
+def _built(comm: MPI.Comm, kernel: str, sizes: Mapping[str, int | str], *more: str) -> CDLL | None:
+    """lanes.c around a kernel, with `more` flags (collective)."""
+    functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
     text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
-    return built_together(
-        form.mesh.comm, "lanes", text, [*_FLAGS, *(f"-D{name}={value}" for name, value in sizes.items())]
-    )
+    return built_together(comm, "lanes", text, [*_FLAGS, *more, *(f"-D{name}={value}" for name, value in sizes.items())])
 
 
 def in_lanes(source: str) -> str | None:
     """The body of the only kernel in FFCx's C, for numbers with lanes; None where it does what those cannot."""
     _, *kernels = source.split("\nvoid tabulate_tensor_")
-    if len(kernels) != 1 or "{" not in kernels[0] or "\nufcx_integral " not in kernels[0]:
+    end = re.search(r"\n(ufcx_integral|bool enabled_|static double points_)", kernels[0]) if len(kernels) == 1 else None
+    if end is None or "{" not in kernels[0]:
         return None
-    body = kernels[0][kernels[0].index("{") : kernels[0].index("\nufcx_integral ")].split("\nbool enabled_")[0]
-    called = set(re.findall(r"\b([A-Za-z_]\w*) *\(", re.sub(r"//.*", "", body)))
+    body = kernels[0][kernels[0].index("{") : end.start()]
+    called = set(re.findall(r"\b([A-Za-z_]\w*) *\(", re.sub(r"//.*|\bpow\(\w+, \d+\)", "", body)))
     if "?" in body or not called <= {"for", *FUNCTIONS}:
         return None
     return "\n".join(_line_in_lanes(line) for line in body.split("\n"))

@@ -15,7 +15,7 @@ after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is g
 any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
             keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
-Nothing was found of the others: packed, cells_of, integrals, nodes_of_cells, identity_rows, assemble_into,
+Nothing was found of the others: packed, cells_of, integrals, nodes_of_cells, identity_rows, assemble_into, source_of, fields_of, constants_of,
 apply_lifting, expanded_csr, create_matrix. What FFCx writes is read by mechanics.lanes.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import basix.ufl
@@ -40,6 +41,7 @@ from dolfinx.io import distribute_entity_data
 from ffcx.codegeneration import jit
 from mpi4py import MPI
 from petsc4py import PETSc
+from ufl.algorithms import extract_coefficients
 
 Ints = npt.NDArray[np.int32]
 
@@ -130,6 +132,27 @@ def evaluate(
 ) -> npt.NDArray[np.float64]:
     """Evaluate an expression in cells into `values` (cells, points times components); returns them."""
     return expression.eval(mesh, cells, values)
+
+
+def source_of(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict[str, Any]) -> Path:
+    """The C that FFCx has written for an expression, compiled with `options` before (collective)."""
+    kernel = expression.ufl_expression, expression.X()
+    scalar = {"scalar_type": expression.dtype}
+    _, module, _ = dolfinx.jit.ffcx_jit(mesh.comm, kernel, form_compiler_options=scalar, jit_options=options)
+    made = Path(str(module.__file__))
+    return made.with_name(made.name.split(".")[0] + ".c")
+
+
+def fields_of(expression: fem.Expression) -> list[fem.Function]:
+    """The functions that the kernel of an expression is given, in that order."""
+    fields, kernel = extract_coefficients(expression.ufl_expression), expression.ufcx_expression
+    return [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
+
+
+def constants_of(expression: fem.Expression) -> npt.NDArray[np.float64]:
+    """The constants that it is given."""
+    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(expression._cpp_object)
+    return constants
 
 
 def packed(form: fem.Form) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
