@@ -224,7 +224,6 @@ class CellExpression:
             return evaluate(self._compiled, self.mesh, self._all, self._values)
         return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.count * self.width)))
 
-
     def _in_lanes(self) -> ExpressionLanes | None:
         from .lanes import ExpressionLanes
 

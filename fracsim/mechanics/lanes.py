@@ -1,4 +1,5 @@
-"""Forms and expressions of several cells at a time: FFCx's kernel with numbers of LANES lanes, and adding what it makes (lanes.c).
+"""Forms and expressions of several cells at a time: FFCx's kernel with numbers of LANES lanes, and what becomes of what
+it makes (lanes.c).
 
 FFCx writes C for one cell, and the tangent of a hyperelastic tetrahedron is 2,000 products and sums of scalars, of
 which a processor does one at a time; DOLFINx then looks up the place of each of 16 blocks. Here the same C is compiled
@@ -171,7 +172,8 @@ def _built(comm: MPI.Comm, kernel: str, sizes: Mapping[str, int | str], *more: s
     """lanes.c around a kernel, with `more` flags (collective)."""
     functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
     text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
-    return built_together(comm, "lanes", text, [*_FLAGS, *more, *(f"-D{name}={value}" for name, value in sizes.items())])
+    defined = [f"-D{name}={value}" for name, value in sizes.items()]
+    return built_together(comm, "lanes", text, [*_FLAGS, *more, *defined])
 
 
 def in_lanes(source: str) -> str | None:
