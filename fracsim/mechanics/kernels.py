@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,16 +103,6 @@ class CellForm(fem.Form):
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
         self._dead = dead
-
-    @contextmanager
-    def only(self, chosen: npt.NDArray[np.bool_]) -> Iterator[None]:
-        """Integrate over the cells of the measure that are flagged, for as long as it lasts (not collective)."""
-        kept, dead, self._dead = self._bound, self._dead, None
-        try:
-            self._bound = self._over(chosen)
-            yield
-        finally:
-            self._bound, self._dead = kept, dead
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
         return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 import basix
@@ -23,6 +24,7 @@ from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.simplices import local_edges
+from .few_cells import FewCells, address
 from .kernels import CellForm, cells_measure, compile_form
 from .material import MaterialFields
 from .rotation import RotationField
@@ -248,11 +250,14 @@ class Stress(Term):
         for field, was in zip(self.fields, before, strict=True):
             for differs in (field.x.array != was).reshape(-1, field.function_space.dofmap.bs).T:  # rows are short
                 lower |= differs[: len(lower)]
-        with self._alone.only(lower):
-            now = self.exchange(before)
-            lost = self.force()
-            self.exchange(now)
-            return lost - self.force()
+        cells = np.flatnonzero(lower)
+        then = {address(field.x.array): was for field, was in zip(self.fields, before, strict=True)}
+        lost = self._assembler.added(lambda sums: self._few.add(cells, sums, then))
+        return lost - self._assembler.added(lambda sums: self._few.add(cells, sums, {}))
+
+    @cached_property
+    def _few(self) -> FewCells:
+        return FewCells(self._alone)
 
     def damage_changed(self) -> None:
         """Cells without stress are not integrated from here on: they would add zeros for ever."""

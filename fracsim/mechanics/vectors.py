@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,13 @@ class Assembler:
     def __call__(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled form (collective)."""
         return self.into(self._kept, form).array_r.copy()
+
+    def added(self, add: Callable[[Values], None]) -> Values:
+        """(owned dofs,) sums of what `add` adds to the dofs of each rank, ghosts included (collective)."""
+        with self._kept.localForm() as local:
+            local.set(0.0)
+            add(local.array_w)
+        return self.summed(self._kept).array_r.copy()
 
     def into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
         """Assemble into b, which loses what it held (collective)."""

@@ -23,6 +23,7 @@ identity_rows, assemble_into, apply_lifting, expanded_csr, create_matrix. What F
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -160,6 +161,34 @@ def packed(form: fem.Form) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
     compiled: Any = form._cpp_object
     (fields,) = dolfinx.cpp.fem.pack_coefficients(compiled).values()
     return fields, dolfinx.cpp.fem.pack_constants(compiled)
+
+
+@dataclass(frozen=True)
+class FormField:
+    """A function that the kernel of a form is given: `size` numbers at each of the dofs (cells, nodes) of a cell."""
+
+    dofs: Ints
+    size: int
+    values: npt.NDArray[np.float64]
+
+
+def form_fields(form: fem.Form) -> list[FormField]:
+    """All of a form, in the order of its kernel."""
+    compiled: Any = form._cpp_object
+    maps = ((each, each.function_space.dofmap) for each in compiled.coefficients)
+    return [FormField(np.asarray(dofmap.map()), dofmap.bs, each.x.array) for each, dofmap in maps]
+
+
+def kernel_of(form: fem.Form) -> int:
+    """The address of the kernel of a form with one integral, over cells."""
+    module: Any = form.module
+    return int(module.ffi.cast("uintptr_t", form.ufcx_form.form_integrals[0].tabulate_tensor_float64))
+
+
+def packed_constants(form: fem.Form) -> npt.NDArray[np.float64]:
+    """The constants of a form."""
+    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(form._cpp_object)
+    return constants
 
 
 def cells_of(form: fem.Form) -> Ints:

@@ -41,14 +41,18 @@ def released_state(
     if not balance.scheme.carries_acceleration:
         forces[own] += balance.reactions[own] - reactions
         return replace(end, forces=forces)
-    balance.displace(solved)
-    lost = balance.stress.force_lost(before)
-    now = balance.stress.exchange(before)
-    if any(term.keeps_apart for term in balance.terms):
-        balance.displace(end.u)  # gaps are open at the step's end, and need not be where forces balance
-    free = np.where(balance.motion.free, lost, 0.0)
-    change = balance.mass.solve(free, balance.motion.free) if response is None else balance.c_a * response(free)
-    balance.stress.exchange(now)
-    balance.displace(end.u)
+    free = balance.motion.free
+    if response is None:  # forces balance at the end of the step, where the body is
+        lost = balance.stress.force_lost(before)
+        change = balance.mass.solve(np.where(free, lost, 0.0), free)
+    else:
+        balance.displace(solved)
+        lost = balance.stress.force_lost(before)
+        now = balance.stress.exchange(before)
+        if any(term.keeps_apart for term in balance.terms):
+            balance.displace(end.u)  # gaps are open at the step's end, and need not be where forces balance
+        change = balance.c_a * response(np.where(free, lost, 0.0))
+        balance.stress.exchange(now)
+        balance.displace(end.u)
     forces[own] -= lost[own]
     return replace(end, forces=forces, a=end.a + change)

@@ -1,0 +1,73 @@
+"""A linear form in a few cells, with fields as they are or as they were: what breaks in a step frees forces there.
+
+To bind a form to other cells, and to put the fields of before into it, takes DOLFINx longer than a hundred cells do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from ctypes import Structure, byref, c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ..mesh.compiled import at, library
+from ..mesh.dolfinx_calls import form_fields, kernel_of, nodes_of_cells, packed_constants
+
+Values = npt.NDArray[np.float64]
+SOURCE = Path(__file__).with_suffix(".c")
+
+
+class _Field(Structure):
+    """As few_cells.c has it."""
+
+    _fields_ = (("nodes", c_int64), ("size", c_int64), ("dofs", c_void_p), ("values", c_void_p))
+
+
+class _Form(Structure):
+    """The same."""
+
+    _fields_ = (
+        ("kernel", c_void_p),
+        *((name, c_int64) for name in ("nodes", "size", "corners", "fields", "width")),
+        *((name, c_void_p) for name in ("dofs", "points", "x", "constants")),
+    )
+
+
+class FewCells:
+    """A form with one integral, over cells."""
+
+    def __init__(self, form: fem.Form) -> None:
+        self._form, self._fields = form, form_fields(form)
+        nodes, geometry, size = nodes_of_cells(form), form.mesh.geometry, form.function_spaces[0].dofmap.index_map_bs
+        self._constants = packed_constants(form)
+        self._kept = at(nodes), at(geometry.dofmap), at(geometry.x), at(self._constants)
+        width = sum(field.dofs.shape[1] * field.size for field in self._fields)
+        sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
+        self._given = _Form(kernel_of(form), *sizes, *self._kept)
+
+    def add(self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values]) -> None:
+        """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
+        place of those that begin at an address."""
+        self._constants[:] = packed_constants(self._form)
+        arrays = [instead.get(address(field.values), field.values) for field in self._fields]
+        fields = (_Field * (len(arrays) + 1))(
+            *(_Field(field.dofs.shape[1], field.size, at(field.dofs), at(array))
+              for field, array in zip(self._fields, arrays, strict=True))
+        )  # fmt: skip
+        _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
+
+
+def address(values: npt.NDArray[Any]) -> int:
+    """Where an array begins."""
+    place: int = values.__array_interface__["data"][0]
+    return place
+
+
+@cache
+def _code() -> Any:
+    return library(SOURCE)
