@@ -75,13 +75,15 @@ def bent_its(size: tuple[float, ...], h: float, given: dict[str, Any]) -> int:
 
 
 def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a large body that is slow to solve for, and once, at every set-up: at most half as many iterations more, for
-    two products less in five. Others, a small one and one in pieces keep what they have."""
+    """Of a large body that is slow to solve for, to whose tangent terms add single entries, and once, at every set-up:
+    at most half as many iterations more, for two products less in five. Others, a small one and one in pieces keep what
+    they have."""
     monkeypatch.setattr(preconditioner, "SLOW", 5)
     monkeypatch.setattr(preconditioner, "WORTH_IT", 10.0)
     scene, by_entries = shattered(0.025, 0, {}, 3)
     assert set(smoothers(scene)) == {("jacobi", 2)}
     monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
     scene, by_nodes = shattered(0.025, 0, {}, 3)
     assert by_nodes[-1] <= 1.5 * by_entries[-1]
     solver = scene.solver
@@ -179,8 +181,9 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
         monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
-    assert isinstance(solver, Solver) and solver.linear._blocks is not None and solver.linear._blocks.first is first
-    pc = solver.snes.ksp.pc
+    assert isinstance(solver, Solver) and solver.linear._blocks is not None
+    assert (solver.linear._blocks.assembled is not None) is first
+    pc = solver.linear.preconditioner.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
     tangent = scene.balance.stiffness.matrix
     x, alone = tangent.createVecs()

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.compiled import at, library
+from ..mesh.compiled import address, at, library
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
@@ -93,7 +93,7 @@ class Simplices:
     def __init__(self, nodes: npt.NDArray[np.int32], rest: Values, moved: Values | None = None) -> None:
         """(cells, d + 1) `nodes` at `rest` (nodes, d), m, and by how much these have `moved` from there."""
         self.dim, self._count = rest.shape[1], len(nodes)
-        self._kept = at(nodes), at(rest), None if moved is None else at(moved)
+        self._kept = address(nodes), address(rest), None if moved is None else address(moved)
         self._all = byref(_Given(len(nodes), *self._kept))
 
     @classmethod
@@ -129,7 +129,7 @@ class Simplices:
         return cells[:many], lost[:many]
 
 
-def _rows(values: Values) -> tuple[c_int64, c_void_p]:
+def _rows(values: Values) -> tuple[c_int64, Any]:
     """How far rows are apart that may be the first columns of a table, and where they begin."""
     if values.strides[1] != values.itemsize:
         values = np.ascontiguousarray(values)
@@ -138,8 +138,8 @@ def _rows(values: Values) -> tuple[c_int64, c_void_p]:
 
 def _damage(of: Damage) -> Any:
     """Damage as C has it: its arrays live as long as they do in Python."""
-    of_cells = at(of.pattern), at(of.damaged), at(of.split)
-    return byref(_Damage(at(of.cell_edges), at(of.integrity), *of_cells))
+    arrays: tuple[npt.NDArray[Any], ...] = of.cell_edges, of.integrity, of.pattern, of.damaged, of.split
+    return byref(_Damage(*map(address, arrays)))
 
 
 @cache

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from ..mesh.compiled import at, library
+from ..mesh.compiled import address, at, library
 from ..mesh.dolfinx_calls import form_fields, kernel_of, nodes_of_cells, packed_constants
 
 Values = npt.NDArray[np.float64]
@@ -45,7 +45,7 @@ class FewCells:
         self._form, self._fields = form, form_fields(form)
         nodes, geometry, size = nodes_of_cells(form), form.mesh.geometry, form.function_spaces[0].dofmap.index_map_bs
         self._constants = packed_constants(form)
-        self._kept = at(nodes), at(geometry.dofmap), at(geometry.x), at(self._constants)
+        self._kept = [address(each) for each in (nodes, geometry.dofmap, geometry.x, self._constants)]
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
         sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
         self._given = _Form(kernel_of(form), *sizes, *self._kept)
@@ -54,15 +54,15 @@ class FewCells:
         """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
         place of those that begin at an address."""
         self._constants[:] = packed_constants(self._form)
-        arrays = [instead.get(address(field.values), field.values) for field in self._fields]
+        arrays = [instead.get(begin(field.values), field.values) for field in self._fields]
         fields = (_Field * (len(arrays) + 1))(
-            *(_Field(field.dofs.shape[1], field.size, at(field.dofs), at(array))
+            *(_Field(field.dofs.shape[1], field.size, address(field.dofs), address(array))
               for field, array in zip(self._fields, arrays, strict=True))
         )  # fmt: skip
         _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
 
 
-def address(values: npt.NDArray[Any]) -> int:
+def begin(values: npt.NDArray[Any]) -> int:
     """Where an array begins."""
     place: int = values.__array_interface__["data"][0]
     return place

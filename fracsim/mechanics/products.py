@@ -18,11 +18,15 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 
 class Products:
-    """Those with a square matrix, owned rows of which are complete."""
+    """Those with a square matrix, owned rows of which are complete.
+
+    Attributes:
+        matrix: what is multiplied with.
+    """
 
     def __init__(self, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: what `compiled` gives for the size of its blocks."""
-        self._matrix, self._code = matrix, code
+        self.matrix, self._code = matrix, code
         columns = matrix.index_map(1)
         self._rows = matrix.index_map(0).size_local
         self._everywhere = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
@@ -38,7 +42,7 @@ class Products:
             self._multiply(local, y)
 
     def _multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        matrix = self._matrix
+        matrix = self.matrix
         arrays = matrix.indptr, matrix.indices, matrix.data, x.array_r, y.array_w
         self._code.multiply(c_int64(self._rows), *map(at, arrays))
 

@@ -25,20 +25,18 @@ class Blocks:
 
     Attributes:
         tangent: the matrix of single entries that it is a copy of.
-        first: whether blocks are assembled first.
+        assembled: products with the blocks, where they are assembled first.
     """
 
     def __init__(self, tangent: PETSc.Mat, assembled: Products | None) -> None:
-        """`assembled`: products with the blocks, where they are assembled first."""
         self.tangent = tangent
-        self.first = assembled is not None
-        self._assembled = assembled
+        self.assembled = assembled
         self._copy: PETSc.Mat | None = None
         self._entries, self._state = 0.0, -1
 
     def follow(self) -> None:
         """Be the tangent as it is now (collective)."""
-        if self.first or self._state == (state := self.tangent.stateGet()):
+        if self.assembled is not None or self._state == (state := self.tangent.stateGet()):
             return
         entries = self.tangent.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
         if self._copy is not None and entries != self._entries:  # it has entries at more places
@@ -48,7 +46,7 @@ class Blocks:
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
-        by = self._assembled or self._copy
+        by = self.assembled or self._copy
         assert by is not None
         by.mult(x, y)
 

@@ -24,6 +24,7 @@ from .preconditioner import MULTIGRID, Due, Preconditioner
 from .rigid_modes import rigid_modes
 
 if TYPE_CHECKING:
+    from .cycle import Cycle
     from .loose_parts import LooseParts
 
 Values = npt.NDArray[np.float64]
@@ -76,13 +77,14 @@ class Linear:
         self.correction = balance.vector.duplicate()
         self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
         self._by_blocks = chosen["pc_type"] == "gamg"
+        self._may_hasten = _is_own(given)
         self._take_tangent()
         refusing(ksp.setFromOptions)
         options.check(given, self._set_up_at_rest)
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
-            large=self._blocks is not None, loosen=self._loosen,
+            large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
             bring=self.stiffness.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
@@ -188,6 +190,13 @@ class Linear:
 
         return loose_parts(self.balance, body)
 
+    def _hasten(self, body: PETSc.PC) -> Cycle | None:
+        if not self._may_hasten or self._blocks is None or (assembled := self._blocks.assembled) is None:
+            return None
+        from .cycle import in_single
+
+        return in_single(body, assembled)
+
     @contextmanager
     def set_up_anew(self) -> Iterator[None]:
         """With a preconditioner that is made anew at every tangent."""
@@ -259,7 +268,7 @@ class Linear:
     def destroy(self) -> None:
         """Give back PETSc's objects."""
         self.factors.forget()
-        self.preconditioner.forget_parts()
+        self.preconditioner.forget()
         self.correction.destroy()
         if self._ending is not None:
             self._ending.destroy()
@@ -292,8 +301,12 @@ def _forcing(balance: Balance, chosen: Options) -> Forcing | Sparing | None:
 
 def _may_change(balance: Balance, given: Options) -> bool:
     """Whether multigrid of another kind may take over: nobody asked for this one, and inertia holds what hangs."""
-    own = not any(key.startswith(("pc_", "mg_")) for key in given)
-    return own and balance.scheme.inertia
+    return _is_own(given) and balance.scheme.inertia
+
+
+def _is_own(given: Options) -> bool:
+    """Whether multigrid is of the program's own choice."""
+    return not any(key.startswith(("pc_", "mg_")) for key in given)
 
 
 def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:

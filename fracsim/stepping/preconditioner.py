@@ -15,11 +15,11 @@ planes), a step in 0.85 of the time; after 100 planes 0.7.
 A whole body that is slow to solve for is thin, or all but incompressible. Aggregates are made anew of the stronger
 links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahedra) takes 38 iterations where it took
 77, and a fresh set-up costs the same. A compact body gains nothing (9 for 9), and its set-up would cost up to half as
-much again. Where it is large, too, its finest level is smoothed by one step with the inverse of each node's block
-instead of two with the diagonal, as products with that level are the larger part of a solve: the sheet takes as many
-iterations for a force at random (25), 31 to 37 for 27 to 30 in its steps, each of three products instead of five. A
-compact one would take 12 or 13 for 9 or 10, in as long. On coarser levels such blocks may be singular, of aggregates of
-a node or two.
+much again. Where it is large, too, and its levels are not copied in single precision (cycle), its finest one is
+smoothed by one step with the inverse of each node's block instead of two with the diagonal, as products with that level
+are the larger part of a solve: the sheet takes as many iterations for a force at random (25), 31 to 37 for 27 to 30 in
+its steps, each of three products instead of five. A compact one would take 12 or 13 for 9 or 10, in as long. On coarser
+levels such blocks may be singular, of aggregates of a node or two.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from petsc4py import PETSc
 from .petsc_options import Options, OptionSet
 
 if TYPE_CHECKING:
+    from .cycle import Cycle
     from .loose_parts import LooseParts
 
 MULTIGRID: Options = {
@@ -91,15 +92,19 @@ class Preconditioner:
         may_change: bool,
         large: bool,
         loosen: Loosen,
+        hasten: Callable[[PETSc.PC], Cycle | None],
         bring: Callable[[], None],
         nodes: int,
     ) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
-        that sees to loose parts out of `pc`, None where that would be no use; `large`: whether products are the larger
-        part of its work; `bring`: brings the entries of the tangent to what they are; `nodes`: of the body."""
+        that sees to loose parts out of `pc`, None where that would be no use; `hasten`: what does the same in less
+        time, None where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the
+        entries of the tangent to what they are; `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
         self.serving, self._loosen, self._bring, self._nodes = self.pc, loosen, bring, nodes
         self._loose: LooseParts | None = None
+        self._hasten = hasten
+        self._cycle: Cycle | None = None
         self._sees_to_parts = False
         self._broke = self._extra = 0  # edges and iterations since it was set up
         self.due, self.keep = Due.REBUILD, keep
@@ -131,17 +136,19 @@ class Preconditioner:
             self.pc.reset()
             self._fresh_its = 0
         self._bring()
+        self._forget_cycle()
         ksp.setPC(self.pc)
         self.pc.setReusePreconditioner(False)
         self.pc.setUseAmat(products is not None)
         ksp.setOperators(products or tangent, tangent)
         ksp.setUp()
-        if self._by_nodes and self.pc.getType() == "gamg":
+        self._cycle = self._hasten(self.pc)
+        if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
             self._smooth_by_nodes()
         self.due, self._broke, self._extra = Due.NOTHING, 0, 0
         if self._sees_to_parts:
             self.forget_parts()
-            self._loose = self._loosen(self.pc)
+            self._loose = self._loosen(self._body)
         self._follow(tangent, products)
 
     def _smooth_by_nodes(self) -> None:
@@ -156,13 +163,31 @@ class Preconditioner:
 
     def _follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None) -> None:
         """What serves is brought to a tangent that is solved with next."""
-        self.serving, loose = self.pc, self._loose
-        if loose is None or loose.body is not self.pc:
+        self.serving, loose = self._body, self._loose
+        if self._cycle is not None and self.serving is self._cycle.pc:
+            self._cycle.follow()
+        if loose is None or loose.body is not self.serving:
             return
         self._bring()
         if loose.follow(tangent, products):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
+
+    @property
+    def _body(self) -> PETSc.PC:
+        """That of the body alone, in single precision where there is such a one."""
+        cycle = self._cycle
+        return self.pc if cycle is None or cycle.body is not self.pc else cycle.pc
+
+    def forget(self) -> None:
+        """Give the memory of what was made of `pc` back."""
+        self.forget_parts()
+        self._forget_cycle()
+
+    def _forget_cycle(self) -> None:
+        if self._cycle is not None:
+            self._cycle.forget()
+            self._cycle = None
 
     def forget_parts(self) -> None:
         """Give the memory of loose parts back."""

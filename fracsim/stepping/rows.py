@@ -1,0 +1,96 @@
+"""Rows of blocks in single precision, and vectors for products with them."""
+
+from __future__ import annotations
+
+from ctypes import CDLL, c_float, c_int64
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import la
+from dolfinx.common import IndexMap
+from mpi4py import MPI
+
+from ..mesh.compiled import FASTER, at, built_together
+
+Single = npt.NDArray[np.float32]
+Values = npt.NDArray[np.float64]
+
+SOURCE = Path(__file__).with_suffix(".c")
+BEHIND = 8  # numbers behind the last block, which are read and made nothing of
+
+
+@dataclass(frozen=True)
+class Code:
+    """What is compiled for a size of blocks.
+
+    Attributes:
+        size: numbers of a block.
+    """
+
+    functions: CDLL
+    size: int
+
+
+class Vector:
+    """Numbers of this rank, those of ghosts behind them.
+
+    Attributes:
+        array: all of them.    place: where they begin.
+    """
+
+    def __init__(self, nodes: IndexMap, size: int) -> None:
+        """`size`: numbers of a node."""
+        self._vector = la.vector(nodes, size, np.float32)
+        self.array: Single = self._vector.array
+        self.place = at(self.array)
+        self._alone = nodes.comm.size == 1
+
+    def fetch(self) -> None:
+        """Those of ghosts become their owners' (collective)."""
+        if not self._alone:
+            self._vector.scatter_forward()
+
+    def give_back(self) -> None:
+        """Those of ghosts are added to their owners' (collective)."""
+        if not self._alone:
+            self._vector.scatter_reverse(la.InsertMode.add)
+
+
+class Rows:
+    """Rows of this rank. Vectors to be multiplied with have their ghosts."""
+
+    def __init__(self, made: Code, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
+        """`starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
+        self._code, self._blocks = made.functions, np.zeros(int(starts[-1]) * made.size + BEHIND, np.float32)
+        self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
+        self._all = *self._pattern, at(self._blocks)
+
+    def take(self, blocks: Values, left: Values, right: Values) -> None:
+        """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
+        self._code.scale(*self._pattern, at(blocks), at(left), at(right), at(self._blocks))
+
+    def residual(self, b: Vector, x: Vector, left: Vector) -> None:
+        """left = b - A x."""
+        self._code.residual(*self._all, b.place, x.place, left.place)
+
+    def smooth(self, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
+        """d = keep d + take (b - A x), to = x + d."""
+        self._code.smooth(*self._all, c_float(keep), c_float(take), b.place, x.place, d.place, to.place)
+
+    def add(self, x: Vector, y: Vector) -> None:
+        """y += A x."""
+        self._code.add(*self._all, x.place, y.place)
+
+    def add_transposed(self, x: Vector, y: Vector) -> None:
+        """y += A^T x, ghosts of y included."""
+        self._code.add_transposed(*self._all, x.place, y.place)
+
+
+def code(comm: MPI.Comm, rows: int, columns: int) -> Code | None:
+    """For blocks of that size; None without a compiler (collective)."""
+    lanes = next(n for n in (2, 4, 8) if n >= rows)
+    sizes = [f"-DR={rows}", f"-DC={columns}", f"-DLANES={lanes}"]
+    functions = built_together(comm, "rows", SOURCE.read_text(), [*FASTER, *sizes])
+    return None if functions is None else Code(functions, rows * columns)

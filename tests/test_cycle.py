@@ -1,0 +1,128 @@
+"""Multigrid's cycle in single precision, against matrices written out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from cases import BAR, study
+from fracsim.scene import Scene, build_scene
+from fracsim.stepping import blocks, cycle
+from fracsim.stepping.linear import Linear
+from fracsim.stepping.preconditioner import Due
+from support.scenes import Walk
+
+Values = npt.NDArray[np.float64]
+
+
+def bar(dim: int, given: dict[str, Any]) -> Scene:
+    """A bar of soft neo-Hookean stuff that is pulled, of some hundred nodes."""
+    fine = {2: {"size": [0.6, 0.2], "h": 0.02}, 3: {"size": [0.6, 0.2, 0.2], "h": 0.05}}[dim]
+    data = study(
+        BAR,
+        mesh=fine,
+        material={"energy": "neo-hookean", "young": 1e6, "poisson": 0.4, "density": 1000.0},
+        fracture={"strength": 1e12},
+        time={"end": 1.0, "scheme": "backward-euler", "step": 5e-3},
+        boundary=[{"on": "left", "fix": "xyz"[:dim]}, {"on": "right", "velocity": [4.0, *[0.0] * (dim - 1)]}],
+        solver={"snes_type": "ksponly"} | given,
+    )
+    return build_scene(MPI.COMM_SELF, data)
+
+
+def linear_of(scene: Scene) -> Linear:
+    return scene.solver.linear  # type: ignore[union-attr]
+
+
+def written_out(apply: Any, like: PETSc.Vec) -> Values:
+    """The matrix of what `apply` does to a vector."""
+    x, y, columns = like.duplicate(), like.duplicate(), []
+    for column in range(like.getSize()):
+        x.zeroEntries()
+        x.array_w[column] = 1.0
+        apply(x, y)
+        columns.append(y.array_r.copy())
+    return np.array(columns).T
+
+
+def by_hand(A: list[Values], P: list[Values], scales: list[Values], largest: list[float]) -> Values:
+    """M of the finest level in double precision, p by Chebyshev's polynomial of eigenvalues: r after two steps is
+    T_2((m - l) / h) / T_2(m / h) of r before, T_2(t) = 2 t^2 - 1; the coarsest matrix is inverted."""
+    M = np.linalg.inv(A[0])
+    for here, between, S, most in zip(A[1:], P, scales, largest, strict=True):
+        values, vectors = np.linalg.eigh(S[:, None] * here * S)
+        m, h = (1.1 + 0.1) / 2 * most, (1.1 - 0.1) / 2 * most
+        left = (2 * ((m - values) / h) ** 2 - 1) / (2 * (m / h) ** 2 - 1)
+        p = S[:, None] * (vectors * ((1 - left) / values)) @ vectors.T * S
+        rest = np.eye(len(here)) - p @ here
+        M = 2 * p - p @ here @ p + rest @ between @ M @ between.T @ rest.T
+    return M
+
+
+def dense(matrix: PETSc.Mat) -> Values:
+    copy = matrix.convert("dense", PETSc.Mat())
+    return np.asarray(copy.getDenseArray().copy())
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of PETSc's matrices, at the tangent that it was set up from, and with that of a body which has moved since as the
+    finest; symmetric and positive. Of the largest eigenvalue Lanczos' method finds nine tenths at least."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    scene = bar(dim, {})
+    Walk(scene).advance()
+    linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
+    preconditioner.due = Due.REFRESH
+    assert linear.solve()
+    made, pc = preconditioner._cycle, preconditioner.pc
+    assert isinstance(made, cycle.Cycle) and preconditioner.serving.handle == made.pc.handle
+    A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
+    P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
+    scales = [np.diag(each) ** -0.5 for each in A[1:]]
+    largest = [1 / (level._weights[0][1] * (1.1 + 0.1) / 2) for level in made._levels]
+    for most, each, S in zip(largest, A[1:], scales, strict=True):
+        assert 0.9 <= most / np.linalg.eigvalsh(S[:, None] * each * S)[-1] < 1 + 1e-5
+    balance, free = scene.balance, scene.balance.motion.free
+    for moved in (0.0, 0.2):
+        wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge
+        balance.displace(balance.u.x.array[: len(free)] + np.where(free, wild, 0.0))
+        preconditioner.due = Due.NOTHING
+        assert linear.solve()
+        linear.stiffness.bring_entries()
+        before, A[-1] = A[-1], dense(linear.stiffness.matrix)
+        assert np.abs(A[-1] - before).max() >= moved / 2 * np.abs(before).max()
+        reference, M = (
+            each[np.ix_(free, free)]
+            for each in (by_hand(A, P, scales, largest), written_out(preconditioner.serving.apply, balance.vector))
+        )
+        assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
+        assert np.abs(M - M.T).max() < 1e-5 * np.abs(M).max()
+        assert np.linalg.eigvalsh(M + M.T)[0] > 0
+
+
+def test_it_takes_as_many_iterations_as_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PETSc's own cycle, which a user who names its smoother keeps: the same motion to the solver's tolerance."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    its, u = [], []
+    for given in ({}, {"mg_levels_pc_type": "jacobi"}):
+        scene = bar(3, given | {"ksp_rtol": 1e-8})
+        walk = Walk(scene)
+        its.append([walk.advance().solve.krylov for _ in range(4)])
+        u.append(walk.u)
+        assert (linear_of(scene).preconditioner._cycle is None) == bool(given)
+    assert np.abs(np.subtract(*its)).max() <= 1 < min(its[1])
+    np.testing.assert_allclose(*u, rtol=0, atol=1e-6 * np.abs(u[1]).max())
+
+
+def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(cycle, "code", lambda *_: None)
+    scene = bar(3, {})
+    assert Walk(scene).advance().solve.converged
+    preconditioner = linear_of(scene).preconditioner
+    assert preconditioner._cycle is None and preconditioner.serving.getType() == "gamg"
