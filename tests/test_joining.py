@@ -15,7 +15,10 @@ from fracsim.mechanics.tethers import Tethers
 from fracsim.mesh.edges import EdgeGraph
 from fracsim.mesh.pieces import find_pieces
 from fracsim.scene import Scene
+from fracsim.stepping import blocks
+from fracsim.stepping.preconditioner import Due
 from support.scenes import Walk, each_step, make_scene, march
+from test_cycle import by_hand, dense, written_out
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -177,6 +180,52 @@ def test_ties_are_born_at_rest_and_give_no_resultant_and_no_moment(dim: int) -> 
     moment = np.einsum("ni,nj->ij", x, force)
     assert np.abs(force).max() > 1e-3
     assert np.abs(force.sum(axis=0)).max() < 1e-14 and np.abs(moment - moment.T).max() < 1e-14
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_ties_beside_blocks_are_those_among_single_entries(dim: int) -> None:
+    """K x of what may move, some dofs of tied nodes being held, is that of PETSc's matrix without their rows and
+    columns."""
+    scene, _, tethers = tied(dim)
+    rng = np.random.default_rng(4)
+    free = rng.random(scene.balance.owned) < 0.7
+    beside, K = tethers.tied(free), tethers.coupling()
+    assert beside is not None and K is not None
+    x, y = K.createVecs()
+    x.array_w[:] = np.where(free, rng.standard_normal(len(free)), 0.0)
+    K.mult(x, y)
+    found, whatever = np.zeros((len(free) // dim, dim)), np.where(free, x.array_r, 9.0).reshape(-1, dim)
+    found[beside.nodes] = beside.product(whatever[beside.nodes])
+    np.testing.assert_allclose(found.reshape(-1), np.where(free, y.array_r, 0.0), atol=1e-14)
+    assert np.abs(found).max() > 1e-3
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they are now, written out: also ties a hundred times as stiff as when multigrid was set up."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    finer = MESHES[dim] | {"h": 0.6 * MESHES[dim]["h"]}
+    scene, _, tethers = tied(dim, mesh=finer, solver={"snes_type": "ksponly", "ksp_rtol": 1e-8})
+    linear, stiffness = scene.solver.linear, scene.balance.stiffness  # type: ignore[union-attr]
+    assert linear.solve()
+    made, pc = linear.preconditioner._cycle, linear.preconditioner.pc
+    assert made is not None
+    A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
+    P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
+    scales = [np.diag(each) ** -0.5 for each in A[1:]]
+    for stiffer in (1.0, 100.0):
+        tethers.stiffness *= stiffer
+        tethers._be(tethers.ties)
+        linear.preconditioner.due = Due.NOTHING
+        assert linear.solve()
+        products = written_out(linear.operator.mult, scene.balance.vector)
+        stiffness.bring_entries()
+        before, A[-1] = A[-1], dense(stiffness.matrix)
+        assert (np.abs(A[-1] - before).max() > 0.01 * np.abs(before).max()) == (stiffer > 1)
+        np.testing.assert_allclose(products, A[-1], atol=1e-13 * np.abs(A[-1]).max())
+        largest = [1 / (level._weights[0][1] * (1.1 + 0.1) / 2) for level in made._levels]
+        M, reference = written_out(made.pc.apply, scene.balance.vector), by_hand(A, P, scales, largest)
+        assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
 
 
 @pytest.mark.parametrize("dim", (2, 3))

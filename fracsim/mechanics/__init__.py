@@ -18,5 +18,6 @@ return_mapping      flow at the end of a step
 rotation, spectrum  polar rotation of every cell; eigenvalues and powers of many tensors
 kernels             compiled forms and expressions
 vectors, tangent    assembling
+tied                stiffness between few nodes, beside blocks
 lanes, products     forms several cells at a time; products with blocks of the tangent: in C (compiled)
 """

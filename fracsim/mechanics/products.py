@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from ctypes import CDLL, c_int64
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dolfinx import la
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.compiled import FASTER, at, built_together
+
+if TYPE_CHECKING:
+    from .tied import Tied
 
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -21,18 +25,26 @@ class Products:
     """Those with a square matrix, owned rows of which are complete.
 
     Attributes:
-        matrix: what is multiplied with.
+        matrix: what is multiplied with.    beside: what is added to it.
     """
 
     def __init__(self, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: what `compiled` gives for the size of its blocks."""
         self.matrix, self._code = matrix, code
+        self.beside: list[Tied] = []
         columns = matrix.index_map(1)
         self._rows = matrix.index_map(0).size_local
         self._everywhere = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
+        self._multiply_blocks(x, y)
+        if self.beside:
+            to, by_nodes = (each.reshape(-1, self.matrix.block_size[0]) for each in (y.array_w, x.array_r))
+            for each in self.beside:
+                to[each.nodes] += each.product(by_nodes[each.nodes])
+
+    def _multiply_blocks(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         if (everywhere := self._everywhere) is None:
             self._multiply(x, y)
             return

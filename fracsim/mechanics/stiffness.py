@@ -81,13 +81,17 @@ class Stiffness:
     def in_blocks(self) -> Products | None:
         """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms,
         or a mass that couples nodes, add to single entries, or nothing can be compiled (collective)."""
-        own = (Term.add_stiffness, Term.coupling, Term.low_rank)
-        adds = any(getattr(type(term), each.__name__) is not each for term in self._terms for each in own)
+        adds = any(map(_adds_entries, self._terms))
         return None if adds or not self._mass.diagonal else self._assembly.use_blocks()
 
     def bring_entries(self) -> None:
-        """Bring `matrix` to where its blocks are (collective)."""
-        self._assembly.bring()
+        """Bring `matrix` to where its blocks are, with what is beside them (collective)."""
+        if self._coupled and self._assembly.is_behind:
+            self.matrix.zeroEntries()  # those beyond the blocks
+        if self._assembly.bring() and self._touches:
+            for coupling in [term.coupling() for term in self._terms]:
+                if coupling is not None:
+                    self._couple(coupling, constant=True)
 
     @property
     def is_incomplete(self) -> bool:
@@ -138,13 +142,17 @@ class Stiffness:
         if not (self._linear and self._is_assembled(small)):
             self._assemble_all(small)
         if not blocks_alone:
-            self._assembly.bring()
+            self.bring_entries()
 
     def _assemble_all(self, small: float | None) -> None:
         served = self._serves(small)
         if not served:
             self._assemble_body(small)
         self.springs, self.couples = [], False
+        if (blocks := self._assembly.blocks) is not None:
+            tied = [term.tied(self._motion.free) for term in self._terms] if self._touches else []
+            blocks.beside = [each for each in tied if each is not None]
+            return
         for term in self._terms:
             term.add_stiffness(self.matrix)
             if self._touches and (coupling := term.coupling()) is not None and not (served and term.linear):
@@ -210,7 +218,7 @@ class Stiffness:
     def _is_assembled(self, small: float | None) -> bool:
         """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
         fields = [field.x.array for field in self._stress.fields]
-        rates = self.matrix.handle, small, sum(term.mass_factor for term in self._terms), self.c_v
+        rates = self.matrix.handle, small, sum(term.mass_factor for term in self._terms), self.c_v, self._touches
         was = self._last
         same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
         if not same:
@@ -246,3 +254,10 @@ class Stiffness:
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self._assembly.destroy()
+
+
+def _adds_entries(term: Term) -> bool:
+    """Whether a term adds to a tangent in blocks what is neither a form nor tied."""
+    kind = type(term)
+    coupling = (Term.coupling,) if kind.tied is Term.tied else ()
+    return any(getattr(kind, each.__name__) is not each for each in (Term.add_stiffness, Term.low_rank, *coupling))

@@ -40,6 +40,7 @@ class Assembly:
     Attributes:
         form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
         blocks: products with what is assembled into blocks, where it is; kept as long.
+        is_behind: whether the blocks have been assembled since the matrix.
     """
 
     matrix: PETSc.Mat
@@ -47,7 +48,7 @@ class Assembly:
     def __init__(self, form: fem.Form) -> None:
         self.form = form
         self.blocks: Products | None = None
-        self._behind = False  # whether the blocks have been assembled since the matrix
+        self.is_behind = False
         self._dead: Flags | None = None
         self._make()
 
@@ -119,7 +120,7 @@ class Assembly:
             d = self.matrix.getBlockSize()
             at, axes = self._on_diagonal[:, None], np.arange(d)
             self._sum.data.reshape(-1, d, d)[at, axes, axes] += diagonal.reshape(-1, d)
-        self._behind = True
+        self.is_behind = True
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
         """Add a form to the sum (collective the first time)."""
@@ -133,18 +134,20 @@ class Assembly:
 
         return MatrixLanes.of(form, self._sum)
 
-    def bring(self) -> None:
-        """Bring the matrix to where the blocks are, if there are any (collective)."""
-        if self._behind:
+    def bring(self) -> bool:
+        """Bring the matrix to where the blocks are, if there are any that it is behind of; whether there were
+        (collective)."""
+        if was_behind := self.is_behind:
             d = self.matrix.getBlockSize()
             values = self._sum.data[: d * d * self._own.stop]
             self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
             self.matrix.assemble()
-            self._behind = False
+            self.is_behind = False
+        return was_behind
 
     def destroy(self) -> None:
         """Give the memory of PETSc's matrices back."""
         self.matrix.destroy()
         if self.blocks is not None:
             self.blocks.destroy()
-            self.blocks, self._behind = None, False
+            self.blocks, self.is_behind = None, False

@@ -25,9 +25,11 @@ from .stiff import Stiff
 
 if TYPE_CHECKING:
     from ..mesh.split.places import Places
+    from .tied import Tied
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 type Form = ufl.Form | int  # 0: none
 # nodes (n, 2) of all broken edges and where they are cut (n, 1) from the lower one, nan: in the middle; on rank 0
 type Cuts = Callable[[], tuple[npt.NDArray[np.int64], Values] | None]  # (collective)
@@ -119,6 +121,11 @@ class Term:
         The tangent takes its entries; the preconditioner is made anew where they are at other places than before. What
         is Stiff stays beside it.
         """
+        return None
+
+    def tied(self, free: Flags) -> Tied | None:
+        """The same as `coupling` for tangents in blocks, which stay without its entries; None: there is none. `free`:
+        (owned dofs,) that nothing prescribes. Terms that have no such way keep the tangent in single entries."""
         return None
 
     beside: ClassVar[bool] = False  # whether the tangent may lack a share of its own: `low_rank`, or a Stiff

@@ -32,6 +32,9 @@ from .term import Term
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
+    from scipy.sparse import csr_matrix
+
+    from .tied import Tied
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -94,6 +97,7 @@ class Tethers(Term):
         """Tie these, and no others (not collective)."""
         self.ties = ties
         self._matrix: PETSc.Mat | None = None
+        self._beside: Tied | None = None
         self._fastest: float | None = None
         self._numbers, place = np.unique(ties.nodes, return_inverse=True)
         self._place: Ints = place.reshape(ties.nodes.shape)
@@ -189,6 +193,26 @@ class Tethers(Term):
         np.add.at(force, self._place, self.stiffness * self.ties.weights[:, :, None] * self._apart()[:, None])
         np.add.at(rows.reshape(-1, self._domain.dim), self._local, force[self._here])
 
+    def _nodal(self) -> csr_matrix:
+        """k w w^T along each axis, over the nodes of all ties."""
+        from scipy.sparse import csr_matrix
+
+        rows = np.repeat(np.arange(len(self.ties.cell)), self._domain.dim + 2)
+        shape = len(self.ties.cell), len(self._numbers)
+        W = csr_matrix((self.ties.weights.reshape(-1), (rows, self._place.reshape(-1))), shape=shape)
+        return csr_matrix(self.stiffness * (W.T @ W))
+
+    def tied(self, free: Flags) -> Tied | None:
+        """k w w^T, made once for the ties of now."""
+        if not len(self.ties.cell):
+            return None
+        if self._beside is None:
+            from .tied import Tied
+
+            may_move = free.reshape(-1, self._domain.dim)[self._local].astype(float)
+            self._beside = Tied(self._domain.comm, self._nodal(), self._here, self._local, may_move)
+        return self._beside
+
     def coupling(self) -> PETSc.Mat | None:
         """k w w^T, made once for the ties of now (collective)."""
         if not len(self.ties.cell):
@@ -197,9 +221,7 @@ class Tethers(Term):
             from scipy.sparse import csr_matrix, identity, kron
 
             n, d = len(self._numbers), self._domain.dim
-            rows = np.repeat(np.arange(len(self.ties.cell)), d + 2)
-            W = csr_matrix((self.ties.weights.reshape(-1), (rows, self._place.reshape(-1))), shape=(len(rows), n))
-            K = csr_matrix(kron(self.stiffness * (W.T @ W), identity(d)))
+            K = csr_matrix(kron(self._nodal(), identity(d)))
             first = self._domain.space.dofmap.index_map.local_range[0]
             own = np.zeros(n, np.int64)
             own[self._here] = first + self._local

@@ -28,8 +28,12 @@ from .levels import Blocks, Copy, copied
 from .rows import Code, Rows, Vector, code
 
 if TYPE_CHECKING:
-    from ..mechanics.products import Products
+    from collections.abc import Iterator
 
+    from ..mechanics.products import Products
+    from ..mechanics.tied import Tied
+
+Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 type Codes = dict[tuple[int, int], Code]
 
@@ -44,14 +48,16 @@ class Level:
 
     Attributes:
         b, x: right-hand side and solution, scaled.    left: b - A x.    scale: S, of ghosts, too.
+        beside: what is added to the blocks of A.
     """
 
-    def __init__(self, copy: Copy, own: Blocks, made: Code) -> None:
+    def __init__(self, copy: Copy, own: Blocks, made: Code, beside: list[Tied]) -> None:
         """`own`: the blocks of A (collective)."""
         nodes, size = copy.nodes, copy.size
         large = np.abs(copy.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
-        self._comm, self._owned = nodes.comm, nodes.size_local * size
+        self._comm, self._owned, self._size = nodes.comm, nodes.size_local * size, size
+        self.beside = beside
         self._rows = Rows(made, own.starts, own.columns)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
         self.take(own.values)
@@ -87,6 +93,17 @@ class Level:
     def _residual(self) -> None:
         self.x.fetch()
         self._rows.residual(self.b, self.x, self.left)
+        for nodes, product in self._beside():
+            self._by_nodes(self.left)[nodes] -= product
+
+    def _beside(self) -> Iterator[tuple[Ints, Values]]:
+        """Nodes, and the product of x with what is beside the blocks there."""
+        for each in self.beside:
+            scale = self.scale[: self._owned].reshape(-1, self._size)[each.nodes]
+            yield each.nodes, scale * each.product(scale * self._by_nodes(self.x)[each.nodes])
+
+    def _by_nodes(self, vector: Vector) -> npt.NDArray[np.float32]:
+        return vector.array[: self._owned].reshape(-1, self._size)
 
     def begin(self) -> None:
         """Smooth from 0, and what is left (collective)."""
@@ -104,6 +121,9 @@ class Level:
         for keep, take in weights:
             self.x.fetch()
             self._rows.smooth(keep, take, self.b, self.x, self._d, self._to)
+            for nodes, product in self._beside():
+                for each in (self._d, self._to):
+                    self._by_nodes(each)[nodes] -= np.float32(take) * product
             self.x, self._to = self._to, self.x
 
 
@@ -127,7 +147,7 @@ class Cycle:
     def __init__(self, body: PETSc.PC, products: Products, codes: Codes) -> None:
         """`body`: of the kind that `in_single` takes; `products`: with the tangent that it was set up from; `codes`:
         for the sizes of blocks (collective)."""
-        self.body, self._tangent = body, products.matrix
+        self.body, self._products, self._tangent = body, products, products.matrix
         coarsest, *found = copied(body, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
         tangent = Blocks(starts, self._tangent.indices[: starts[-1]], self._values)
@@ -136,7 +156,8 @@ class Cycle:
         below = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
         for here in found:
-            level = Level(here, here.own or tangent, codes[here.size, here.size])
+            beside = [] if here.own else products.beside
+            level = Level(here, here.own or tangent, codes[here.size, here.size], beside)
             self._levels.append(level)
             assert here.between is not None
             between = Rows(codes[here.size, below.size], here.between.starts, here.between.columns)
@@ -157,6 +178,7 @@ class Cycle:
     def follow(self) -> None:
         """Take the tangent as it is now for the finest level."""
         self._levels[-1].take(self._values)
+        self._levels[-1].beside = self._products.beside
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x (collective)."""

@@ -88,8 +88,7 @@ class _Entries:
 def _nodes(matrix: PETSc.Mat, size: int, read: list[Ints]) -> IndexMap:
     """Those of the rows of a matrix; ghosts are what else is `read`, by global numbers (collective)."""
     first, last = (end // size for end in matrix.getOwnershipRange())
-    every = np.unique(np.concatenate(read)).astype(np.int64)
-    ghosts = every[(every < first) | (every >= last)]
+    ghosts = np.unique(np.concatenate([each[(each < first) | (each >= last)] for each in read])).astype(np.int64)
     owners = np.searchsorted(matrix.getOwnershipRanges() // size, ghosts, side="right") - 1
     return IndexMap(matrix.comm.tompi4py(), last - first, ghosts, owners.astype(np.int32))
 

@@ -85,7 +85,7 @@ class Linear:
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
             large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
-            bring=self.stiffness.bring_entries, nodes=balance.domain.space.dofmap.index_map.size_global,
+            bring=self._bring, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self.linearly = is_linear(balance, given, ksp.getType())
@@ -196,6 +196,11 @@ class Linear:
         from .cycle import in_single
 
         return in_single(body, assembled)
+
+    def _bring(self) -> bool:
+        self.stiffness.bring_entries()
+        changed, self.stiffness.pattern_changed = self.stiffness.pattern_changed, False
+        return changed
 
     @contextmanager
     def set_up_anew(self) -> Iterator[None]:

@@ -93,13 +93,13 @@ class Preconditioner:
         large: bool,
         loosen: Loosen,
         hasten: Callable[[PETSc.PC], Cycle | None],
-        bring: Callable[[], None],
+        bring: Callable[[], bool],
         nodes: int,
     ) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
         that sees to loose parts out of `pc`, None where that would be no use; `hasten`: what does the same in less
         time, None where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the
-        entries of the tangent to what they are; `nodes`: of the body."""
+        entries of the tangent to what they are, and tells whether they are at other places; `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
         self.serving, self._loosen, self._bring, self._nodes = self.pc, loosen, bring, nodes
         self._loose: LooseParts | None = None
@@ -132,10 +132,9 @@ class Preconditioner:
         if self.due == Due.NOTHING:
             self._follow(tangent, products)
             return
-        if self.due == Due.REBUILD:
+        if self._bring() or self.due == Due.REBUILD:
             self.pc.reset()
             self._fresh_its = 0
-        self._bring()
         self._forget_cycle()
         ksp.setPC(self.pc)
         self.pc.setReusePreconditioner(False)
@@ -168,7 +167,8 @@ class Preconditioner:
             self._cycle.follow()
         if loose is None or loose.body is not self.serving:
             return
-        self._bring()
+        if self._bring():
+            self.due = Due.REBUILD
         if loose.follow(tangent, products):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc

@@ -423,9 +423,9 @@ def by_rows() -> Found:
 def in_blocks() -> Found:
     """Edges that the block breaks where its tangent is multiplied with in blocks."""
     small, blocks.SMALL = blocks.SMALL, 0
-    found = run("block")
+    found = run("block") | run("joined")
     blocks.SMALL = small
-    return {"broken-in-blocks": found["block-broken"], "u-in-blocks": found["block-u"]}
+    return {f"{key}-in-blocks": found[key] for key in ("block-broken", "block-u", "joined-broken", "joined-u")}
 
 
 def compared(folder: Path) -> Found:
