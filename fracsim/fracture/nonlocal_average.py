@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..mesh.compiled import address, at, library
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
+from ..mesh.ranks import largest
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -75,7 +75,7 @@ class NonlocalAverage:
         column where the values have six. `values` and `size` are 0 on cells that are not active.
         """
         n = values.shape[1]
-        if self._comm.allreduce(float(np.max(size, initial=0.0)), op=MPI.MAX) < bound:
+        if largest(self._comm, float(np.max(size, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
         near, pull = self._exchange(values), self._exchange(size[:, None])[:, 0]
         hot = pull >= bound * (1 - 1e-9)  # hairs below the bound: the sums are rounded

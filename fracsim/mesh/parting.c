@@ -9,30 +9,42 @@ typedef struct {
     const uint8_t *shared;       /* (nodes,) that another rank has, too */
 } Graph;
 
+typedef struct {
+    int64_t *nodes, *place;      /* what is reached, room for all nodes; where a node is among it, -1 but meanwhile */
+    int64_t *part;               /* of each node that is reached, from 0 */
+    uint8_t *goes_on;            /* (parts,) whether it has nodes of the last round or of another rank */
+    int64_t *of_part;            /* (parts,) the piece of before that it is of */
+} Reached;
+
 static int64_t root(int64_t *above, int64_t n)
 {
     while (above[n] != n) n = above[n] = above[above[n]];
     return n;
 }
 
-/* Nodes at most `far` whole edges from the first `count` of `reached`, which has room for all; `place` (nodes,) is -1
-   and is so again afterwards. `part` (reached,): of each, from 0; `goes_on` (parts,): whether it has nodes of the last
-   round or of another rank. Returns how many nodes there are, and sets how many parts. */
+static inline int64_t at(const Reached *all, int64_t node, int64_t *count)
+{
+    if (all->place[node] < 0) { all->nodes[*count] = node; all->part[*count] = *count; all->place[node] = (*count)++; }
+    return all->place[node];
+}
+
+/* Nodes at most `far` whole edges from the ends of some edges (some,), and their parts. Returns how many nodes there are,
+   and sets how many parts; `piece`: (nodes,) those of before. */
 int64_t reached(
-    const Graph *graph, int64_t count, int64_t far, int64_t *reached, int64_t *place, int64_t *part, uint8_t *goes_on,
+    const Graph *graph, const Reached *all, int64_t some, const int64_t *edges, int64_t far, const int64_t *piece,
     int64_t *parts)
 {
-    int64_t first = 0, last = count;
-    for (int64_t n = 0; n < count; n++) { place[reached[n]] = n; part[n] = n; }
+    int64_t first = 0, count = 0, *part = all->part;
+    for (int64_t n = 0; n < 2 * some; n++) at(all, graph->nodes[2 * edges[n / 2] + n % 2], &count);
+    int64_t last = count;
     for (int64_t round = 0; round < far && first < last; round++) {
         for (int64_t n = first; n < last; n++) {
-            int64_t node = reached[n];
+            int64_t node = all->nodes[n];
             for (int64_t j = node ? graph->end[node - 1] : 0; j < graph->end[node]; j++) {
-                int64_t edge = graph->edges[j], to;
+                int64_t edge = graph->edges[j];
                 if (graph->broken[edge]) continue;
-                to = graph->nodes[2 * edge] == node ? graph->nodes[2 * edge + 1] : graph->nodes[2 * edge];
-                if (place[to] < 0) { reached[count] = to; part[count] = count; place[to] = count++; }
-                int64_t one = root(part, n), other = root(part, place[to]);
+                int64_t to = graph->nodes[2 * edge] == node ? graph->nodes[2 * edge + 1] : graph->nodes[2 * edge];
+                int64_t one = root(part, n), other = root(part, at(all, to, &count));
                 if (one < other) part[other] = one;
                 else part[one] = other;
             }
@@ -42,10 +54,13 @@ int64_t reached(
     }
     *parts = 0;
     for (int64_t n = 0; n < count; n++) {  /* roots come before what hangs on them */
-        place[reached[n]] = -1;
-        if (part[n] == n) goes_on[part[n] = (*parts)++] = 0;
-        else part[n] = part[part[n]];
-        if (n >= first || graph->shared[reached[n]]) goes_on[part[n]] = 1;
+        int64_t node = all->nodes[n];
+        all->place[node] = -1;
+        if (part[n] == n) {
+            all->of_part[*parts] = piece[node];
+            all->goes_on[part[n] = (*parts)++] = 0;
+        } else part[n] = part[part[n]];
+        if (n >= first || graph->shared[node]) all->goes_on[part[n]] = 1;
     }
     return count;
 }

@@ -17,11 +17,11 @@ import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from .compiled import address, at, library
+from .compiled import at, library
 from .domain import Domain
 from .edges import EdgeGraph
 from .pieces import Pieces, find_pieces, followed
-from .ranks import total
+from .ranks import joined, largest, offset, total
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -35,18 +35,28 @@ class _Given(Structure):
     _fields_ = tuple((name, c_void_p) for name in ("nodes", "broken", "edges", "end", "shared"))
 
 
+class _Room(Structure):
+    """For what is reached of so many nodes, as parting.c has it; numbers and parts of before are looked at there."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("nodes", "place", "part", "goes_on", "of_part"))
+
+    def __init__(self, nodes: int) -> None:
+        self.reached, self.parts, self.of_parts = (np.empty(nodes, np.int64) for _ in range(3))
+        self.open = np.empty(nodes, bool)
+        self._place = np.full(nodes, -1)
+        arrays = self.reached, self._place, self.parts, self.open, self.of_parts
+        super().__init__(*(at(each).value for each in arrays))
+
+
 @dataclass(frozen=True)
-class _Room:
-    """For what is reached, and for places of nodes (nodes,) among it: -1 but while it lasts."""
+class _Found:
+    """Nodes (n,), the part of each, whether parts (parts,) go on or may do so on another rank, and the piece of before
+    that each is of."""
 
     nodes: Ints
-    place: Ints
     part: Ints
     goes_on: Flags
-
-    @classmethod
-    def of(cls, nodes: int) -> _Room:
-        return cls(np.empty(nodes, np.int64), np.full(nodes, -1), np.empty(nodes, np.int64), np.empty(nodes, bool))
+    piece: Ints
 
 
 class Parting:
@@ -59,7 +69,10 @@ class Parting:
     def __init__(self, graph: EdgeGraph) -> None:
         self._graph, self._domain = graph, graph.domain
         self._shared = _on_other_ranks(graph.domain)
-        self._room = _Room.of(len(self._shared))
+        self._room = _Room(len(self._shared))
+        edges = graph.edges_at
+        self._kept = graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared
+        self._given = _Given(*(at(each).value for each in self._kept))
         self._code = library(SOURCE).reached
         self._code.restype = c_int64
         self._look_everywhere()
@@ -67,55 +80,54 @@ class Parting:
     def look(self) -> Pieces:
         """The pieces of now (collective)."""
         graph = self._graph
-        new, whole_again = graph.broken & ~self._broken, np.any(self._broken & ~graph.broken)
-        count, healed = total(graph.domain.comm, np.array([np.count_nonzero(new), whole_again]))
+        changed = np.flatnonzero(graph.broken != self._broken)
+        count, healed = total(graph.domain.comm, np.array([len(changed), np.count_nonzero(self._broken[changed])]))
         if healed:
             self._look_everywhere()
         elif count:
-            self._look_around(np.unique(graph.edge_nodes[new]))
+            self._look_around(changed)
         return self.pieces
 
     def _look_everywhere(self) -> None:
         self.pieces, self._broken = find_pieces(self._graph), self._graph.broken.copy()
 
-    def _look_around(self, ends: Ints) -> None:
-        """The pieces once edges between some of the nodes `ends` have broken (collective)."""
-        of_node, comm = self.pieces.of_node, self._domain.comm
+    def _look_around(self, edges: Ints) -> None:
+        """The pieces once edges (n,) have broken (collective)."""
         for far in FAR:
-            nodes, part, goes_on = self._reached(ends, far)
-            first = np.unique(part, return_index=True)[1]
-            open_in = np.bincount(of_node[nodes[first]][goes_on], minlength=1)
-            if comm.allreduce(int(open_in.max()), op=MPI.MAX) <= 1:
-                self._part(nodes, part, goes_on)
+            found = self._reached(edges, far)
+            open_in = np.bincount(found.piece[found.goes_on], minlength=1)  # parts of each piece
+            if largest(self._domain.comm, int(open_in.max())) <= 1:
+                self._part(found)
                 self._broken = self._graph.broken.copy()
                 return
         self._look_everywhere()
 
-    def _reached(self, ends: Ints, far: int) -> tuple[Ints, Ints, Flags]:
-        """(n,) nodes at most `far` whole edges from `ends`, (n,) the part each is in, and (parts,) which of these go on
-        or may do so on another rank."""
-        graph, room, parts = self._graph, self._room, c_int64()
-        room.nodes[: len(ends)] = ends
-        edges = graph.edges_at
-        given = _Given(*map(address, (graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared)))
-        sizes = byref(given), c_int64(len(ends)), c_int64(far)
-        count = self._code(*sizes, *map(at, (room.nodes, room.place, room.part, room.goes_on)), byref(parts))
-        return room.nodes[:count], room.part[:count], room.goes_on[: parts.value]
+    def _reached(self, edges: Ints, far: int) -> _Found:
+        """What is at most `far` whole edges from the ends of edges (n,)."""
+        room, parts = self._room, c_int64()
+        given = byref(self._given), byref(room), c_int64(len(edges)), at(edges), c_int64(far), at(self.pieces.of_node)
+        count = self._code(*given, byref(parts))
+        of_parts = room.open[: parts.value], room.of_parts[: parts.value]
+        return _Found(room.reached[:count], room.parts[:count], *of_parts)
 
-    def _part(self, nodes: Ints, part: Ints, goes_on: Flags) -> None:
-        """Parts (parts,) of nodes (n,) that do not go on are pieces of their own (collective)."""
-        before, domain = self.pieces, self._domain
-        off = nodes[~goes_on[part]]
-        if not total(domain.comm, len(off))[0]:
+    def _part(self, found: _Found) -> None:
+        """Parts that do not go on are pieces of their own (collective)."""
+        before, domain, comm = self.pieces, self._domain, self._domain.comm
+        off = np.flatnonzero(~found.goes_on)
+        if not total(comm, len(off))[0]:
             return
-        number = (np.cumsum(~goes_on) - 1)[part[~goes_on[part]]]
-        low = np.full(int(np.count_nonzero(~goes_on)), np.iinfo(np.int64).max)
-        np.minimum.at(low, number, domain.node_input[off])
-        every = domain.comm.allgather(low)
-        first = before.count + sum(map(len, every[: domain.comm.rank]))
+        numbers = np.full(len(found.goes_on), -1)
+        numbers[off] = np.arange(len(off))
+        of_node = numbers[found.part]
+        nodes, number = found.nodes[of_node >= 0], of_node[of_node >= 0]
+        low = np.full(len(off), np.iinfo(np.int64).max)
+        np.minimum.at(low, number, domain.node_input[nodes])
         label = before.of_node.copy()
-        label[off] = first + number
-        lowest = np.concatenate([self._lowest_of_rest(before.of_node[off], label), *every])
+        label[nodes] = before.count + offset(comm, len(off)) + number
+        rest, gone = before.lowest, np.count_nonzero(low == before.lowest[found.piece[off]])
+        if total(comm, gone)[0]:
+            rest = self._lowest_of_rest(found.piece[off], label)
+        lowest = np.concatenate([rest, joined(comm, low)])
         count = int(np.count_nonzero(lowest < np.iinfo(np.int64).max))
         order = np.argsort(lowest, kind="stable")
         rank = np.empty(len(order), np.int64)
@@ -130,7 +142,7 @@ class Parting:
         """(pieces,) the lowest input node that is left of each piece of before, where nodes of the pieces `parted` have
         other labels now (collective)."""
         domain, lowest = self._domain, self.pieces.lowest.copy()
-        changed = np.unique(np.concatenate(domain.comm.allgather(np.unique(parted))))
+        changed = np.unique(joined(domain.comm, np.unique(parted)))
         left = np.full(len(lowest), np.iinfo(np.int64).max)
         of_changed = np.zeros(label.max(initial=len(lowest)) + 1, bool)
         of_changed[changed] = True

@@ -98,6 +98,17 @@ def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
     return result
 
 
+def largest[Number: (int, float)](comm: MPI.Intracomm, value: Number) -> Number:
+    """The greatest over the ranks."""
+    result: Number = value if comm.size == 1 else comm.allreduce(value, op=MPI.MAX)
+    return result
+
+
+def joined(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Rows of all ranks, those of the lowest first."""
+    return rows if comm.size == 1 else np.concatenate(comm.allgather(rows))
+
+
 def offset(comm: MPI.Intracomm, count: int) -> int:
     """Sum of `count` over the lower ranks."""
     before = comm.exscan(count)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ..fracture.cracks import ends_in_order
 from ..fracture.record import EdgeRecord
-from ..mesh.ranks import total
+from ..mesh.ranks import joined, total
 from ..meshes.words import AXES
 
 Values = npt.NDArray[np.float64]
@@ -42,7 +42,7 @@ class CrackFront:
         self._pattern = self._graph.pattern.copy()
         self._size[changed] = self._cut(changed)
         self._figures[0] = total(self._domain.comm, float(self._size.sum()))[0]
-        tips = np.concatenate(self._domain.comm.allgather(self._tips()))
+        tips = joined(self._domain.comm, self._tips())
         if len(tips):  # a crack that has run through has none: its last one stays
             first = np.lexsort([tips[:, 2], tips[:, 1], -tips[:, 0]])[0]
             self._figures[1:] = tips[first, 3:]
@@ -80,7 +80,7 @@ class CrackFront:
         """(n, 3 + d) of this rank's cells that cracks have come into last and not left: when, which edge (two input
         nodes), and where, m."""
         graph, at = self._graph, self._record.at
-        newest = at == np.nanmax(at, initial=-np.inf)
+        newest = at == np.fmax.reduce(at, initial=-np.inf)  # NaN: whole ones
         cells, entry = self._entered(graph.cells_at(np.flatnonzero(newest)))
         if not newest[graph.cell_edges[cells, entry]].any():  # what broke last led nowhere
             cells, entry = self._entered(np.flatnonzero((graph.pattern > 0) & ~graph.split))
