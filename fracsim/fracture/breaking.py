@@ -84,7 +84,7 @@ class Breaking:
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.not_finite, self.opened, self._pace, self._joining = 0, opened, pace, joining
         self._due, self._now, self._dt = True, 0.0, math.inf
-        self._restless = getattr(criterion, "carried", None) is not None  # remembers more than what broke
+        self._restless = criterion.carried is not None  # remembers more than what broke
         if opened is not None:
             self.degradation.opened()
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain

@@ -23,6 +23,15 @@ ROUND_OFF = 1e-12  # of a stress, by which a bound of it may be too low
 class Criterion(Protocol):
     """Finds the edges that fail."""
 
+    @property
+    def cut(self) -> Values | None:
+        """(edges,) where local edges are cut, from the end that comes first in the input mesh, NaN: nowhere yet; the
+        same array for ever. None: it does not say."""
+
+    @property
+    def carried(self) -> Values | None:
+        """(edges, n) of tips that run, the same array for ever; None: there are none."""
+
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """(n,) local edges and their load over strength, 1 or more.
 
@@ -94,6 +103,8 @@ class OverloadedEdges:
     Attributes:
         strength: of each edge in each cell.
     """
+
+    cut = carried = None
 
     def __init__(
         self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, cap: float | None = None

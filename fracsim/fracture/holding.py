@@ -38,6 +38,8 @@ class Holding:
         strength: of each edge in each cell.
     """
 
+    cut = carried = None
+
     def __init__(self, failing: OverloadedEdges, stress: Stress, graph: EdgeGraph, limit: float = LIMIT) -> None:
         self._failing, self._cells, self._graph, self._limit = failing, Simplices.of(stress), graph, limit
         self.strength = failing.strength

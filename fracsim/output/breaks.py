@@ -46,8 +46,8 @@ class Breaks:
             self.record, self._parting = EdgeRecord(breaking.graph), Parting(breaking.graph)
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
-            self._cut_by = getattr(breaking.criterion, "cut", None)
-            self._carried = getattr(breaking.criterion, "carried", None)
+            self._cut_by = breaking.criterion.cut
+            self._carried = breaking.criterion.carried
             if breaking.opened is not None:
                 self.record.note(0.0, breaking.opened)
             self.count()

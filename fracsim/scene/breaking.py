@@ -58,7 +58,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
         criterion = _criterion(study, balance.stress, graph)
         joining = _joining(study, balance, graph, criterion.strength)
         breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
-    if (cut := getattr(breaking.criterion, "cut", None)) is not None:  # of a surface, or of a crack
+    if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
         balance.cut_by(lambda: graph.gather_broken(cut[:, None]))
     if opened is not None:
         balance.edges_broke(graph.pattern)

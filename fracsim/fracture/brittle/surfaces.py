@@ -33,6 +33,8 @@ class BrittleSurfaces:
         spacing: least distance of starts, m.
     """
 
+    carried = None
+
     def __init__(
         self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, rules: SurfaceRules
     ) -> None:
