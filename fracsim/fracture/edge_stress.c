@@ -1,7 +1,6 @@
 /* What fracture.edge_stress does to cells. A cell has d + 1 corners of d coordinates, PAIRS edges in DOLFINx's order, the
-   broken ones of which are bits of its pattern, and as many components of a stress s, which is one after the other or
-   `stride` apart. Sums are taken in the order of
-   arrays, to the last digit. */
+   broken ones of which are bits of its pattern, and as many components of a stress s, one cell's after the other or
+   `stride` apart. Sums are taken in the order of arrays, to the last digit. */
 
 #include <math.h>
 #include <stdbool.h>

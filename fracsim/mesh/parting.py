@@ -36,7 +36,7 @@ class _Given(Structure):
 
 
 class _Room(Structure):
-    """For what is reached of so many nodes, as parting.c has it; numbers and parts of before are looked at there."""
+    """For what is reached of so many nodes, as parting.c has it, and its arrays."""
 
     _fields_ = tuple((name, c_void_p) for name in ("nodes", "place", "part", "goes_on", "of_part"))
 
@@ -45,7 +45,7 @@ class _Room(Structure):
         self.open = np.empty(nodes, bool)
         self._place = np.full(nodes, -1)
         arrays = self.reached, self._place, self.parts, self.open, self.of_parts
-        super().__init__(*(at(each).value for each in arrays))
+        super().__init__(*(each.ctypes.data for each in arrays))
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Parting:
         self._room = _Room(len(self._shared))
         edges = graph.edges_at
         self._kept = graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared
-        self._given = _Given(*(at(each).value for each in self._kept))
+        self._given = _Given(*(each.ctypes.data for each in self._kept))
         self._code = library(SOURCE).reached
         self._code.restype = c_int64
         self._look_everywhere()
