@@ -62,6 +62,14 @@ RUNS["cohesive"] = {
     ],
     "time": {"scheme": "quasi-static", "step": 0.05, "end": 1.0},
 }  # fmt: skip
+# a front that is passed over until it has nearly what it takes
+RUNS["waiting"] = {
+    "mesh": {"builder": "box", "size": [2.0, 0.3, 1.0], "h": 1 / 6, "pattern": "unstructured"},
+    "material": _SOFT | {"energy": "linear"}, "fracture": {"strength": 1e5, "energy": 1.0},
+    "crack": [{"polygon": [[-0.1, -0.1, 0.52], [1.0, -0.1, 0.52], [1.0, 0.5, 0.52], [-0.1, 0.5, 0.52]]}],
+    "boundary": [{"on": "bottom", "fix": "xyz"}, {"on": "top", "velocity": [0.0, 0.0, 0.25]}], "damping": {"mass": 2e3},
+    "time": {"scheme": "explicit", "step": 5e-4, "end": 0.07},
+}  # fmt: skip
 # many cracks at once, which with crumbs cut eight nodes off
 RUNS["shivered"] = RUNS["begun"] | {
     "mesh": _PLATE | {"size": [2.0, 0.8], "h": 1 / 10},

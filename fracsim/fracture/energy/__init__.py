@@ -16,6 +16,7 @@ running    how fast cracks run that may branch, and where they do
 branching  tips that share a disc
 cutting    the line or plane that cuts a cell
 tips       which tips advance, and where cracks begin: the criterion
+waiting    in space, with inertia: how long tips need not be looked at
 row        in space, without inertia: all of a front gets on at once
 joined     the same, without those that would cut a node off
 splitting  what is left of a cell that has come apart

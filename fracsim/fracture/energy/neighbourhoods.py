@@ -136,9 +136,13 @@ class Neighbourhoods:
 
     def most(self, sigma: Values, push: Values) -> Values:
         """(n,) no less than the size of those forces: sum V |Sigma| |grad q| + sum V q |f|."""
-        _, inside, steep = self._force
         size, pushed = np.einsum("nij,nij->n", sigma, sigma), np.einsum("ni,ni->n", push, push)
-        return np.asarray(steep @ np.sqrt(size) + inside @ np.sqrt(pushed))
+        return self.most_of(np.sqrt(size)[:, None], np.sqrt(pushed)[:, None]).sum(axis=1)
+
+    def most_of(self, sizes: Values, pushed: Values) -> Values:
+        """(n, k + m) sum V |grad q| of `sizes` (asked, k), and sum V q of `pushed` (asked, m)."""
+        _, inside, steep = self._force
+        return np.column_stack([steep @ sizes, inside @ pushed])
 
     @property
     def _force(self) -> tuple[csc_matrix, csc_matrix, csc_matrix]:

@@ -11,7 +11,11 @@ Values = npt.NDArray[np.float64]
 
 
 class Patch:
-    """Some cells. What comes out has its components one after the other in memory, each of them in one piece."""
+    """Some cells. What comes out has its components one after the other in memory, each of them in one piece.
+
+    Attributes:
+        steepness: (n,) sum |grad lambda_i| of the barycentric coordinates, 1/m.
+    """
 
     def __init__(self, nodes: Ints, slopes: Values) -> None:
         """`nodes`: (n, d + 1) of cells.    `slopes`: (n, d + 1, d) of their barycentric coordinates, 1/m."""
@@ -23,6 +27,7 @@ class Patch:
         self._slopes = csr_matrix(
             (axes, np.tile(index, self._d), corners * np.arange(self._d * count + 1)), (self._d * count, size)
         )
+        self.steepness: Values = np.sqrt(np.einsum("nki,nki->nk", slopes, slopes)).sum(axis=1)
         share = np.full(index.size, 1 / corners)
         self._mean = csr_matrix((share, index, corners * np.arange(count + 1)), (count, size))
 

@@ -67,13 +67,12 @@ class Seen:
         force = self.around.forces(self.sigma, self.inertia)
         return force if force.shape[1] == 2 else self.around.along(force)
 
-    def may_reach(self, least: Values) -> bool:
-        """Whether the force on any tip of this rank, by itself, may be as large as `least` (tips,), J/m^2: by a bound,
-        which takes a third of the time: at rest twice the force, where strong waves pass far more."""
+    def most(self) -> Values:
+        """(tips,) no less than the force on tips by themselves, J/m^2: a bound that takes a third of the time, at rest
+        twice the force, where strong waves pass far more; in the plane none."""
         if self.sigma.shape[1] == 2:
-            return True
-        most = self.around.along.most(self.around.most(self.sigma, self.inertia))
-        return bool(np.any(most * (1 + ROUND_OFF) >= least))
+            return np.full(len(self.tips), np.inf)
+        return self.around.along.most(self.around.most(self.sigma, self.inertia)) * (1 + ROUND_OFF)
 
     def means(self, rows: Ints) -> Values:
         """(m, d, d) mean stress around tips `rows` (m,), Pa."""
@@ -129,7 +128,7 @@ class Sight:
     def look(self, stress: Values, psi: Values) -> Seen:
         """What is around the tips (collective)."""
         asked, tips, (mu, kappa) = self.around.asked, self.around.tips, self._elastic
-        cells, patch = asked.own, self._over(asked)
+        cells, patch = asked.own, self.patch
         H = patch.gradients(patch.corners(self._stress.u.x.array))
         own = np.array([column[cells] for column in stress.T]).T  # in half the time of rows
         assert self._stress.chi is not None
@@ -146,8 +145,10 @@ class Sight:
         elastic, turns = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
         return Seen(self.around, self._reach.disc[tips.cell], seen, sigma, inertia, H, push, elastic, turns)
 
-    def _over(self, asked: Asked) -> Patch:
+    @property
+    def patch(self) -> Patch:
         """Of the cells of this rank that anybody asks for: as long as they are the same."""
+        asked = self.around.asked
         if self._patch is None or self._patch[0] is not asked:
             self._patch = asked, Patch(self._domain.cell_nodes[asked.own], self._slopes_of(asked.own))
         return self._patch[1]

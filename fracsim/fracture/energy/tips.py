@@ -30,6 +30,7 @@ from .cutting import Cuts, cleave, fork, leave, through_centre
 from .mixed import gain, kink
 from .neighbourhoods import Reach, Tips
 from .seen import Seen, Sight
+from .waiting import Waiting
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -111,6 +112,8 @@ class CrackTips:
         self.disc = DISC[domain.dim]
         reach = Reach(self.disc * self._h, AVERAGE * self._h, FULL * self._h)
         self.sight = Sight(stress, graph, reach, forks=self.forks, shares=self.shares)
+        waits = domain.dim == 3 and stress.linear and not self.shares
+        self._waiting = Waiting(self.sight, stress) if waits else None
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)  # E' in plane strain; in plane stress of its own lambda
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
@@ -122,7 +125,8 @@ class CrackTips:
         """The edges that cracks cut now, as loaded as they may be (collective)."""
         tips = self.tips()
         weak = self._weak(stress)
-        found, begun = total(self._domain.comm, np.array([len(tips), len(weak)]))
+        waits = self._waiting is not None and self._waiting.holds(self._toughness_at(tips), self._now)
+        found, begun = total(self._domain.comm, np.array([0 if waits else len(tips), len(weak)]))
         proposals = [self._grown(self.sight.look(stress, psi)) if found else self._none(0)]
         proposals.append(self._begun(weak, stress) if begun else self._none(1))
         if not found + begun:
@@ -171,8 +175,10 @@ class CrackTips:
     def _grown(self, seen: Seen) -> Proposal:
         """Tips that advance."""
         tips, d = seen.tips, self._domain.dim
-        h, toughness = self._h[tips.cell], np.broadcast_to(self.toughness, len(self._h))[tips.cell]
-        force = seen.forces() if self.shares or seen.may_reach(toughness) else np.zeros_like(tips.point)
+        h, toughness = self._h[tips.cell], self._toughness_at(tips)
+        most = seen.most()
+        reaches = self.shares or bool(np.any(most >= toughness))
+        force = seen.forces() if reaches else np.zeros_like(tips.point)
         mature = tips.mature.copy()
         size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
         ahead, apart = np.where(mature[:, None], force, tips.point - tips.behind), APART[d] * h
@@ -182,6 +188,8 @@ class CrackTips:
             turns, abreast = mature & np.any(turned, axis=1), np.any(tips.parts, axis=1)
             ahead = np.where(turns[:, None], turned, ahead)
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
+        if self._waiting is not None:
+            self._waiting.looked(size if reaches else most, self._now)
         enough = self._enough(size, toughness, tips)
         if self.forks:
             branches = turns & self._forked(tips)
@@ -200,6 +208,10 @@ class CrackTips:
         rank = self._ranked(0, sigma[active], self._numbers(tips.cell[rows]), tips.point[rows], apart[rows])
         entry = self._entry(tips.cell[rows])
         return Proposal(rank, tips.cell[rows], mean[active], entry, ahead[rows], turns[rows], branches[rows])
+
+    def _toughness_at(self, tips: Tips) -> Values:
+        """(n,) G_c of tips, J/m^2."""
+        return np.broadcast_to(self.toughness, len(self._h))[tips.cell]
 
     def _entry(self, cells: Ints) -> Ints:
         """(n,) local edge by which a crack came into cells."""
