@@ -54,18 +54,12 @@ class FewCells:
         """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
         place of those that begin at an address."""
         self._constants[:] = packed_constants(self._form)
-        arrays = [instead.get(begin(field.values), field.values) for field in self._fields]
+        arrays = [instead.get(field.values.ctypes.data, field.values) for field in self._fields]
         fields = (_Field * (len(arrays) + 1))(
             *(_Field(field.dofs.shape[1], field.size, address(field.dofs), address(array))
               for field, array in zip(self._fields, arrays, strict=True))
         )  # fmt: skip
         _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
-
-
-def begin(values: npt.NDArray[Any]) -> int:
-    """Where an array begins."""
-    place: int = values.__array_interface__["data"][0]
-    return place
 
 
 @cache
