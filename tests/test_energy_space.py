@@ -169,6 +169,19 @@ def test_the_force_along_a_front_is_that_of_what_is_near() -> None:
     np.testing.assert_allclose(both[:n], expected)
 
 
+@pytest.mark.parametrize(("end", "least"), ((0.75, 0.08), (0.8, 0.3), (0.85, 0.8), (0.9, 1.1)))
+def test_a_uniform_body_pulls_at_no_front(end: float, least: float) -> None:
+    """However near the face that it goes for: an advance would move that face as well, sum V grad q = int q n dA, which
+    a front feels otherwise as an energy that it takes to get on."""
+    scene = cracked(half(0.54, end), [1.0, 0.25, 1.0], 1 / 12)
+    look = seen(scene)
+    ahead = look.tips.ahead / np.linalg.norm(look.tips.ahead, axis=1)[:, None]
+    face = np.einsum("ni,ni->n", look.tips.surface, ahead)
+    density, none = np.tile(np.eye(3), (len(look.sigma), 1, 1)), np.zeros((len(look.sigma), 3))
+    pulls = np.einsum("ni,ni->n", look.around.forces(density, none), ahead)
+    assert (face / look.disc**2).max() > least and (np.abs(pulls) / look.disc**2).max() < 0.05
+
+
 def test_forces_and_their_bound_are_sums_over_all_cells() -> None:
     """Of any Sigma and f: as written out over the whole body; a bound that holds, and that one cell reaches whose Sigma
     pulls along its grad q, or one that is pushed."""
@@ -237,7 +250,7 @@ def test_what_is_kept_of_the_tips_is_what_is_found_anew() -> None:
         np.testing.assert_array_equal(kept.tips.mature, found.tips.mature)
         np.testing.assert_allclose(kept.tips.behind, found.tips.behind, rtol=1e-12)
         expected = found.forces()
-        np.testing.assert_allclose(kept.forces(), expected, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(kept.forces(), expected, atol=1e-12 * np.abs(expected).max(initial=0.0))
         rows = np.arange(len(kept.tips))
         np.testing.assert_allclose(kept.means(rows), found.means(rows), rtol=1e-9, atol=1e-3)
         counts.append(len(criterion.sight.crack.number))
@@ -306,14 +319,17 @@ def test_a_front_gets_on_in_few_solves(solved: list[int]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", (16, 20))
 def test_a_straight_front_takes_its_energy(n: int, solved: list[int]) -> None:
-    """The plate torn over half of its way, in jumps: its peak, G_c of the area of the cut polygons, a crack that stays
-    flat, and two solves at most for each h."""
+    """The plate torn over half of its way, in jumps: its peak, G_c of the area of the cut polygons up to a jump through
+    the rest, which takes all that is stored, a crack that stays flat, and two solves at most for each h."""
     scene = plate(n, {"time": [0, 1, 31], "value": [[0, 0, 0], [0, 0, 4.1e-6], [0, 0, 4.85e-6]]}, 31.0)
     h = float(np.median(criterion_of(scene)._h))
     found, solves = torn(scene, 0.8e-3, solved)
     assert found[:, 2].max() / 0.25e-3 == pytest.approx(645e3, rel=0.05)
-    assert found[-1, 1] / found[-1, 0] == pytest.approx(2.7e3, rel=0.08)
-    assert polygons(scene)[..., 2].std() < 0.1e-3 / 16
+    corners = polygons(scene)
+    through = corners[..., 0].max() > 0.99e-3
+    before = found[found[:, 0] < found[-1, 0]][-1] if through else found[-1]
+    assert before[0] > 0.05e-6 and before[1] / before[0] == pytest.approx(2.7e3, rel=0.08)
+    assert corners[corners[..., 0] < 0.8e-3][:, 2].std() < 0.1e-3 / 16
     assert solves * h * 0.25e-3 < 2
 
 

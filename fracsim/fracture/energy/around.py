@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
 from ...mesh.halo import Halo
+from ...mesh.small_matrices import barycentric_gradients
 from .asked import Asked
 
 Ints = npt.NDArray[np.int64]
@@ -27,6 +28,17 @@ def local_size(domain: Domain) -> Values:
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
     return np.asarray((factorial(domain.dim) * (rows[:, 0] / rows[:, 1])[nodes].mean(axis=1)) ** (1 / domain.dim))
+
+
+def surface_of(domain: Domain) -> tuple[Values, Values]:
+    """(cells, d) int n dA over the facets that cells of this rank have in the body's surface, outwards, and (cells, d)
+    the mean of the middles of these facets, m."""
+    corners, outside = domain.nodes[domain.cell_nodes], domain.sides_outside
+    areas = -domain.dim * domain.volumes[:, None, None] * barycentric_gradients(corners)
+    middles = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
+    count = np.maximum(outside.sum(axis=1), 1)[:, None]
+    vector, place = (np.einsum("nk,nki->ni", outside, each) for each in (areas, middles))
+    return vector, place / count
 
 
 @dataclass(frozen=True)
@@ -88,6 +100,7 @@ class Around:
 
     Attributes:
         number: (near,) of cells in the input mesh, rising.    volumes: (near,) m^d.    centres: (near, d) m.
+        outside: (near, d) int n dA over what cells have of the body's surface, m^(d-1).    there: (near, d) its middle.
     """
 
     def __init__(self, domain: Domain, reach: float) -> None:
@@ -95,10 +108,11 @@ class Around:
         own = domain.nodes[domain.cell_nodes].mean(axis=1)
         halo, self._comm = Halo(domain.comm, own, reach), domain.comm
         rank, index = np.full(len(own), float(domain.comm.rank)), np.arange(float(len(own)))
-        known = halo(np.column_stack([domain.cell_input, rank, index, domain.volumes, own]))
+        known = halo(np.column_stack([domain.cell_input, rank, index, domain.volumes, own, *surface_of(domain)]))
         known = known[np.argsort(known[:, 0], kind="stable")]
         self.number, self._rank, self._index = known[:, :3].T.astype(np.int64)
-        self.volumes, self.centres = known[:, 3].copy(), known[:, 4:].copy()
+        self.volumes = known[:, 3].copy()
+        self.centres, self.outside, self.there = (each.copy() for each in np.split(known[:, 4:], 3, axis=1))
         self._tree = cKDTree(self.centres)
 
     def pairs(self, places: Values, radius: Values) -> Pairs:

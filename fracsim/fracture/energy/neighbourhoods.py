@@ -100,6 +100,7 @@ class Neighbourhoods:
         self._place: Ints = none
         self._cell: Ints = none
         self._weights: Values = np.empty((0, graph.domain.dim + len(_Sum)))
+        self._crossed: Values = nowhere  # and int q n dA over what it has of the body's surface
         self._matrices: dict[int, csr_matrix] = {}
         self._products: tuple[csc_matrix, csc_matrix, csc_matrix] | None = None
 
@@ -146,14 +147,22 @@ class Neighbourhoods:
 
     @property
     def _force(self) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
-        """(tips, d asked) V grad q, one axis after the other, (tips, asked) V q and V |grad q|; by columns, which takes
-        two thirds of the time: in rows each sum waits for the one before."""
+        """(tips, d asked) V grad q less int q n dA, one axis after the other, (tips, asked) V q and the size of these;
+        by columns, which takes two thirds of the time: in rows each sum waits for the one before."""
         if self._products is None:
-            axes = [self._matrix(axis) for axis in range(self.tips.point.shape[1])]
+            slopes = self._weights[:, : self.tips.point.shape[1]] - self._crossed_ahead()
+            axes = [self._sparse(each) for each in slopes.T]
             steep = sum(each.multiply(each) for each in axes).sqrt()
             matrices = hstack(axes), self._matrix(len(axes) + _Sum.INSIDE), steep
             self._products = tuple(each.tocsc() for each in matrices)
         return self._products
+
+    def _crossed_ahead(self) -> Values:
+        """(pairs, d) int q n dA over the body's surface around tips that go for it; in the plane 0."""
+        tips = self.tips
+        onwards, size = (np.linalg.norm(each, axis=1) for each in (tips.ahead, tips.surface))
+        faces = np.einsum("ni,ni->n", tips.ahead, tips.surface) ** 2 > (onwards * size) ** 2 / 2
+        return (faces & (tips.point.shape[1] == 3))[self._place, None] * self._crossed
 
     def means(self, rows: Ints, stress: Values) -> Values:
         """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, 3 or 6) which have not come apart,
@@ -201,10 +210,14 @@ class Neighbourhoods:
             data = self._weights[:, column]
             if column > self._graph.domain.dim:
                 data = np.where(self._split[self._cell], 0.0, data)
-            matrix = csr_matrix((data, self._index, self._ends), shape=self._shape, copy=True)
-            matrix.eliminate_zeros()  # in place
-            self._matrices[column] = matrix
+            self._matrices[column] = self._sparse(data)
         return self._matrices[column]
+
+    def _sparse(self, data: Values) -> csr_matrix:
+        """(tips, asked) of what pairs have."""
+        matrix = csr_matrix((data, self._index, self._ends), shape=self._shape, copy=True)
+        matrix.eliminate_zeros()  # in place
+        return matrix
 
     # --- what lies around ---
 
@@ -219,7 +232,7 @@ class Neighbourhoods:
         kept[kept] = old.pattern[row[kept]] == graph.pattern[cell[kept]]
         new = np.flatnonzero(~kept)
         point = self._front.middles(cell, cut)
-        place, cells, weights, surface = self._surroundings(cell[new], point[new])
+        place, cells, weights, crossed = self._surroundings(cell[new], point[new])
         after = np.full(len(old), -1)
         after[row[kept]] = np.flatnonzero(kept)
         stays = np.flatnonzero(after[self._place] >= 0)
@@ -227,16 +240,18 @@ class Neighbourhoods:
         order = np.argsort(every, kind="stable")
         self._place, self._cell = every[order], np.concatenate([self._cell[stays], cells])[order]
         self._weights = np.concatenate([self._weights[stays], weights])[order]
+        self._crossed = np.concatenate([self._crossed[stays], crossed])[order]
         behind, ahead, course, parts, surfaces = np.zeros((5, *point.shape))
         mature, waits, alone = np.zeros((3, len(cell)), bool)
-        surfaces[new] = surface
+        size, slope = len(new), weights[:, : point.shape[1]]
+        surfaces[new] = np.column_stack([np.bincount(place, each, size) for each in slope.T])
         self.tips = Tips(cell, graph.pattern[cell], point, behind, mature, ahead, course, parts, waits, alone, surfaces)
         for each in ("behind", "mature", "ahead", "course", "parts", "waits", "alone", "surface"):
             getattr(self.tips, each)[kept] = getattr(old, each)[row[kept]]
         return ~kept
 
     def _surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
-        """Of tips: the tip and the cell of each pair, (pairs, d + 4) weights and (n, d) the surface in the discs."""
+        """Of tips: the tip and the cell of each pair, its (pairs, d + 3) weights and (pairs, d) int q n dA of it."""
         disc, average = self._reach.disc[cell], self._reach.average[cell]
         pairs = self._around.pairs(point, disc)
         volume, r, R = self._around.volumes[pairs.other], pairs.distance, disc[pairs.place]
@@ -244,7 +259,8 @@ class Neighbourhoods:
         share = 1 - r / average[pairs.place]
         columns = [plateau(r, R), np.maximum(share, 0.0), share > 0]
         weights = np.column_stack([slope, *(volume * each for each in columns)])
-        return pairs.place, pairs.other, weights, pairs.sum(slope)
+        apart = np.linalg.norm(self._around.there[pairs.other] - point[pairs.place], axis=1)
+        return pairs.place, pairs.other, weights, plateau(apart, R)[:, None] * self._around.outside[pairs.other]
 
     def _near(self, changed: Values) -> Flags:
         """(n,) whether a tip sees any of the cells with these centres (m, d)."""
