@@ -14,9 +14,13 @@ from petsc4py import PETSc
 from ..mechanics.balance import Balance
 from .descent import Descent
 
+type Way = tuple[tuple[float, float], bool]
+
 # attempts with positive moduli: below which share of their residual tangents are exact, and negative eigenvalues that
-# are let be, in mean moduli of a cell
-POSITIVE = (1e-2, 1e-2), (0.0, 0.0)
+# are let be, in mean moduli of a cell; whether preconditioners are made anew for each tangent. The second goes on from
+# where exact tangents misled the first
+POSITIVE = ((1e-2, 1e-2), False), ((0.0, 0.0), False), ((0.0, 0.0), True)
+EXACT = (math.inf, 0.0), False  # an attempt with exact tangents throughout
 PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
 
 

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..mechanics.balance import Balance
 from .choice import Choice
+from .downhill import EXACT, POSITIVE
 from .factors import SOONER_THAN_GMRES
 from .linear import Linear, chosen_options
 from .petsc_options import Options, OptionSet, refusing
@@ -22,7 +23,7 @@ from .preconditioner import Due
 from .stepper import SolveResult
 
 if TYPE_CHECKING:
-    from .downhill import Downhill
+    from .downhill import Downhill, Way
 
 Values = npt.NDArray[np.float64]
 
@@ -32,6 +33,7 @@ LARGE_GAP = 0.01
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
 
+CRAWL = 5  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
 ON_THE_WAY = 1e-2  # rtol of all but the last of them
@@ -76,6 +78,7 @@ class Solver:
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._first = self._last_little = 0.0
+        self._norms: list[float] = []
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
         self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
@@ -150,6 +153,8 @@ class Solver:
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)
+        if self._has_crawled:
+            result = self._attempt_downhill(None, (EXACT,))
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
         if self._misled(result):
             if self._sets_out_anew:
@@ -157,7 +162,7 @@ class Solver:
             # Smoothers of an older tangent need not be positive for this one.
             self.linear.preconditioner.due = Due.REBUILD
             if self.balance.conservative:
-                result = self._attempt_positively(start)
+                result = self._attempt_downhill(start, POSITIVE)
             else:
                 with self.linear.set_up_anew():
                     result = self._attempt(start)
@@ -171,6 +176,10 @@ class Solver:
             self.snes.ksp.setType("cg")
         return result
 
+    @property
+    def _has_crawled(self) -> bool:
+        return self._may_go_down and self._is_slow
+
     @cached_property
     def _sets_out_anew(self) -> bool:
         """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
@@ -178,16 +187,14 @@ class Solver:
         or contact set the pace that place is no better."""
         return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_steps
 
-    def _attempt_positively(self, guess: Values | None) -> SolveResult:
-        """With moduli made positive, down the incremental potential. (From the start of every attempt they would cost
-        more than they save.)"""
-        from .downhill import POSITIVE
-
+    def _attempt_downhill(self, guess: Values | None, ways: tuple[Way, ...]) -> SolveResult:
+        """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive
+        moduli would cost more than they save.)"""
         down = self._downhill = self._downhill or self._another_downhill()
-        for kept, how in zip((True, False), POSITIVE, strict=True):
+        for (how, anew), start in zip(ways, (guess, None, guess), strict=False):
             down.made_positive(how)
-            with nullcontext() if kept else self.linear.set_up_anew():
-                result = self._attempt(guess, (down.snes, down))
+            with self.linear.set_up_anew() if anew else nullcontext():
+                result = self._attempt(start, (down.snes, down))
             if not self._misled(result):
                 break
         down.made_positive(None)
@@ -332,7 +339,26 @@ class Solver:
             return int(reason.DIVERGED_INNER)
         if self._down is not None and self.balance.scheme.inertia and self._down.stalls(norms[2], its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
+        if self._crawls(norms[2], its):
+            return int(reason.DIVERGED_LINE_SEARCH)
         return int(reason.ITERATING)
+
+    def _crawls(self, norm: float, its: int) -> bool:
+        """Whether the line search has cut the last steps to next to nothing, by a norm that is no merit of them: the
+        residual of one cell that is all but flat grows before it falls. Down the potential they would be whole ones."""
+        if its == 0:
+            self._norms = []
+        self._norms.append(norm)
+        return self._may_go_down and self._is_slow
+
+    @property
+    def _is_slow(self) -> bool:
+        return len(self._norms) > CRAWL and self._norms[-1] > self._norms[-1 - CRAWL] / 2
+
+    @property
+    def _may_go_down(self) -> bool:
+        """Whether there is a potential to go down, and this attempt, by CG, does not."""
+        return self._down is None and self.balance.conservative and self.snes.ksp.getType() == "cg"
 
     def _is_small(self, norm: float, its: int) -> bool:
         """Whether that is so of |r| after so many iterations (collective)."""
