@@ -357,8 +357,11 @@ class Solver:
 
     @property
     def _may_go_down(self) -> bool:
-        """Whether there is a potential to go down, and this attempt, by CG, does not."""
-        return self._down is None and self.balance.conservative and self.snes.ksp.getType() == "cg"
+        """Whether there is a potential to go down, and this attempt, by CG, does not. (Without inertia factors see to
+        what iterations are slow with.)"""
+        balance = self.balance
+        down = self._down is not None or not (balance.conservative and balance.scheme.inertia)
+        return not down and self.snes.ksp.getType() == "cg"
 
     def _is_small(self, norm: float, its: int) -> bool:
         """Whether that is so of |r| after so many iterations (collective)."""
