@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.ranks import total
@@ -60,12 +61,24 @@ class Level:
         self.beside = beside
         self._rows = Rows(made, own.starts, own.columns)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
+        rows = np.repeat(np.arange(nodes.size_local), np.diff(own.starts))
+        self._on_diagonal = np.flatnonzero(own.columns == rows)
         self.take(own.values)
-        self._weights = chebyshev(self._largest(), STEPS)
+        self._at_first = self._largest()
+        self._weights = chebyshev(self._at_first, STEPS)
 
     def take(self, values: Values) -> None:
         """Those of the blocks of A, as many as at first."""
         self._rows.take(values, self.scale, self.scale)
+
+    def follow(self, values: Values) -> None:
+        """Take others, and smooth for the largest eigenvalue that they may have, as the diagonal of A' has grown: what
+        is beyond HIGH of it would make M negative (collective)."""
+        self.take(values)
+        axes = np.arange(self._size)
+        diagonal = values.reshape(-1, self._size, self._size)[self._on_diagonal[:, None], axes, axes].reshape(-1)
+        grown = float(np.max(diagonal * self.scale[: self._owned] ** 2, initial=1.0))
+        self._weights = chebyshev(self._at_first * self._comm.allreduce(grown, op=MPI.MAX), STEPS)
 
     def _largest(self) -> float:
         """About the largest eigenvalue of A', from below, by Lanczos' method; 1 at least, as its diagonal is
@@ -176,8 +189,8 @@ class Cycle:
         return np.asarray(self._tangent.data, np.float64)
 
     def follow(self) -> None:
-        """Take the tangent as it is now for the finest level."""
-        self._levels[-1].take(self._values)
+        """Take the tangent as it is now for the finest level (collective)."""
+        self._levels[-1].follow(self._values)
         self._levels[-1].beside = self._products.beside
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
