@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mesh.ranks import total
+from ..mesh.ranks import largest, total
 from .levels import Blocks, Copy, copied
 from .rows import Code, Rows, Vector, code
 
@@ -78,7 +77,7 @@ class Level:
         axes = np.arange(self._size)
         diagonal = values.reshape(-1, self._size, self._size)[self._on_diagonal[:, None], axes, axes].reshape(-1)
         grown = float(np.max(diagonal * self.scale[: self._owned] ** 2, initial=1.0))
-        self._weights = chebyshev(self._at_first * self._comm.allreduce(grown, op=MPI.MAX), STEPS)
+        self._weights = chebyshev(self._at_first * largest(self._comm, grown), STEPS)
 
     def _largest(self) -> float:
         """About the largest eigenvalue of A', from below, by Lanczos' method; 1 at least, as its diagonal is

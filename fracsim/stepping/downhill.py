@@ -8,19 +8,32 @@ again, for there Newton's method gains its digits; where they are not positive e
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from .descent import Descent
 
-type Way = tuple[tuple[float, float], bool]
 
-# attempts with positive moduli: below which share of their residual tangents are exact, and negative eigenvalues that
-# are let be, in mean moduli of a cell; whether preconditioners are made anew for each tangent. The second goes on from
-# where exact tangents misled the first
-POSITIVE = ((1e-2, 1e-2), False), ((0.0, 0.0), False), ((0.0, 0.0), True)
-EXACT = (math.inf, 0.0), False  # an attempt with exact tangents throughout
+class Way(NamedTuple):
+    """How an attempt goes down.
+
+    Attributes:
+        exact_below: share of the greatest residual below which tangents are exact.
+        small: negative eigenvalues that are let be otherwise, in mean moduli of a cell.
+        anew: whether preconditioners are made for each tangent.    goes_on: from where the last attempt has come to.
+    """
+
+    exact_below: float
+    small: float
+    anew: bool = False
+    goes_on: bool = False
+
+
+# with positive moduli; the second goes on from where exact tangents have misled the first
+POSITIVE = Way(1e-2, 1e-2), Way(0.0, 0.0, goes_on=True), Way(0.0, 0.0, anew=True)
+EXACT = Way(math.inf, 0.0, goes_on=True)  # exact tangents throughout
 PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
 
 
@@ -39,8 +52,8 @@ class Downhill:
         snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
         self.made_positive(None)
 
-    def made_positive(self, how: tuple[float, float] | None) -> None:
-        """An attempt begins: tangents are those of one of POSITIVE, or exact."""
+    def made_positive(self, how: Way | None) -> None:
+        """An attempt begins: tangents are those of a way, or exact."""
         self._how, self._highest = how, 0.0
         self._least, self._least_at = math.inf, 0
 
@@ -49,10 +62,9 @@ class Downhill:
         """Of the tangent at the present iterate (Stiffness.assemble); None: it is exact."""
         if self._how is None:
             return None
-        exact_below, small = self._how
         norm = self.snes.getFunctionNorm()
         self._highest = max(self._highest, norm)
-        return None if norm < exact_below * self._highest else small
+        return None if norm < self._how.exact_below * self._highest else self._how.small
 
     def stalls(self, norm: float, its: int) -> bool:
         """Whether it goes about in circles: exact tangents that are not positive, though CG does not notice, lead past

@@ -78,7 +78,7 @@ class Solver:
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._first = self._last_little = 0.0
-        self._norms: list[float] = []
+        self._norms: list[float] = []  # of the residual in the last attempt
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
         self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
@@ -153,7 +153,7 @@ class Solver:
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
         result = self._attempt(guess)
-        if self._has_crawled:
+        if self._crawls:
             result = self._attempt_downhill(None, (EXACT,))
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
         if self._misled(result):
@@ -176,10 +176,6 @@ class Solver:
             self.snes.ksp.setType("cg")
         return result
 
-    @property
-    def _has_crawled(self) -> bool:
-        return self._may_go_down and self._is_slow
-
     @cached_property
     def _sets_out_anew(self) -> bool:
         """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
@@ -191,10 +187,10 @@ class Solver:
         """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive
         moduli would cost more than they save.)"""
         down = self._downhill = self._downhill or self._another_downhill()
-        for (how, anew), start in zip(ways, (guess, None, guess), strict=False):
-            down.made_positive(how)
-            with self.linear.set_up_anew() if anew else nullcontext():
-                result = self._attempt(start, (down.snes, down))
+        for way in ways:
+            down.made_positive(way)
+            with self.linear.set_up_anew() if way.anew else nullcontext():
+                result = self._attempt(None if way.goes_on else guess, (down.snes, down))
             if not self._misled(result):
                 break
         down.made_positive(None)
@@ -235,6 +231,7 @@ class Solver:
     def _attempt(self, guess: Values | None, other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
         """From `guess`; None: from where the last attempt has come to."""
         self.snes, self._down = other or self._first_choice
+        self._norms = []
         self._shrink()
         self.balance.set_out()
         extended = 0 if guess is None else self._start_from(guess)
@@ -339,29 +336,18 @@ class Solver:
             return int(reason.DIVERGED_INNER)
         if self._down is not None and self.balance.scheme.inertia and self._down.stalls(norms[2], its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
-        if self._crawls(norms[2], its):
-            return int(reason.DIVERGED_LINE_SEARCH)
-        return int(reason.ITERATING)
+        self._norms.append(norms[2])
+        return int(reason.DIVERGED_LINE_SEARCH if self._crawls else reason.ITERATING)
 
-    def _crawls(self, norm: float, its: int) -> bool:
+    @property
+    def _crawls(self) -> bool:
         """Whether the line search has cut the last steps to next to nothing, by a norm that is no merit of them: the
-        residual of one cell that is all but flat grows before it falls. Down the potential they would be whole ones."""
-        if its == 0:
-            self._norms = []
-        self._norms.append(norm)
-        return self._may_go_down and self._is_slow
-
-    @property
-    def _is_slow(self) -> bool:
-        return len(self._norms) > CRAWL and self._norms[-1] > self._norms[-1 - CRAWL] / 2
-
-    @property
-    def _may_go_down(self) -> bool:
-        """Whether there is a potential to go down, and this attempt, by CG, does not. (Without inertia factors see to
-        what iterations are slow with.)"""
-        balance = self.balance
-        down = self._down is not None or not (balance.conservative and balance.scheme.inertia)
-        return not down and self.snes.ksp.getType() == "cg"
+        residual of one cell that is all but flat grows before it falls. Down the potential, if there is one that this
+        attempt does not go by, they would be whole ones. (Without inertia factors see to what is slow.)"""
+        norms, balance = self._norms, self.balance
+        slow = len(norms) > CRAWL and norms[-1] > norms[-1 - CRAWL] / 2
+        goes_down = self._down is not None or not (balance.conservative and balance.scheme.inertia)
+        return slow and not goes_down and self.snes.ksp.getType() == "cg"
 
     def _is_small(self, norm: float, its: int) -> bool:
         """Whether that is so of |r| after so many iterations (collective)."""
