@@ -150,9 +150,9 @@ def fields_of(expression: fem.Expression) -> list[fem.Function]:
     return [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
 
 
-def constants_of(expression: fem.Expression) -> npt.NDArray[np.float64]:
-    """The constants that it is given."""
-    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(expression._cpp_object)
+def constants_of(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
+    """The constants that the kernel of a form or an expression is given."""
+    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(kind._cpp_object)
     return constants
 
 
@@ -160,7 +160,7 @@ def packed(form: fem.Form) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
     """What the kernel of a form over cells is given: (cells, width) numbers of its fields, and its constants."""
     compiled: Any = form._cpp_object
     (fields,) = dolfinx.cpp.fem.pack_coefficients(compiled).values()
-    return fields, dolfinx.cpp.fem.pack_constants(compiled)
+    return fields, constants_of(form)
 
 
 @dataclass(frozen=True)
@@ -183,12 +183,6 @@ def kernel_of(form: fem.Form) -> int:
     """The address of the kernel of a form with one integral, over cells."""
     module: Any = form.module
     return int(module.ffi.cast("uintptr_t", form.ufcx_form.form_integrals[0].tabulate_tensor_float64))
-
-
-def packed_constants(form: fem.Form) -> npt.NDArray[np.float64]:
-    """The constants of a form."""
-    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(form._cpp_object)
-    return constants
 
 
 def cells_of(form: fem.Form) -> Ints:
