@@ -41,7 +41,5 @@ ROUND = [100.0, 10.0, 0.1, *[0.11] * 30]  # exact below a hundredth: from the th
         ([100.0, *(0.5 * 0.99**k for k in range(30))], POSITIVE[0], None),
     ],
 )
-def test_what_goes_about_in_circles_gives_up(
-    norms: list[float], how: Way | None, at: int | None
-) -> None:
+def test_what_goes_about_in_circles_gives_up(norms: list[float], how: Way | None, at: int | None) -> None:
     assert stalls_after(norms, how) == at
