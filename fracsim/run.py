@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -16,26 +16,21 @@ from .errors import CannotWrite, NotConverged, Stopped
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
 from .output.checkpoint import Notes, checkpoint_path, read_checkpoint, read_notes, write_checkpoint
-from .output.energy_gain import EnergyGain, worth_telling
 from .output.folder import OutputClock, check_folder, check_readable, make_folder, versions
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
-from .output.inverted_cells import InvertedCells
 from .output.progress import Progress
-from .output.summary import Meter, Monitors, say, write_summary
+from .output.summary import Meter, say, write_summary
 from .output.writing import written
 from .scene import Scene, build_scene
 from .stepping.stepper import StepReport
 from .study import Study
 from .study.file import completed, study_text
+from .watched import Watched, wants_surface
 
 if TYPE_CHECKING:
     from .output.crack_front import CrackFront
-    from .output.load_drop import LoadDrop
-    from .output.meetings import Meetings, Met
-    from .output.overlapping import Overlapping
-    from .output.passing import Passing
 
 FRAMES = 50  # of a run whose study says neither every nor interval
 
@@ -46,8 +41,7 @@ class Run:
     Attributes:
         scene, folder: what is stepped, and where it is written.    state: where it has come to.
         history: the rows of history.csv.    frames: what is written from time to time.    breaks: the edges that broke.
-        inverted, gained, meetings, passing: what makes a result doubtful, the last two None where nothing can.
-        monitors: they, and what the run has used.
+        watched: what makes a result doubtful, what ends the run early, and what it has used.
         interrupt: what may end the run early.
     """
 
@@ -106,29 +100,18 @@ class Run:
         on_root(self.comm, lambda: make_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
         self.history = History(self.comm, folder / "history.csv", names, step, study.thickness)
-        self._watch(notes)
+        self.watched = Watched(self.scene, self.history, self._meter)
+        if notes is not None:
+            self.watched.restore(notes.monitors)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
-            passing=self.passing, resume_at=t, thickness=study.thickness,
+            passing=self.watched.passing, resume_at=t, thickness=study.thickness,
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
         # it tells how the run ended, which is open again
         written(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
-
-    def _watch(self, notes: Notes | None) -> None:
-        """What is watched from step to step, going on from where there are notes."""
-        stress = self.scene.balance.stress
-        self.inverted = InvertedCells(stress, self.scene.fracture)
-        self.gained = EnergyGain(at_rest=self.scene.study.at_rest, floor=worth_telling(stress))
-        self.meetings, self.overlapping, self.passing = self._contact_watched()
-        self.drop = self._load_drop()
-        watching = (self.meetings, self.overlapping, self.passing, self.drop)
-        others = [each for each in watching if each is not None]
-        self.monitors = Monitors(self.history, self.inverted, self.gained, self._meter, others)
-        if notes is not None:
-            self.monitors.restore(notes.monitors)
 
     def _crack_front(self) -> CrackFront | None:
         """Where cracks say where they cut: how long they are, and their tip."""
@@ -140,40 +123,10 @@ class Run:
         assert self.breaks.record is not None
         return CrackFront(self.breaks.record)
 
-    def _load_drop(self) -> LoadDrop | None:
-        """What ends the run early."""
-        study = self.scene.study
-        if (until := study.time.until) is None:
-            return None
-        from .output.load_drop import LoadDrop
-
-        return LoadDrop(study.watched, until.drop, until.above, breaks=study.fracture is not None)
-
     @property
     def ended(self) -> bool:
         """Whether the run is at its end: that of the study, or that of `time.until`."""
-        return self.scene.ended(self.state) or (self.drop is not None and self.drop.reached)
-
-    def _contact_watched(self) -> tuple[Meetings | None, Overlapping | None, Passing | None]:
-        """What watches obstacles, those that move freely, and pieces that nothing keeps apart: each only where it can
-        tell anything."""
-        study, meetings, overlapping, passing = self.scene.study, None, None, None
-        if study.obstacle:
-            from .mechanics.contact.obstacles import Obstacles
-            from .output.meetings import Meetings
-
-            terms = [term for term in self.scene.balance.terms if term.name in ("obstacles", "solids")]
-            meetings = Meetings(cast("list[Met]", terms))
-            if len(study.obstacle) > 1 and any(each.free for each in study.obstacle):
-                from .output.overlapping import Overlapping
-
-                watched = [term for term in terms if isinstance(term, Obstacles)]
-                overlapping = Overlapping(watched[0]) if watched else None
-        if wants_surface(study) and (study.contact is None or not study.contact.itself):
-            from .output.passing import Passing
-
-            passing = Passing()
-        return meetings, overlapping, passing
+        return self.scene.ended(self.state) or self.watched.dropped
 
     # --- one step, one frame, one checkpoint ---
 
@@ -185,13 +138,8 @@ class Run:
         probes = self.scene.probes()
         front = self.front() if self.front is not None else ()
         self.history.append(self.state, report, self.breaks.figures, np.array([*probes, *front]))
-        if self.meetings is not None or self.drop is not None:
-            figures = {name: float(value) for name, value in zip(self.scene.probes.names, probes, strict=True)}
-            if self.meetings is not None:
-                self.meetings.look(self.state, report.dt, figures)
-            if self.drop is not None:
-                self.drop.look(self.state.t, figures, self.breaks.figures[0])
-        self.gained.look(report, self.state)
+        figures = {name: float(value) for name, value in zip(self.scene.probes.names, probes, strict=True)}
+        self.watched.look(self.state, report, figures, self.breaks.figures[0])
         return report
 
     def note_breaks(self) -> None:
@@ -204,17 +152,15 @@ class Run:
     def write_frame(self) -> None:
         """Write the body as it is now, and look at its cells. Raises CannotWrite (collective)."""
         began = time.perf_counter()
-        self.inverted.look(self.state.t)
+        self.watched.look_at_frame(self.state.t)
         self.frames.write(self.state)
-        if self.overlapping is not None:
-            self.overlapping.look(self.state.t)
         self._clock.wrote(self.state)
         self._meter.output += time.perf_counter() - began
 
     def checkpoint(self) -> Path:
         """Write a checkpoint of now; returns its path. Raises CannotWrite (collective)."""
         began = time.perf_counter()
-        notes, domain, breaks = Notes(self._text, self.monitors.saved()), self.scene.domain, self.breaks
+        notes, domain, breaks = Notes(self._text, self.watched.saved()), self.scene.domain, self.breaks
         balance = self.scene.balance
         breaks.remember()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
@@ -274,14 +220,7 @@ class Run:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
-        notes = self.monitors.notes(self.scene.study.material.energy, self.scene.study.time.scheme)
-        if self.meetings is not None:
-            notes += self.meetings.notes(done=outcome == "done")
-        if self.overlapping is not None:
-            notes += self.overlapping.notes()
-        if self.passing is not None:
-            notes += self.passing.notes(implicit=self.scene.study.time.kind.implicit)
-        say(self.comm, notes)
+        say(self.comm, self.watched.notes(done=outcome == "done"))
         return summary
 
     def _summary(self, outcome: str) -> dict[str, Any]:
@@ -293,7 +232,7 @@ class Run:
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces, "dust": dust, "dust_mass": dust_mass,
-            "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.monitors.summary(),
+            "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.watched.summary(),
         }  # fmt: skip
 
     # --- where to go on from ---
@@ -326,13 +265,6 @@ def wanted_fields(study: Study) -> list[str]:
     if study.output.fields is not None:
         return study.output.fields
     return ["damage", "von_mises"] if study.fracture is not None else ["von_mises"]
-
-
-def wants_surface(study: Study) -> bool:
-    """Whether the split surface is written: as the study says, or where something breaks or stands in the way."""
-    if study.output.surface is None:
-        return study.fracture is not None or bool(study.obstacle)
-    return study.output.surface
 
 
 def wants_smooth(study: Study) -> bool:

@@ -6,18 +6,13 @@ import json
 import resource
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from mpi4py import MPI
 
 from ..mesh.ranks import total
 from ..stepping.stepper import Stepper
-from .energy_gain import EnergyGain
-from .folder import versions
-from .history import History
-from .inverted_cells import InvertedCells
 from .writing import replace_text, written
 
 
@@ -58,68 +53,6 @@ class Meter:
     def restore(self, monitors: dict[str, Any]) -> None:
         """Go on from what `read` gave."""
         self._earlier = {name: monitors[name] for name in self._earlier}
-
-
-class Monitor(Protocol):
-    """Something that is watched."""
-
-    def monitors(self) -> dict[str, Any]:
-        """What a restart goes on from, for `restore` (collective)."""
-
-    def restore(self, monitors: dict[str, Any]) -> None:
-        """Go on from `monitors`."""
-
-    def summary(self) -> dict[str, Any]:
-        """Its part of summary.json (rank 0)."""
-
-
-class Monitors:
-    """All that is watched from step to step and goes on with a restart."""
-
-    def __init__(
-        self,
-        history: History,
-        inverted: InvertedCells,
-        gained: EnergyGain,
-        meter: Meter,
-        others: Sequence[Monitor] = (),
-    ) -> None:
-        """`others`: those that are there in some runs only."""
-        self.history, self.inverted, self.gained, self.meter = history, inverted, gained, meter
-        self._others = others
-
-    def saved(self) -> dict[str, Any]:
-        """For a checkpoint (collective)."""
-        watched: dict[str, Any] = self.inverted.monitors() | self.gained.monitors()
-        watched |= {"peak_reactions": self.history.peaks, "worked": self.history.worked}
-        for monitor in self._others:
-            watched |= monitor.monitors()
-        return watched | self.meter.read()
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Go on from those of a checkpoint."""
-        watched: list[Any] = [self.inverted, self.gained, self.meter, *self._others]
-        for monitor in watched:
-            monitor.restore(saved)
-        self.history.peaks |= saved["peak_reactions"]
-        self.history.worked |= saved.get("worked", {})
-
-    def summary(self) -> dict[str, Any]:
-        """Their part of summary.json (collective)."""
-        used = self.meter.read()
-        return {
-            **used["trouble"], "smallest_J": self.inverted.least,
-            "inverted_cells": self.inverted.count, "peak_reactions": self.history.peaks,
-            "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
-            "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
-            **{name: found for each in self._others for name, found in each.summary().items()},
-            "ranks": self.history.comm.size, "versions": versions(self.history.comm),
-        }  # fmt: skip
-
-    def notes(self, energy: str, scheme: str) -> list[str]:
-        """Sentences on what makes the result doubtful; `energy` and `scheme` are those of the study (collective)."""
-        trouble = trouble_in_words(self.meter.read()["trouble"])
-        return [note for note in (trouble, self.inverted.note(energy), self.gained.note(scheme)) if note]
 
 
 # what a run went on in spite of; a step that was halved and then taken is no trouble
