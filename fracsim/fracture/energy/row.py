@@ -42,15 +42,16 @@ class RowTips(CrackTips):
         self._leading = self._none(0)
         return super().__call__(stress, psi)
 
-    def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
-        """(n,) which tips reach G_c, or lack little of it in the ball of one that does (collective)."""
+    def _ready(self, size: Values, toughness: Values, tips: Tips) -> tuple[Flags, Flags]:
+        """(n,) which tips reach G_c, or lack little of it in the ball of one that does; none goes on as two
+        (collective)."""
         reach = size >= toughness
         first = tips.point[reach & tips.mature & ~self.barred[tips.cell]]
         every = np.concatenate(self._domain.comm.allgather(first))
         if not len(every):
-            return reach
+            return reach, np.zeros(len(tips), bool)
         near = cKDTree(every).query(tips.point)[0] < self.disc * self._h[tips.cell]
-        return np.asarray(reach | (near & (size >= (1 - ABOUT) * toughness)))
+        return reach | (near & (size >= (1 - ABOUT) * toughness)), np.zeros(len(tips), bool)
 
     def _grown(self, seen: Seen) -> Proposal:
         """Tips that advance, each on its plane; those that go by G lead on."""

@@ -79,7 +79,6 @@ class RunningTips(CrackTips):
         super().__init__(*args, **kwargs)
         self.carried = np.tile(STANDS, (len(self._graph.broken), 1))
         self._due: Flags = np.empty(0, bool)
-        self._flow: Values = np.empty(0)
 
     def memory(self) -> object:
         """Where cracks cut, and how they run."""
@@ -91,21 +90,19 @@ class RunningTips(CrackTips):
         cut, self.carried[:] = memory
         super().recall(cut)
 
-    def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
-        """(n,) which tips have come to the end of what they cut last; in long steps, reach G_c."""
+    def _ready(self, size: Values, toughness: Values, tips: Tips) -> tuple[Flags, Flags]:
+        """(n,) which tips have come to the end of what they cut last, in long steps reach G_c; and which go on as
+        two."""
         entry, rate = self._graph.cell_edges[tips.cell, self._entry(tips.cell)], self._rate[tips.cell]
         slow, left, flow, at = self.carried[entry].T
         time = np.where(np.isnan(at), 0.0, self._now - at)
         slow = np.where(tips.mature & (size > 0), slower(slow, size / toughness, rate * time), 1.0)
-        self._flow = later(flow, size / toughness, rate * time)
+        flow = later(flow, size / toughness, rate * time)
         left = left - (1 - slow) * rate * self.disc * self._h[tips.cell] * time
-        self.carried[entry] = np.column_stack([slow, left, self._flow, np.full(len(at), self._now)])
+        self.carried[entry] = np.column_stack([slow, left, flow, np.full(len(at), self._now)])
         self._due = (slow < 1) & (left <= 0)
-        return np.where(self._sees_waves(tips), self._due, size >= toughness)
-
-    def _forked(self, tips: Tips) -> Flags:
-        """(n,) which tips go on as two."""
-        return tips.alone & (self._flow >= TIPS) & self._sees_waves(tips)
+        sees = self._sees_waves(tips)
+        return np.where(sees, self._due, size >= toughness), tips.alone & (flow >= TIPS) & sees
 
     def _sees_waves(self, tips: Tips) -> Flags:
         """(n,) whether a Rayleigh wave stays in the disc of a tip within a step."""

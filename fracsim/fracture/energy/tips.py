@@ -190,9 +190,9 @@ class CrackTips:
             apart = np.where(abreast, APART[3] * h, apart)  # what goes abreast gets on alike
         if self._waiting is not None:
             self._waiting.looked(size if reaches else most, self._now)
-        enough = self._enough(size, toughness, tips)
+        enough, forked = self._ready(size, toughness, tips)
         if self.forks:
-            branches = turns & self._forked(tips)
+            branches = turns & forked
             ahead = np.where(branches[:, None], tips.course, ahead)
         stays = (tips.waits & (size < TIPS * toughness)) | self.barred[tips.cell]
         may = np.flatnonzero((~mature | enough) & ~stays)
@@ -217,13 +217,10 @@ class CrackTips:
         """(n,) local edge by which a crack came into cells."""
         return np.argmax(~self._graph.intact(cells), axis=1)
 
-    def _enough(self, size: Values, toughness: Values, tips: Tips) -> Flags:
-        """(n,) which tips, on which a force of `size` (n,) acts, reach their G_c (collective)."""
-        return size >= toughness
-
-    def _forked(self, tips: Tips) -> Flags:
-        """(n,) which tips go on as two, once `_enough` was asked."""
-        return np.zeros(len(tips), bool)
+    def _ready(self, size: Values, toughness: Values, tips: Tips) -> tuple[Flags, Flags]:
+        """(n,) which tips, on which a force of `size` (n,) acts, reach their G_c, and which go on as two
+        (collective)."""
+        return size >= toughness, np.zeros(len(tips), bool)
 
     @staticmethod
     def _turned(psi: Values, tips: Tips, force: Values) -> tuple[Values, Values]:
