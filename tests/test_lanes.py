@@ -81,7 +81,7 @@ def test_expressions_as_one_by_one(energy: str, dim: int) -> None:
     DOLFINx's to the last digit; the fields they are made of are looked up anew."""
     mesh = {"builder": "box", "size": [1.0, 0.7, 0.5][:dim], "h": 0.2}
     scene, _ = make_scene(mesh=mesh, material=MATERIAL | {"energy": energy}, fracture={"strength": 1.0})
-    expression, balance = scene.fracture._evaluate, scene.balance
+    expression, balance = scene.fracture._undamaged._evaluate, scene.balance
     compiled_one = expression._compiled
     lanes = ExpressionLanes.of(compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options()))
     assert lanes is not None and expression._lanes is None
@@ -105,7 +105,7 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
         u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned)
         u[3] = np.nan
         scene.balance.displace(u)
-        assert (scene.fracture._evaluate._lanes is None) == (many > 1)
+        assert (scene.fracture._undamaged._evaluate._lanes is None) == (many > 1)
         found.append((*map(np.copy, scene.fracture.evaluate()), scene.fracture.not_finite))
     (ours, energy, crushed), (theirs, expected, count) = found
     np.testing.assert_array_equal(ours, theirs)

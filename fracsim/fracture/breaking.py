@@ -7,17 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-import ufl
 
-from ..forms.energies import cauchy_stress
-from ..forms.kinematics import deformation_gradient, symmetric_components
-from ..mechanics.kernels import CellExpression
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
 from .criterion import Criterion
 from .degradation import Degradation, make_degradation
 from .edge_law import Brittle, EdgeLaw
 from .joining import Joining
+from .undamaged import Undamaged
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -59,7 +56,6 @@ class Breaking:
         degradation: what broken edges take out of the energy.
         passes: most passes in a step; None: until nothing changes.
         opened: (edges,) where edges that were broken before the start are cut, NaN elsewhere; None: there are none.
-        not_finite: cells whose stress was no number when it was looked at (crushed flat), over all passes of this rank.
     """
 
     phase = "fracture"
@@ -82,15 +78,12 @@ class Breaking:
         self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
-        self.not_finite, self.opened, self._pace, self._joining = 0, opened, pace, joining
+        self.opened, self._pace, self._joining = opened, pace, joining
         self._due, self._now, self._dt = True, 0.0, math.inf
         self._restless = criterion.carried is not None  # remembers more than what broke
         if opened is not None:
             self.degradation.opened()
-        energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
-        tensor = symmetric_components(cauchy_stress(energy, F, stress.R))
-        both = ufl.as_vector([*tensor, energy.psi(F, stress.R)])  # one kernel: F is worked out once
-        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, often=True)
+        self._undamaged = Undamaged(stress, often=True)
         self._memory: Damage | None = None
 
     @property
@@ -98,13 +91,14 @@ class Breaking:
         """(cells,) broken edges of each cell."""
         return self.graph.pattern
 
+    @property
+    def not_finite(self) -> int:
+        """Cells of this rank whose stress was no number (crushed flat), over all passes."""
+        return self._undamaged.not_finite
+
     def evaluate(self) -> tuple[Values, Values]:
         """Cauchy stress (cells, 3 or 6) in Pa and energy density (cells,) in J/m^3 of the undamaged material."""
-        values = self._evaluate()
-        if not np.isfinite(values.sum()):  # a crushed cell: J = 0
-            self.not_finite += int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
-            np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        return values[:, :-1], values[:, -1]
+        return self._undamaged()
 
     def begin(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""

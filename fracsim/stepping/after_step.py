@@ -42,8 +42,11 @@ class Breaking(Remembers, Protocol):
     """What breaks."""
 
     passes: int | None  # most passes in a step; None: until nothing changes
-    not_finite: int  # cells whose stress was no number when it was looked at, summed over the passes of this rank
     phase: str  # what its seconds are counted under
+
+    @property
+    def not_finite(self) -> int:
+        """Cells whose stress was no number when it was looked at, summed over the passes of this rank."""
 
     @property
     def pattern(self) -> npt.NDArray[np.uint8] | None:
