@@ -105,11 +105,15 @@ def test_vtk_reads_curved_cells(tmp_path: Path) -> None:
 # --- what it does not go with ---
 
 
+SLOW = {"scheme": "quasi-static", "step": 1.0, "end": 1.0}
+
+
 @pytest.mark.parametrize(
     ("tables", "key"),
     [
         ({"fracture": {"strength": 1.0, "approach": "edge"}}, "fracture.approach"),
-        ({"fracture": {"strength": 1.0, "energy": 1.0}}, "fracture.energy"),
+        ({"fracture": {"strength": 1.0, "energy": 1.0, "law": "cohesive"}, "time": SLOW}, "fracture.law"),
+        ({"fracture": {"strength": 1.0}, "output": {"cut": "forces"}}, "output.cut"),
     ],
 )
 def test_what_needs_straight_cells_is_refused(tables: dict[str, Any], key: str) -> None:

@@ -240,6 +240,14 @@ def stress_points(mesh: Mesh) -> npt.NDArray[np.float64]:
     return points
 
 
+def quadratic_functions(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(count, k) functions of the nodes of a cell with quadratic displacement at these points, and (count, k, d) their
+    derivatives by the barycentric coordinates of the corners but the first."""
+    element = basix.create_element(basix.ElementFamily.P, mesh.basix_cell(), 2, basix.LagrangeVariant.gll_warped)
+    table: npt.NDArray[np.float64] = np.asarray(element.tabulate(1, stress_points(mesh)))[..., 0]
+    return table[0], np.moveaxis(table[1:], 0, -1)
+
+
 STRESS_DEGREE = 2  # of the quadrature of a stress where displacement is quadratic
 
 

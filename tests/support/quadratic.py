@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+from . import tearing
 from .scenes import make_scene, march
 from .torn import MESHES, SOFT, TIGHT, Found, result_of
 
 _PULLED = [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.4, 0.0, 0.1]}]
+
+
+def _quadratic(name: str, **mesh: Any) -> dict[str, Any]:
+    """A run of `tearing`."""
+    tables = tearing.RUNS[name]
+    return tables | {"mesh": tables["mesh"] | {"order": 2} | mesh}
+
 
 RUNS: dict[str, dict[str, Any]] = {
     # flows and tears; what does either is straight
@@ -40,6 +48,8 @@ RUNS: dict[str, dict[str, Any]] = {
         "boundary": [{"on": "bottom", "fix": "xy"}, {"on": "top", "pressure": 0.05}, {"on": "rim", "force": [0.1, 0]}],
         "time": {"scheme": "newmark", "step": 0.1, "end": 0.5, "mass": "consistent"},
     },
+    # tips go by the force on them, in the plane and in space
+    "tearing": _quadratic("notched"), "waiting": _quadratic("waiting", h=1 / 4),
 }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ class Run:
     tips: int
 
 
-def run_of_a_strip(ratio: float, scheme: str, kind: str, n: int, **fracture: Any) -> Run:
+def run_of_a_strip(ratio: float, scheme: str, kind: str, n: int, order: int = 1, **fracture: Any) -> Run:
     """How far the crack of a clamped strip, 1 m high, that stores `ratio` G_c a metre runs, and how fast.
 
     The strip is 3 m long and is pulled slowly with its crack, of 1 m, held; then it is let go, for 3 m at c_R.
@@ -38,7 +38,7 @@ def run_of_a_strip(ratio: float, scheme: str, kind: str, n: int, **fracture: Any
     s, end = np.linspace(0, 1, 30), ready + 3 / rayleigh
     ramp = {"time": (ready * s).tolist(), "value": [[0.0, x] for x in opening * s**3 * (10 - 15 * s + 6 * s**2)]}
     study = make_study(
-        mesh={"builder": "box", "size": [3.0, 1.0], "h": 1 / n, "pattern": kind},
+        mesh={"builder": "box", "size": [3.0, 1.0], "h": 1 / n, "pattern": kind, "order": order},
         material={"energy": "linear", "young": young, "poisson": poisson, "density": 1.0},
         fracture={"strength": 1e9, "energy": 1.0} | fracture, crack=[{"segment": [[0.0, at], [PLACE["notch"], at]]}],
         boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": ramp}], damping={"mass": 4 * shear},

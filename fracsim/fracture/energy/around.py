@@ -27,7 +27,8 @@ def local_size(domain: Domain) -> Values:
     np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
-    return np.asarray((factorial(domain.dim) * (rows[:, 0] / rows[:, 1])[nodes].mean(axis=1)) ** (1 / domain.dim))
+    around = rows[nodes]  # of corners: no cell has brought anything to the middle of an edge
+    return np.asarray((factorial(domain.dim) * (around[..., 0] / around[..., 1]).mean(axis=1)) ** (1 / domain.dim))
 
 
 def surface_of(domain: Domain) -> tuple[Values, Values]:

@@ -14,6 +14,7 @@ from ...mesh.edges import EdgeGraph
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..brittle.principal import tensors
+from ..undamaged import Undamaged
 from .around import Around, over
 from .asked import Asked
 from .crack import Crack
@@ -115,6 +116,7 @@ class Sight:
         # of the coordinates of cells, NaN until somebody looks there
         self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
         self._patch: tuple[Asked, Patch] | None = None
+        self._undamaged = Undamaged(stress) if domain.order == 2 else None  # of points
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         every = (domain.cell_count,)
         self._elastic = np.broadcast_to(mu, every), np.broadcast_to((lmbda + 3 * mu) / (lmbda + mu), every)
@@ -130,17 +132,22 @@ class Sight:
         """What is around the tips (collective)."""
         asked, tips, (mu, kappa) = self.around.asked, self.around.tips, self._elastic
         cells, patch = asked.own, self.patch
-        H = patch.gradients(patch.corners(self._stress.u.x.array))
+        H = patch.gradients(patch.at_nodes(self._stress.u.x.array))
         own = np.array([column[cells] for column in stress.T]).T  # in half the time of rows
         assert self._stress.chi is not None
         chi = self._stress.chi.x.array[cells]
-        sigma = self._eshelby(cells, chi, own, psi[cells], H)
-        inertia, push = np.zeros((2, len(cells), self._domain.dim))
+        there, density = (own, psi[cells]) if self._undamaged is None else self._undamaged.at_points(cells)
+        sigma = self._eshelby(patch.everywhere(chi), there, density, H)
+        inertia, push = np.zeros((2, len(H), self._domain.dim))
         if self.motion is not None:
             density = np.where(self._stress.closes | (chi > 0), self._density[cells], 0.0)
-            kinetic, inertia, push = self._moved(density, H, patch, *map(self._domain.with_ghosts, self.motion))
+            v, a = map(self._domain.with_ghosts, self.motion)
+            kinetic, inertia, push = self._moved(patch.everywhere(density), H, patch, v, a)
             for axis in range(self._domain.dim):
                 sigma[:, axis, axis] += kinetic
+        sigma, inertia, H, push = map(patch.means, (sigma, inertia, H, push))
+        if self._stress.closes:
+            sigma += self._pressed(cells, 1 - chi)
         flat = (H, push) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
         seen, sigma, inertia, H, push = asked(own, sigma, inertia, *flat)
         elastic, turns = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
@@ -151,7 +158,7 @@ class Sight:
         """Of the cells of this rank that anybody asks for: as long as they are the same."""
         asked = self.around.asked
         if self._patch is None or self._patch[0] is not asked:
-            self._patch = asked, Patch(self._domain.cell_nodes[asked.own], self._slopes_of(asked.own))
+            self._patch = asked, Patch.of(self._domain, asked.own, self._slopes_of(asked.own))
         return self._patch[1]
 
     def places(self, edges: npt.NDArray[np.integer], cut: Values) -> Values:
@@ -169,38 +176,36 @@ class Sight:
         weight = self._near.volumes[pairs.other] * (1 - pairs.distance / average[pairs.place])
         return tensors(over(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None]), self._domain.dim)
 
-    def _eshelby(self, cells: Ints, chi: Values, stress: Values, psi: Values, H: Values) -> Values:
-        """(n, d, d) Pa of the stress (n, 3 or 6)."""
+    def _eshelby(self, chi: Values, stress: Values, psi: Values, H: Values) -> Values:
+        """(m, d, d) Pa of the stress (m, 3 or 6)."""
         P = first_piola(tensors((chi * stress.T).T, self._domain.dim), H, linear=self._stress.energy.linear)
-        psi = chi * psi
-        if self._stress.closes:
-            pressed, push = self._pressed(cells, 1 - chi, H)
-            psi, P = psi + pressed, P + push
-        return eshelby(psi, H, P)
+        return eshelby(chi * psi, H, P)
 
-    def _pressed(self, cells: Ints, share: Values, H: Values) -> tuple[Values, Values]:
-        """psi (n,) in J/m^3 and P (n, d, d) in Pa of the broken edges of cells, with `share` of their springs."""
-        graph, material = self._graph, self._stress.material
-        nodes = self._domain.nodes[self._domain.cell_nodes[cells]]
+    def _pressed(self, cells: Ints, share: Values) -> Values:
+        """(n, d, d) Pa of the broken edges of cells, with `share` of their springs: of what corners make alone."""
+        graph, material, corners = self._graph, self._stress.material, self._domain.cell_nodes[cells]
+        nodes, moved = self._domain.nodes[corners], self._stress.u.x.array.reshape(-1, self._domain.dim)[corners]
+        H = np.einsum("nki,nkj->nij", moved, self._slopes_of(cells))
         first, second = local_edges(self._domain.dim).T
         stiff = np.broadcast_to(spring_modulus(material, self._domain.dim, len(first)), (len(self.centres),))[cells]
         modulus = (share * stiff)[:, None] * ~graph.intact(cells)
-        return springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
+        psi, P = springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
+        return eshelby(psi, H, P)
 
     @staticmethod
     def _moved(density: Values, H: Values, patch: Patch, v: Values, a: Values) -> tuple[Values, Values, Values]:
-        """(n,) rho v^2 / 2 in J/m^3, and (n, d) rho (H^T a - (grad v)^T v) and rho a in N/m^3, in the middles of cells
-        of a density (n,), 0 of those that carry nothing."""
-        moves = patch.corners(v)
-        speed, push = patch.middles(moves), density[:, None] * patch.middles(patch.corners(a))
+        """(m,) rho v^2 / 2 in J/m^3, and (m, d) rho (H^T a - (grad v)^T v) and rho a in N/m^3, at points of a density
+        (m,), 0 of those that carry nothing."""
+        moves = patch.at_nodes(v)
+        speed, push = patch.values(moves), density[:, None] * patch.values(patch.at_nodes(a))
         momentum = density[:, None] * speed
         carried = across(H, push) - across(patch.gradients(moves), momentum)
         return np.einsum("ni,ni->n", speed, momentum) / 2, carried, push
 
     def gradients(self, cells: Ints, field: Values) -> Values:
-        """(n, d, d) gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
-        patch = Patch(self._domain.cell_nodes[cells], self._slopes_of(cells))
-        return patch.gradients(patch.corners(field))
+        """(n, d, d) mean gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
+        patch = Patch.of(self._domain, cells, self._slopes_of(cells))
+        return patch.means(patch.gradients(patch.at_nodes(field)))
 
     def _slopes_of(self, cells: Ints) -> Values:
         """(n, d + 1, d) of the barycentric coordinates of cells, 1/m."""

@@ -1,7 +1,7 @@
 """Tips in space that wait: how long none of them can reach G_c once they were looked at, by how the body has moved.
 
     u = u_0 + t v_0 + r,  v = v_0 + w,  a = a_0 + b          since that look, t ago
-    D = t |grad v_0| + max |r| sum |grad lambda_i| >= |H - H_0|
+    D = t |grad v_0| + max |r| sum |grad N_i| >= |H - H_0|
 
 G is a sum of products of H, v and a. What each of these can have changed by bounds what it can have grown by:
 
@@ -39,7 +39,7 @@ class Look:
 
     Attributes:
         tips, patch: these, and the cells around them.    chi: (cells,) of those.    now: s.
-        u, v, a: (3, nodes) at their corners, m, m/s, m/s^2.    fastest: greatest |v| and |a| on any rank.
+        u, v, a: (3, nodes) of theirs, m, m/s, m/s^2.    fastest: greatest |v| and |a| on any rank, or more.
         G: (n,) no less than G of tips, J/m^2.    grows: (n, 9) how it grows with what `_changes` gives.
     """
 
@@ -89,6 +89,7 @@ class Waiting:
         self._comm.Allreduce(MPI.IN_PLACE, here, MPI.MAX)
         if here[3]:
             return None
+        here[1:3] *= last.patch.most
         return (last.G + last.grows @ _changes(time, here, *last.fastest)) * (1 + ROUND_OFF)
 
     def looked(self, G: Values, now: float) -> None:
@@ -104,13 +105,14 @@ class Waiting:
         self._comm.Allreduce(MPI.IN_PLACE, here, MPI.MAX)
         if not here[2]:
             grows = self._grows(patch, u, v)
-            self._last = Look(tips, patch, self._chi(), now, u, v, a, (here[0], here[1]), G, grows)
+            fastest = here[0] * patch.most, here[1] * patch.most
+            self._last = Look(tips, patch, self._chi(), now, u, v, a, fastest, G, grows)
 
     def _motion(self, patch: Patch) -> tuple[Values, Values, Values]:
         """(3, nodes) u, v and a around tips (collective)."""
         assert self._sight.motion is not None
         v, a = map(self._stress.domain.with_ghosts, self._sight.motion)
-        return patch.corners(self._stress.u.x.array), patch.corners(v), patch.corners(a)
+        return patch.at_nodes(self._stress.u.x.array), patch.at_nodes(v), patch.at_nodes(a)
 
     def _chi(self) -> Values:
         assert self._stress.chi is not None
@@ -120,13 +122,14 @@ class Waiting:
         """(n, 9) of `Look` (collective)."""
         around, chi = self._sight.around, self._chi()
         own = around.asked.own
-        mu, lmbda, density = chi * self._mu[own], chi * self._lmbda[own], np.where(chi > 0, self._density[own], 0.0)
+        carried = chi * self._mu[own], chi * self._lmbda[own], np.where(chi > 0, self._density[own], 0.0)
+        mu, lmbda, density = map(patch.everywhere, carried)
         (H, P), (rate, pressing) = (_sizes(patch.gradients(each), mu, lmbda) for each in (u, v))
         k, steep = 1.5 * np.maximum(2 * mu, 3 * lmbda + 2 * mu), patch.steepness
         first = [2 * P * rate + H * pressing, (2 * P + k / 1.5 * H) * steep]
         second = [k * rate**2, 2 * k * rate * steep, k * steep**2]
-        carried = [density * H, density * steep, density * rate]
-        (columns,) = around.asked(np.column_stack([*first, *second, density, *carried]))
+        moved = [density * H, density * steep, density * rate]
+        (columns,) = around.asked(patch.means(np.column_stack([*first, *second, density, *moved])))
         sums = around.most_of(columns[:, :6], columns[:, 6:])
         return np.column_stack([around.along.most(each) for each in sums.T])
 
