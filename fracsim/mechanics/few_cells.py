@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
 
 from ..mesh.compiled import address, at, library
-from ..mesh.dolfinx_calls import constants_of, form_fields, kernel_of, nodes_of_cells
+from ..mesh.dolfinx_calls import constants_in, form_fields, kernel_of, nodes_of_cells
+from .kernels import CellForm
 
 Values = npt.NDArray[np.float64]
 SOURCE = Path(__file__).with_suffix(".c")
@@ -41,10 +41,10 @@ class _Form(Structure):
 class FewCells:
     """A form with one integral, over cells."""
 
-    def __init__(self, form: fem.Form) -> None:
+    def __init__(self, form: CellForm) -> None:
         self._form, self._fields = form, form_fields(form)
         nodes, geometry, size = nodes_of_cells(form), form.mesh.geometry, form.function_spaces[0].dofmap.index_map_bs
-        self._constants = constants_of(form)
+        self._constants = constants_in(form.whole)
         self._kept = [address(each) for each in (nodes, geometry.dofmap, geometry.x, self._constants)]
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
         sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
@@ -53,7 +53,7 @@ class FewCells:
     def add(self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values]) -> None:
         """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
         place of those that begin at an address."""
-        self._constants[:] = constants_of(self._form)
+        self._constants[:] = constants_in(self._form.whole)
         arrays = [instead.get(field.values.ctypes.data, field.values) for field in self._fields]
         fields = (_Field * (len(arrays) + 1))(
             *(_Field(field.dofs.shape[1], field.size, address(field.dofs), address(array))

@@ -100,6 +100,11 @@ class CellForm(fem.Form):
     def _cpp_object(self, bound: Any) -> None:
         self._bound = bound
 
+    @property
+    def whole(self) -> Any:
+        """C++ form over all cells of the measure, as it was compiled: to ask it for anything binds nothing anew."""
+        return self._whole
+
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
         self._dead = dead

@@ -252,8 +252,13 @@ class Stress(Term):
                 lower |= differs[: len(lower)]
         cells = np.flatnonzero(lower)
         then = {field.x.array.ctypes.data: was for field, was in zip(self.fields, before, strict=True)}
-        lost = self._assembler.added(lambda sums: self._few.add(cells, sums, then))
-        return lost - self._assembler.added(lambda sums: self._few.add(cells, sums, {}))
+
+        def add(sums: Values) -> None:
+            self._few.add(cells, sums, {})
+            np.negative(sums, out=sums)
+            self._few.add(cells, sums, then)
+
+        return self._assembler.added(add)
 
     @cached_property
     def _few(self) -> FewCells:

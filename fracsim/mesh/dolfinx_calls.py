@@ -152,7 +152,12 @@ def fields_of(expression: fem.Expression) -> list[fem.Function]:
 
 def constants_of(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
     """The constants that the kernel of a form or an expression is given."""
-    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(kind._cpp_object)
+    return constants_in(kind._cpp_object)
+
+
+def constants_in(compiled: Any) -> npt.NDArray[np.float64]:
+    """The same of a C++ form."""
+    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(compiled)
     return constants
 
 
