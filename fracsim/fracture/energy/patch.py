@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from ...mechanics.kernels import quadratic_functions
 from ...mesh.domain import Domain
 
 Ints = npt.NDArray[np.integer]
@@ -24,7 +25,7 @@ class Patch:
 
     Attributes:
         count: points of a cell.    steepness: (m,) sum |grad N_k| over the functions N_k of nodes, 1/m.
-        most: max sum |N_k| over all points: no value there is that many times as large as all those of nodes.
+        most: max sum |N_k| over all points: no value there is more than that many times as large as those of nodes.
     """
 
     @classmethod
@@ -33,8 +34,6 @@ class Patch:
         if domain.order == 1:
             corners = domain.dim + 1
             return cls(domain.cell_nodes[cells], slopes[:, None], np.full((1, corners), 1 / corners))
-        from ...mechanics.kernels import quadratic_functions
-
         values, by_coordinate = quadratic_functions(domain.mesh)
         each = np.einsum("pka,nai->npki", by_coordinate, slopes[:, 1:])
         return cls(domain.all_cell_nodes[cells], each, values)

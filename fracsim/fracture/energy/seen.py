@@ -136,8 +136,8 @@ class Sight:
         own = np.array([column[cells] for column in stress.T]).T  # in half the time of rows
         assert self._stress.chi is not None
         chi = self._stress.chi.x.array[cells]
-        there, density = (own, psi[cells]) if self._undamaged is None else self._undamaged.at_points(cells)
-        sigma = self._eshelby(patch.everywhere(chi), there, density, H)
+        there, stored = (own, psi[cells]) if self._undamaged is None else self._undamaged.at_points(cells)
+        sigma = self._eshelby(patch.everywhere(chi), there, stored, H)
         inertia, push = np.zeros((2, len(H), self._domain.dim))
         if self.motion is not None:
             density = np.where(self._stress.closes | (chi > 0), self._density[cells], 0.0)
