@@ -5,21 +5,30 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.positive import least_pivots
+from fracsim.mechanics.positive import made_positive
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
 
 RANDOM = np.random.default_rng(3)
 
 
-def test_pivots_tell_what_is_positive() -> None:
-    """Their least is negative where an eigenvalue is (numpy's), also beside a matrix of zeros."""
-    roots = RANDOM.normal(size=(200, 9, 9))
-    A = roots @ roots.transpose(0, 2, 1) + RANDOM.uniform(-3.0, 1.0, 200)[:, None, None] * np.eye(9)
-    negative = np.linalg.eigvalsh(A)[:, 0] < 0
-    assert 0 < negative.sum() < 200
-    np.testing.assert_array_equal(least_pivots(A) < 0, negative)
-    assert not (least_pivots(np.zeros((1, 4, 4))) < 0).any()
+@pytest.mark.parametrize("size", [4, 9])
+@pytest.mark.parametrize("small", [0.0, 0.05])
+def test_matrices_are_made_positive(size: int, small: float) -> None:
+    """By their negative eigenvalues (LAPACK's), where one of them is below - small of their mean; one of nothing and
+    one with equal eigenvalues are among them."""
+    roots = RANDOM.normal(size=(203, size, size))
+    A = roots @ roots.transpose(0, 2, 1) + RANDOM.uniform(-3.0, 1.0, 203)[:, None, None] * np.eye(size)
+    A[5], A[6] = 0.0, -np.eye(size)
+    values, vectors = np.linalg.eigh(A)
+    lifted = values[:, 0] < -small * values.mean(axis=1)
+    lifted[6] = True
+    assert 0 < lifted.sum() < len(A)
+    expected = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1) * lifted[:, None, None]
+    found = np.full((len(A) + 1, size, size), 7.0)
+    made_positive(A, small, found)
+    np.testing.assert_allclose(found[:-1], expected, atol=1e-10)
+    assert (found[-1] == 7.0).all()
 
 
 @pytest.mark.parametrize("energy", ["neo-hookean", "stvk"])

@@ -225,10 +225,10 @@ class CellExpression:
         return ExpressionLanes.of(self._compiled, self.mesh, source)
 
 
-def point_expression(domain: Domain, expression: Expr) -> CellExpression:
+def point_expression(domain: Domain, expression: Expr, *, often: bool = False) -> CellExpression:
     """An expression whose `at_points` are those of a `point_field`."""
     points = stress_points(domain.mesh) if domain.order == 2 else _CENTRE[domain.dim]
-    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points)
+    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points, often=often)
 
 
 def _points_of(mesh: Mesh, expression: Expr) -> npt.NDArray[np.float64]:

@@ -10,16 +10,24 @@ d^2 x d^2 moduli instead of a closed form.) Built when it is first asked for.
 
 from __future__ import annotations
 
+from ctypes import CDLL, c_double, c_int64
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 import ufl
 
 from ..forms.balance import points_of_stress
 from ..forms.kinematics import deformation_gradient
+from ..mesh.compiled import FASTER, at, built
 from .kernels import CellForm, cells_measure, point_expression, point_field
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
+
+SOURCE = Path(__file__).with_suffix(".c")
+LANES = 4
 
 
 class Positive:
@@ -34,7 +42,7 @@ class Positive:
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
         P = stress.remaining_stiffness_of_energy * ufl.diff(stress.energy.psi(F, stress.R), F)
-        self._moduli = point_expression(domain, ufl.diff(P, F))
+        self._moduli = point_expression(domain, ufl.diff(P, F), often=True)
         self._field = point_field(domain, (d * d, d * d), "what makes moduli positive")
         self._size = d * d
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
@@ -46,25 +54,16 @@ class Positive:
     def update(self, small: float) -> None:
         """Bring C to the current u; moduli stay as they are without an eigenvalue below - `small` of their mean:
         whatever is pressed has such (not collective)."""
-        A = self._moduli.at_points().reshape(-1, self._size, self._size)
-        mean = A.trace(axis1=1, axis2=2) / self._size
-        shifted = A + (small * mean)[:, None, None] * np.eye(self._size)
-        points = np.flatnonzero((least_pivots(shifted) < 0) & (mean != 0))
-        values, vectors = np.linalg.eigh(A[points])
-        C = self._field.x.array.reshape(-1, self._size, self._size)
-        C[:] = 0.0
-        C[points] = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        made_positive(self._moduli.at_points().reshape(-1, self._size, self._size), small, self._field.x.array)
 
 
-def least_pivots(A: Values) -> Values:
-    """(k,) the least pivot of symmetric matrices (k, n, n): negative where one is not positive (Sylvester's law of
-    inertia). A tenth of what their eigenvalues cost."""
-    U = A.transpose(1, 2, 0).copy()
-    least = U[0, 0].copy()
-    with np.errstate(divide="ignore", invalid="ignore"):  # a cell without stiffness
-        for k in range(len(U) - 1):
-            share = U[k, k + 1 :] / U[k, k]
-            for i in range(k + 1, len(U)):
-                U[i, i:] -= U[k, i] * share[i - k - 1 :]
-            np.fmin(least, U[k + 1, k + 1], out=least)
-    return least
+def made_positive(A: Values, small: float, C: Values) -> None:
+    """Fill the first of C with what makes symmetric matrices A (k, n, n) positive, where one has an eigenvalue below
+    - small of their mean, and with zeros where none has. (A tenth to a third of the time of LAPACK, a matrix a call.)
+    """
+    _code(A.shape[1]).positive(c_int64(len(A)), c_double(small), at(A), at(C))
+
+
+@cache
+def _code(size: int) -> CDLL:
+    return built("positive", SOURCE.read_text(), [*FASTER, f"-DN={size}", f"-DLANES={LANES}"])
