@@ -24,6 +24,7 @@ from .stepper import SolveResult
 
 if TYPE_CHECKING:
     from .downhill import Downhill, Way
+    from .patches import Patches
 
 Values = npt.NDArray[np.float64]
 
@@ -77,6 +78,8 @@ class Solver:
         self._first_choice, self._downhill = (snes, self._down), self._down
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
+        self._by_steps = chosen["snes_type"] == "newtonls"
+        self._patches: Patches | None = None  # of a body that breaks
         self._first = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
@@ -159,8 +162,9 @@ class Solver:
         if self._misled(result):
             if self._sets_out_anew:
                 start = self.balance.level.u
-            # Smoothers of an older tangent need not be positive for this one.
-            self.linear.preconditioner.due = Due.REBUILD
+            if self.snes.ksp.reason != PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:  # which is K's own doing
+                # Smoothers of an older tangent need not be positive for this one.
+                self.linear.preconditioner.due = Due.REBUILD
             if self.balance.conservative:
                 result = self._attempt_downhill(start, POSITIVE)
             else:
@@ -303,6 +307,10 @@ class Solver:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh the
         preconditioner at the next tangent, where that pays."""
         self.linear.preconditioner.damage_changed(broke)
+        if self._patches is None and self._by_steps:
+            from .patches import patches_of
+
+            self._patches = patches_of(self.balance)
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
@@ -330,14 +338,25 @@ class Solver:
         reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norms[2]):
             return int(reason.DIVERGED_FNORM_NAN)
-        if self._is_small(norms[2], its):
+        if self._is_small(norms[2], its) or self._is_small_at_rest(snes, its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
         if self._choice.gets_dear(snes.getLinearSolveIterations(), its, positively=self._positively):
             return int(reason.DIVERGED_INNER)
-        if self._down is not None and self.balance.scheme.inertia and self._down.stalls(norms[2], its):
+        if self._down is not None and self.balance.scheme.inertia and self._down.stalls(snes.getFunctionNorm(), its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
-        self._norms.append(norms[2])
+        self._norms.append(snes.getFunctionNorm())
         return int(reason.DIVERGED_LINE_SEARCH if self._crawls else reason.ITERATING)
+
+    def _is_small_at_rest(self, snes: PETSc.SNES, its: int) -> bool:
+        """Let the few nodes that hold most of the residual of an iterate come to rest; whether it is a solution then
+        (collective). SNES goes on from there: it takes the norm of the residual anew."""
+        if self._patches is None or not its or not self._patches.rest(self._last_little):
+            return False
+        x, r = snes.getSolution(), snes.getFunction()[0]
+        x.array_w[:] = self.balance.u.x.array[: self.balance.owned]
+        snes.computeFunction(x, r)
+        snes.setFunctionNorm(r.norm())
+        return self._is_small(snes.getFunctionNorm(), its)
 
     @property
     def _crawls(self) -> bool:

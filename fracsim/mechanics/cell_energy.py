@@ -1,0 +1,56 @@
+"""Energy, forces and stiffness of single cells, of any energy.
+
+f_a = V P g_a,   K_ab = V g_a . A . g_b      P = d(chi psi)/dF,  A = dP/dF,  g_a = grad of corner a's shape function
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+
+from ..forms.kinematics import deformation_gradient
+from .kernels import point_expression
+from .stress import Stress
+
+Values = npt.NDArray[np.float64]
+
+
+class OfCells(NamedTuple):
+    """What k cells of c corners say at the current u.
+
+    Attributes:
+        energy: (k,) J.    forces: (k, c, d) N.    stiffness: (k, c, c, d, d) N/m.
+    """
+
+    energy: Values
+    forces: Values
+    stiffness: Values
+
+
+class CellEnergy:
+    """That of a `Stress` with linear displacement."""
+
+    def __init__(self, stress: Stress) -> None:
+        """Compiles (collective)."""
+        domain, d = stress.domain, stress.domain.dim
+        F = ufl.variable(deformation_gradient(stress.u))
+        psi = stress.remaining_stiffness_of_energy * stress.energy.psi(F, stress.R)
+        P = ufl.diff(psi, F)
+        A, each = ufl.diff(P, F), [(i, j) for i in range(d) for j in range(d)]
+        parts = [psi, *(P[i] for i in each), *(A[i + j] for i in each for j in each)]
+        self._parts = point_expression(domain, ufl.as_vector(parts))
+        self._volumes, self._d = domain.volumes, d
+        corners = domain.nodes[domain.cell_nodes]
+        inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+        self._gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+
+    def __call__(self, cells: npt.NDArray[np.int32]) -> OfCells:
+        """Of owned cells at the current u (not collective)."""
+        d, g = self._d, self._gradients[cells]
+        values = self._parts.at_points(cells) * self._volumes[cells, None]
+        P, A = values[:, 1 : 1 + d * d].reshape(-1, d, d), values[:, 1 + d * d :].reshape((-1, d, d, d, d))
+        stiffness = np.einsum("kaj,kijlm,kbm->kabil", g, A, g, optimize=True)
+        return OfCells(values[:, 0], np.einsum("kij,kaj->kai", P, g), np.asarray(stiffness))

@@ -1,0 +1,240 @@
+"""Few nodes that hold Newton's method up are brought to rest by themselves, with everything else at its place.
+
+Where a body tears, single cells are all but flat, turn over, or hang by a node. A few nodes hold nearly all of the
+residual then, and Newton's method solves for the whole body, again and again, for their sake: 28 times in one step,
+3 times with patches. So before it solves, nodes that hold nearly all of |r|^2, and their neighbours, go down to a
+minimum of the incremental potential in which only they move,
+
+    min  sum V (psi(u + w) - psi(u))  +  m c_a w^2 / 2  +  (r - f(u)) w
+
+(nonlinear elimination: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002). What bends
+there is exact, by trust regions with exact tangents (trust): a patch snaps through at once, and at its minimum the
+body's exact tangent is positive, too. The step ends where r = 0 as it would.
+
+Patches are what is left of the mesh's graph there. Every rank goes through the same motions; what cells say is found
+where they are.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import bsr_array, coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..mechanics.balance import Balance
+from ..mechanics.cell_energy import CellEnergy
+from ..mechanics.term import Term
+from ..mesh.ranks import total
+from .descent import ROUND_OFF
+from .trust import of_each, trusted_step
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+
+HELD, LEAST_HELD = 0.99, 0.9  # of |r|^2, by nodes that are brought to rest: no more of them than it takes, and at least
+FEW = 0.01  # of all nodes, which these may be
+ITERATIONS = 40
+ENOUGH = 1e-2  # of a patch's residual, which it may keep
+SMALL = 0.1  # of what is little for the whole body, which it may keep, too
+# radius of trust at first, in mean edges, and at last, where it is given up
+FIRST, LAST = 0.3, 1e-8
+LEAST = 1e-8  # of the greatest eigenvalue of a block that is preconditioned with
+# shares of what the model promised, below which a step is not taken, above which the next one may be longer
+POOR, GOOD = 0.05, 0.7
+
+
+def patches_of(balance: Balance) -> Patches | None:
+    """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
+    cell are constant forces and inertia; None: it has not (collective)."""
+    others = [term for term in balance.terms if term is not balance.stress]
+    plain = not any(type(term).tangent is not Term.tangent for term in others) and balance.stress.rotation is None
+    lumped = balance.mass.diagonal and balance.scheme.inertia and balance.domain.order == 1
+    return Patches(balance) if plain and lumped and not balance.limits_steps and balance.conservative else None
+
+
+class Patches:
+    """Those of a balance."""
+
+    def __init__(self, balance: Balance) -> None:
+        self._balance = balance
+        numbers = balance.domain.space.dofmap.index_map
+        self._count = numbers.size_global
+        self._names = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
+        self._free = np.ones(balance.owned)
+        self._free[balance.motion.owned] = 0.0
+
+    @cached_property
+    def _energy(self) -> CellEnergy:
+        """Compiled where it is first asked for (collective)."""
+        return CellEnergy(self._balance.stress)
+
+    def rest(self, little: float) -> bool:
+        """Bring the few nodes that hold most of the residual to rest, down to `little`, N, as it counts for the whole
+        body; whether any moved (collective)."""
+        nodes = self._heavy()
+        if not len(nodes) or (region := self._around(nodes)) is None:
+            return False
+        moved = _settle(region, little, self._balance.domain.mean_edge)
+        u = self._balance.u.x.array[: self._balance.owned].copy()
+        self._balance.displace(u)
+        return moved
+
+    def _heavy(self) -> Ints:
+        """Global numbers of the nodes that hold HELD of |r|^2, or of the FEW that hold most of it; none where these do
+        not hold LEAST_HELD (collective)."""
+        comm, d = self._balance.domain.comm, self._balance.domain.dim
+        squares = np.square((self._balance.reactions * self._free).reshape(-1, d)).sum(axis=1)
+        most, own = int(FEW * self._count), np.flatnonzero(squares)
+        if len(own) > most:
+            own = own[np.argpartition(-squares[own], most)[: most + 1]]
+        of_all = total(comm, np.sum(squares))[0]
+        names, parts = map(np.concatenate, zip(*comm.allgather((self._names[own], squares[own])), strict=True))
+        falling = np.sort(parts)[::-1][:most]
+        held = np.cumsum(falling)
+        if not len(held) or held[-1] < LEAST_HELD * of_all:
+            return np.asarray(names[:0])
+        last = min(int(np.searchsorted(held, HELD * of_all)), len(held) - 1)
+        return np.asarray(names[parts >= falling[last]])
+
+    def _around(self, nodes: Ints) -> _Region | None:
+        """Those of global numbers that have cells, and their neighbours, with all cells of these; None: they have none
+        (collective)."""
+        balance, domain = self._balance, self._balance.domain
+        comm, dead = domain.comm, balance.stress.stressless
+        alive = np.ones(domain.cell_count, bool) if dead is None else ~dead
+        touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
+        chosen = self._flags(np.concatenate(comm.allgather(self._names[touched])))
+        cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
+        own = np.flatnonzero(chosen[: domain.node_count])
+        inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
+        rows = [each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free)]
+        given = comm.allgather((self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
+        names, *rows, corners = map(np.concatenate, zip(*given, strict=True))
+        if not len(names):
+            return None
+        order = np.argsort(names)
+        here = np.flatnonzero(chosen)
+        of_here = np.searchsorted(names[order], self._names[here])
+        at = np.minimum(np.searchsorted(names[order], corners), len(names) - 1)
+        at = np.where(names[order][at] == corners, at, -1)
+        return _Region(balance, self._energy, cells, here, of_here, at, *(each[order] for each in rows))
+
+    def _flags(self, nodes: Ints) -> Flags:
+        """(nodes,) of this rank, ghosts too, that are among global numbers."""
+        flags = np.zeros(self._count, bool)
+        flags[nodes] = True
+        return np.asarray(flags[self._names])
+
+
+class _Region:
+    """Nodes that move, by themselves, and the patches that they make.
+
+    Attributes:
+        of, of_cell: the patch of each node and of each cell.    count: of patches.
+    """
+
+    def __init__(
+        self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], here: Ints, of_here: Ints, at: Ints,
+        inertia: Values, r: Values, free: Values,
+    ) -> None:  # fmt: skip
+        """`cells`: owned cells of this rank; `here`: its nodes, of which `of_here` tells the place among all; and of
+        all ranks `at`: (k, c) such places of the corners of cells, -1 of those that stay, `inertia`: (n, d) m c_a, N/m,
+        `r`: (n, d) the residual, N, and `free`: (n, d) 0 where motion is prescribed."""
+        n, d = self.shape = r.shape
+        self._comm, self._energy, self._u = balance.domain.comm, energy, balance.u.x.array.reshape(-1, d)
+        self._cells, self._here, self._of_here, self._at = cells, here, of_here, at
+        self._start, self._inertia, self._free = self._u[here].copy(), inertia, free
+        rows, columns = np.repeat(at, at.shape[1], axis=1).ravel(), np.tile(at, at.shape[1]).ravel()
+        self._both = (rows >= 0) & (columns >= 0)
+        self._rows, self._columns = rows[self._both], columns[self._both]
+        links = coo_array((np.ones(len(self._rows)), (self._rows, self._columns)), shape=(n, n))
+        self.count, self.of = connected_components(links, directed=False)
+        self.of_cell = self.of[at.max(axis=1)]
+        self._constant: Values = np.zeros((n, d))
+        self._constant = r - self.look(np.zeros((n, d))).forces
+
+    def put(self, w: Values) -> None:
+        """Nodes of this rank, ghosts too, are w (n, d) from where they began (not collective)."""
+        self._u[self._here] = self._start + w[self._of_here]
+
+    def look(self, w: Values) -> _Look:
+        """The patches there (collective)."""
+        self.put(w)
+        found = self._comm.allgather(self._energy(self._cells))
+        energy, forces, stiffness = map(np.concatenate, zip(*found, strict=True))
+        inside, sums = self._at >= 0, self._inertia * w + self._constant
+        work = ((sums + self._constant) * w / 2).sum(axis=1)
+        np.add.at(sums, self._at[inside], forces[inside])
+        parts = of_each(self.of_cell, energy, self.count), of_each(self.of, work, self.count)
+        return _Look(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
+
+    def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
+        """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
+        n, d = self._inertia.shape
+        blocks = stiffness.reshape(-1, d, d)[self._both]
+        blocks = blocks * self._free[self._rows, :, None] * self._free[self._columns, None, :]
+        own, every = self._inertia[:, :, None] * np.eye(d), np.arange(n)
+        keys = np.concatenate([self._rows * n + self._columns, every * (n + 1)])
+        order = np.argsort(keys, kind="stable")
+        first = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        data = np.add.reduceat(np.concatenate([blocks, own])[order], first)
+        rows, columns = np.divmod(keys[order][first], n)
+        values, vectors = np.linalg.eigh(data[rows == columns])
+        values = np.maximum(abs(values), LEAST * abs(values).max(axis=1, keepdims=True))
+        inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
+        starts = np.searchsorted(rows, np.arange(n + 1))
+        return bsr_array((data, columns, starts), shape=(n * d, n * d)), inverse
+
+    def norms(self, forces: Values) -> Values:
+        """(count,) |r| of each patch, N."""
+        return np.asarray(np.sqrt(of_each(self.of, np.square(forces).sum(axis=1), self.count)))
+
+
+class _Look(NamedTuple):
+    """What patches are like at some w.
+
+    Attributes:
+        potential: (count,) J.    size: (count,) of what that is the sum of, J.    forces: (n, d) its derivative, N.
+        stiffness: blocks of all cells, N/m.
+    """
+
+    potential: Values
+    size: Values
+    forces: Values
+    stiffness: Values
+
+    def where(self, taken: Flags, other: _Look, region: _Region) -> _Look:
+        """Of those patches, and the other's of all else."""
+        choices = taken, taken, taken[region.of, None], taken[region.of_cell, None, None, None, None]
+        return _Look(*(np.where(*each) for each in zip(choices, self, other, strict=True)))
+
+
+def _settle(region: _Region, little: float, edge: float) -> bool:
+    """Each patch goes down to a minimum, or as far as it gets; whether any moved (collective)."""
+    w = np.zeros(region.shape)
+    now = region.look(w)
+    enough = np.maximum(ENOUGH * region.norms(now.forces), SMALL * little)
+    radius = np.full(region.count, FIRST * edge)
+    for _ in range(ITERATIONS):
+        norms = region.norms(now.forces)
+        going = (norms > enough) & (radius > LAST * edge)
+        if not going.any():
+            break
+        pulled = np.where(going[region.of, None], now.forces, 0.0)
+        step, promised = trusted_step(*region.tangent(now.stiffness), pulled, region.of, radius)
+        there = region.look(w + step)
+        fell, slack = now.potential - there.potential, ROUND_OFF * now.size
+        gain = np.divide(fell, promised, out=np.zeros_like(fell), where=promised > 0)
+        taken = going & ((gain > POOR) | ((abs(fell) <= slack) & (region.norms(there.forces) < norms)))
+        long = region.norms(step)
+        longer = taken & (gain > GOOD) & (long > 0.9 * radius)
+        radius = np.where(longer, 2 * radius, np.where(taken | ~going, radius, long / 4))
+        w = np.where(taken[region.of, None], w + step, w)
+        now = there.where(taken, now, region)
+    region.put(w)
+    return bool(w.any())

@@ -1,0 +1,95 @@
+"""Nodes that hold Newton's method up: what they come to rest by, and that steps end where they would without."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fracsim.mechanics.cell_energy import CellEnergy
+from fracsim.mechanics.stiffness import Stiffness
+from fracsim.stepping import newton, patches
+from support.ranks import OnRanks, Results, starting
+from support.reference import dense_tangent
+from support.scenes import make_scene, positions
+from support.thrown import thrown
+
+RANDOM = np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("energy", ["neo-hookean", "stvk", "corotated"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_add_up_to_the_body(energy: str, dim: int) -> None:
+    """Energies, forces and stiffness of cells, to what DOLFINx assembles of a crumpled body."""
+    scene, _ = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 0.5},
+        material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
+    )
+    X, balance, domain = positions(scene), scene.balance, scene.domain
+    balance.displace((-0.2 * X + RANDOM.normal(scale=0.05, size=X.shape)).reshape(-1))
+    of_cells = CellEnergy(balance.stress)(np.arange(domain.cell_count, dtype=np.int32))
+    assert np.isclose(of_cells.energy.sum(), balance.stress.stored(), rtol=1e-12)
+    forces, n = np.zeros_like(X), domain.node_count
+    np.add.at(forces, domain.cell_nodes, of_cells.forces)
+    np.testing.assert_allclose(forces.reshape(-1), balance.stress.force(), atol=1e-13)
+    K = np.zeros((n, n, dim, dim))
+    for corners, block in zip(domain.cell_nodes, of_cells.stiffness, strict=True):
+        K[np.ix_(corners, corners)] += block
+    np.testing.assert_allclose(K.transpose(0, 2, 1, 3).reshape(n * dim, -1), dense_tangent(scene), atol=1e-12)
+
+
+def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A block of which a corner flies off at once, through the cell behind it: steps end as without, to the tolerance
+    of Newton's method, with fewer tangents; without damage nothing of it is made."""
+    made: list[int] = []
+    assemble = Stiffness._assemble_body
+    monkeypatch.setattr(Stiffness, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
+    monkeypatch.setattr(patches, "FEW", 0.2)
+    scene, state = thrown()
+    u, tangents = state.u.copy(), len(made)
+    assert scene.solver is not None and scene.solver._patches is not None
+    made.clear()
+    monkeypatch.setattr(newton.Solver, "damage_changed", lambda *_: None)
+    scene, state = thrown()
+    assert scene.solver is not None and scene.solver._patches is None
+    np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
+    assert tangents < len(made)
+
+
+def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A corner that is pushed through its cell: it and its neighbours lower the potential, their forces are next to
+    nothing, nothing else moves, and there K is positive."""
+    monkeypatch.setattr(patches, "FEW", 0.2)
+    scene, _ = thrown(steps=0)
+    balance = scene.balance
+    balance.begin(0.01, 0.01, *(np.zeros(balance.owned) for _ in range(3)))
+    X, u = positions(scene), np.zeros((balance.owned // 3, 3))
+    corner = X.sum(axis=1).argmax()
+    u[corner] = -0.3
+    balance.displace(u.reshape(-1))
+    before, high = balance.forces().copy().reshape(-1, 3), balance.potential()[0]
+    few = patches.patches_of(balance)
+    assert few is not None and few.rest(0.0)
+    moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, 3) - u).max(axis=1))
+    touched = np.unique(scene.domain.cell_nodes[(scene.domain.cell_nodes == corner).any(axis=1)])
+    assert set(touched) <= set(moved) and len(moved) < 0.7 * len(u)
+    after = balance.forces().reshape(-1, 3)
+    assert np.linalg.norm(after[moved]) < patches.ENOUGH * np.linalg.norm(before)
+    assert balance.potential()[0] < high
+    dofs = (3 * moved[:, None] + np.arange(3)).reshape(-1)
+    K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
+    assert np.linalg.eigvalsh(K[np.ix_(dofs, dofs)])[0] > 0
+
+
+@pytest.fixture(scope="module")
+def results(on_ranks: OnRanks) -> Results:
+    """Arrays of a rank count."""
+    return starting("thrown-", on_ranks)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("ranks", (2, 3))
+def test_on_any_number_of_ranks(results: Results, ranks: int) -> None:
+    """The same motion, and some nodes came to rest by themselves."""
+    found, serial = results(ranks), results(1)
+    assert found["rested"] > 0 and serial["rested"] > 0
+    np.testing.assert_allclose(found["u"], serial["u"], atol=1e-7 * np.abs(serial["u"]).max())
