@@ -12,6 +12,7 @@ from support.ranks import OnRanks, Results, starting
 from support.reference import dense_tangent
 from support.scenes import make_scene, positions
 from support.thrown import thrown
+from test_joining import tied
 
 RANDOM = np.random.default_rng(5)
 
@@ -78,6 +79,27 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
     dofs = (3 * moved[:, None] + np.arange(3)).reshape(-1)
     K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
     assert np.linalg.eigvalsh(K[np.ix_(dofs, dofs)])[0] > 0
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatch, dim: int) -> None:
+    """A node without cells that is pulled away from where it is tied goes back: the potential, with what ties store, is
+    lower, and the forces of all nodes that moved, which ties are part of, are next to nothing."""
+    monkeypatch.setattr(patches, "FEW", 0.5)
+    scene, state, tethers = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0})
+    balance = scene.balance
+    balance.begin(10.0, 10.0, state.u, np.zeros(balance.owned), np.zeros(balance.owned))
+    u = state.u.reshape(-1, dim).copy()
+    node = int(np.flatnonzero(scene.domain.node_input == tethers.ties.nodes[0, 0])[0])
+    u[node] += 2.0
+    balance.displace(u.reshape(-1))
+    before, high, stored = balance.forces().copy(), balance.potential()[0], tethers.stored()
+    few = patches.patches_of(balance)
+    assert few is not None and few.rest(0.0)
+    moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, dim) - u).max(axis=1))
+    assert node in moved
+    assert np.linalg.norm(balance.forces().reshape(-1, dim)[moved]) < patches.ENOUGH * np.linalg.norm(before)
+    assert balance.potential()[0] < high - 0.9 * stored
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ class Stiffness:
     def in_blocks(self) -> Products | None:
         """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms,
         or a mass that couples nodes, add to single entries, or nothing can be compiled (collective)."""
-        adds = any(map(_adds_entries, self._terms))
+        adds = any(map(adds_entries, self._terms))
         return None if adds or not self._mass.diagonal else self._assembly.use_blocks()
 
     def bring_entries(self) -> None:
@@ -256,7 +256,7 @@ class Stiffness:
         self._assembly.destroy()
 
 
-def _adds_entries(term: Term) -> bool:
+def adds_entries(term: Term) -> bool:
     """Whether a term adds to a tangent in blocks what is neither a form nor tied."""
     kind = type(term)
     coupling = (Term.coupling,) if kind.tied is Term.tied else ()

@@ -20,16 +20,16 @@ class Tied:
     """K of nodes that all ranks know, the same along each axis.
 
     Attributes:
-        nodes: (m,) local numbers of those that this rank owns.
+        K: (n, n) N/m.    nodes: (m,) local numbers of those that this rank owns.    here: (m,) which of the n they are.
     """
 
     def __init__(self, comm: MPI.Comm, K: csr_matrix, here: Ints, nodes: Ints, free: Values) -> None:
         """`K`: (n, n) N/m; `here`: (m,) which of the n are this rank's `nodes`; `free`: (m, d) 1, and 0 of prescribed
         dofs."""
-        self.nodes, self._comm, self._K, self._here, self._free = nodes, comm, K, here, free
+        self.K, self.nodes, self.here, self._comm, self._free = K, nodes, here, comm, free
 
     def product(self, x: Reals) -> Values:
         """(m, d) K x at the nodes of this rank, of x there (collective)."""
-        every = np.zeros((self._K.shape[0], x.shape[1]))
-        every[self._here] = x * self._free
-        return np.asarray((self._K @ total(self._comm, every))[self._here] * self._free)
+        every = np.zeros((self.K.shape[0], x.shape[1]))
+        every[self.here] = x * self._free
+        return np.asarray((self.K @ total(self._comm, every))[self.here] * self._free)

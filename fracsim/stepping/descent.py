@@ -31,10 +31,16 @@ class Descent:
         self._whole: float | None = None  # J, what the whole step of an iteration rises by
         self._known, self._known_at, self._residual_at = (0.0, 0.0), -1, -1  # after how many moves of the body
         self._height, self._norm, self._sets_out, self._by_norm = 0.0, 0.0, True, False
+        self._rested = False
 
     def set_out(self) -> None:
         """The direction of an iteration is found: PETSc asks for its start next."""
         self._sets_out = True
+
+    def rested(self) -> None:
+        """Some nodes went down by themselves, where the residual of others may rise: from here on the norm is no merit,
+        or what they gained would be given back, again and again."""
+        self._rested = True
 
     def residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r at x into b (collective)."""
@@ -65,7 +71,8 @@ class Descent:
         return -slack if abs(rise) <= slack and self._whole <= NEARLY * slack else rise
 
     def _set_out_from(self, x: PETSc.Vec) -> None:
-        self._sets_out, self._by_norm, self._whole = False, not self._balance.acts(), None
+        self._sets_out, self._whole = False, None
+        self._by_norm = not self._rested and not self._balance.acts()
         if self._by_norm:
             x.copy(self._from)
             self._norm = self._snes.getFunctionNorm()

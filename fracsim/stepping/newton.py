@@ -34,6 +34,9 @@ LARGE_GAP = 0.01
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
 
+RESTS = (
+    4  # of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
+)
 CRAWL = 5  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
@@ -82,6 +85,7 @@ class Solver:
         self._patches: Patches | None = None  # of a body that breaks
         self._first = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
+        self._rests = 0  # how often few nodes came to rest in it
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
         self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
@@ -235,7 +239,7 @@ class Solver:
     def _attempt(self, guess: Values | None, other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
         """From `guess`; None: from where the last attempt has come to."""
         self.snes, self._down = other or self._first_choice
-        self._norms = []
+        self._norms, self._rests = [], 0
         self._shrink()
         self.balance.set_out()
         extended = 0 if guess is None else self._start_from(guess)
@@ -350,8 +354,13 @@ class Solver:
     def _is_small_at_rest(self, snes: PETSc.SNES, its: int) -> bool:
         """Let the few nodes that hold most of the residual of an iterate come to rest; whether it is a solution then
         (collective). SNES goes on from there: it takes the norm of the residual anew."""
-        if self._patches is None or not its or not self._patches.rest(self._last_little):
+        if self._patches is None or not its or (self._down is None and self._rests >= RESTS):
             return False
+        if not self._patches.rest(self._last_little):
+            return False
+        self._rests += 1
+        if self._down is not None:
+            self._down.descent.rested()
         x, r = snes.getSolution(), snes.getFunction()[0]
         x.array_w[:] = self.balance.u.x.array[: self.balance.owned]
         snes.computeFunction(x, r)

@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
+from ..mechanics.stiffness import adds_entries
 from ..mechanics.term import Term
 from ..mesh.ranks import total
 from .descent import ROUND_OFF
@@ -50,11 +51,13 @@ POOR, GOOD = 0.05, 0.7
 
 def patches_of(balance: Balance) -> Patches | None:
     """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
-    cell are constant forces and inertia; None: it has not (collective)."""
+    cell are constant forces, inertia and ties; None: it has not (collective)."""
     others = [term for term in balance.terms if term is not balance.stress]
-    plain = not any(type(term).tangent is not Term.tangent for term in others) and balance.stress.rotation is None
-    lumped = balance.mass.diagonal and balance.scheme.inertia and balance.domain.order == 1
-    return Patches(balance) if plain and lumped and not balance.limits_steps and balance.conservative else None
+    bent = any(type(term).tangent is not Term.tangent or adds_entries(term) for term in others)
+    whole = balance.domain.order == 1 and balance.stress.rotation is None
+    lumped = balance.mass.diagonal and balance.scheme.inertia
+    fit = whole and lumped and not bent and not balance.limits_steps and balance.conservative
+    return Patches(balance) if fit else None
 
 
 class Patches:
@@ -77,8 +80,9 @@ class Patches:
         """Bring the few nodes that hold most of the residual to rest, down to `little`, N, as it counts for the whole
         body; whether any moved (collective)."""
         nodes = self._heavy()
-        if not len(nodes) or (region := self._around(nodes)) is None:
+        if not len(nodes):
             return False
+        region = self._around(nodes)
         moved = _settle(region, little, self._balance.domain.mean_edge)
         u = self._balance.u.x.array[: self._balance.owned].copy()
         self._balance.displace(u)
@@ -101,34 +105,49 @@ class Patches:
         last = min(int(np.searchsorted(held, HELD * of_all)), len(held) - 1)
         return np.asarray(names[parts >= falling[last]])
 
-    def _around(self, nodes: Ints) -> _Region | None:
-        """Those of global numbers that have cells, and their neighbours, with all cells of these; None: they have none
-        (collective)."""
+    def _around(self, nodes: Ints) -> _Region:
+        """Those of global numbers and their neighbours, with all cells of these (collective)."""
         balance, domain = self._balance, self._balance.domain
         comm, dead = domain.comm, balance.stress.stressless
         alive = np.ones(domain.cell_count, bool) if dead is None else ~dead
         touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
-        chosen = self._flags(np.concatenate(comm.allgather(self._names[touched])))
+        chosen = self._flags(np.concatenate([*comm.allgather(self._names[touched]), nodes]))
         cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
         own = np.flatnonzero(chosen[: domain.node_count])
         inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
         rows = [each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free)]
         given = comm.allgather((self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
         names, *rows, corners = map(np.concatenate, zip(*given, strict=True))
-        if not len(names):
-            return None
         order = np.argsort(names)
-        here = np.flatnonzero(chosen)
-        of_here = np.searchsorted(names[order], self._names[here])
-        at = np.minimum(np.searchsorted(names[order], corners), len(names) - 1)
-        at = np.where(names[order][at] == corners, at, -1)
-        return _Region(balance, self._energy, cells, here, of_here, at, *(each[order] for each in rows))
+        names, here = names[order], np.flatnonzero(chosen)
+        own = here, np.searchsorted(names, self._names[here])
+        given = *(each[order] for each in rows), self._ties(names)
+        return _Region(balance, self._energy, cells, *own, _places(corners, names), *given)
+
+    def _ties(self, names: Ints) -> coo_array:
+        """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
+        balance, n = self._balance, len(names)
+        rows, columns, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+        for tied in filter(None, (term.tied(balance.motion.free) for term in balance.terms)):
+            numbers = np.zeros(tied.K.shape[0], np.int64)
+            numbers[tied.here] = self._names[tied.nodes]
+            at, K = _places(total(balance.domain.comm, numbers), names), tied.K.tocoo()
+            inside = (at[K.row] >= 0) & (at[K.col] >= 0)
+            for found, each in zip((rows, columns, values), (at[K.row], at[K.col], K.data), strict=True):
+                found.append(each[inside])
+        return coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
 
     def _flags(self, nodes: Ints) -> Flags:
         """(nodes,) of this rank, ghosts too, that are among global numbers."""
         flags = np.zeros(self._count, bool)
         flags[nodes] = True
         return np.asarray(flags[self._names])
+
+
+def _places(numbers: Ints, names: Ints) -> Ints:
+    """Where numbers are among names, which rise; -1: they are not."""
+    at = np.minimum(np.searchsorted(names, numbers), len(names) - 1)
+    return np.asarray(np.where(names[at] == numbers, at, -1))
 
 
 class _Region:
@@ -140,11 +159,12 @@ class _Region:
 
     def __init__(
         self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], here: Ints, of_here: Ints, at: Ints,
-        inertia: Values, r: Values, free: Values,
+        inertia: Values, r: Values, free: Values, ties: coo_array,
     ) -> None:  # fmt: skip
         """`cells`: owned cells of this rank; `here`: its nodes, of which `of_here` tells the place among all; and of
         all ranks `at`: (k, c) such places of the corners of cells, -1 of those that stay, `inertia`: (n, d) m c_a, N/m,
-        `r`: (n, d) the residual, N, and `free`: (n, d) 0 where motion is prescribed."""
+        `r`: (n, d) the residual, N, `free`: (n, d) 0 where motion is prescribed, and `ties`: (n, n) K of what ties
+        nodes, N/m."""
         n, d = self.shape = r.shape
         self._comm, self._energy, self._u = balance.domain.comm, energy, balance.u.x.array.reshape(-1, d)
         self._cells, self._here, self._of_here, self._at = cells, here, of_here, at
@@ -152,7 +172,9 @@ class _Region:
         rows, columns = np.repeat(at, at.shape[1], axis=1).ravel(), np.tile(at, at.shape[1]).ravel()
         self._both = (rows >= 0) & (columns >= 0)
         self._rows, self._columns = rows[self._both], columns[self._both]
-        links = coo_array((np.ones(len(self._rows)), (self._rows, self._columns)), shape=(n, n))
+        self._ties, self._tie = ties.tocsr(), ties
+        joined = np.concatenate([self._rows, ties.row]), np.concatenate([self._columns, ties.col])
+        links = coo_array((np.ones(len(joined[0])), joined), shape=(n, n))
         self.count, self.of = connected_components(links, directed=False)
         self.of_cell = self.of[at.max(axis=1)]
         self._constant: Values = np.zeros((n, d))
@@ -167,8 +189,9 @@ class _Region:
         self.put(w)
         found = self._comm.allgather(self._energy(self._cells))
         energy, forces, stiffness = map(np.concatenate, zip(*found, strict=True))
-        inside, sums = self._at >= 0, self._inertia * w + self._constant
-        work = ((sums + self._constant) * w / 2).sum(axis=1)
+        linear, inside = self._inertia * w + self._ties @ w, self._at >= 0
+        work = ((linear / 2 + self._constant) * w).sum(axis=1)
+        sums = linear + self._constant
         np.add.at(sums, self._at[inside], forces[inside])
         parts = of_each(self.of_cell, energy, self.count), of_each(self.of, work, self.count)
         return _Look(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
@@ -176,16 +199,19 @@ class _Region:
     def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
         """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
         n, d = self._inertia.shape
-        blocks = stiffness.reshape(-1, d, d)[self._both]
-        blocks = blocks * self._free[self._rows, :, None] * self._free[self._columns, None, :]
-        own, every = self._inertia[:, :, None] * np.eye(d), np.arange(n)
-        keys = np.concatenate([self._rows * n + self._columns, every * (n + 1)])
+        every, ties = np.arange(n), self._tie.data[:, None, None] * np.eye(d)
+        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], ties, self._inertia[:, :, None] * np.eye(d)])
+        rows = np.concatenate([self._rows, self._tie.row, every])
+        columns = np.concatenate([self._columns, self._tie.col, every])
+        blocks = blocks * self._free[rows, :, None] * self._free[columns, None, :]
+        keys = rows * n + columns
         order = np.argsort(keys, kind="stable")
         first = np.flatnonzero(np.diff(keys[order], prepend=-1))
-        data = np.add.reduceat(np.concatenate([blocks, own])[order], first)
+        data = np.add.reduceat(blocks[order], first)
         rows, columns = np.divmod(keys[order][first], n)
         values, vectors = np.linalg.eigh(data[rows == columns])
-        values = np.maximum(abs(values), LEAST * abs(values).max(axis=1, keepdims=True))
+        largest = abs(values).max(axis=1, keepdims=True)
+        values = np.maximum(abs(values), np.where(largest > 0, LEAST * largest, 1.0))
         inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
         starts = np.searchsorted(rows, np.arange(n + 1))
         return bsr_array((data, columns, starts), shape=(n * d, n * d)), inverse
