@@ -126,6 +126,8 @@ ENTRIES = (
         "fracsim.studies.rigid_trials",
     ),
     one("brazilian", "A disk of granite split between platens.", "--field stress:xx"),
+    one("granite-cylinder", "A cylinder of granite split between platens: as its load falls, and in the end.",
+        "--sheet=-13,-1 --view top --magnify 20 --size 1400x700"),
     Entry(
         "steels", "Charpy and Izod bars of steel A516 at -40 C, which snap, and of NVE 36 at 23 C, which bend.",
         (("charpy-A516", "charpy"), ("charpy-NVE36", f"charpy {NVE36}"),

@@ -20,6 +20,7 @@ from fracsim.studies.evidence import (
     published,
     results,
     slit,
+    splitting,
     stability,
     survival,
     written,
@@ -439,11 +440,43 @@ def test_section_of_experiments() -> None:
         records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
     records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
     (section,) = experiments.sections(records)
-    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 6]
+    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 11]
     every, spreads = section.tables
     assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
     assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))
     assert [series.style for series in section.plots[0].series] == ["line", "line", "line", "reference"]
+
+
+def test_how_much_of_a_section_is_covered() -> None:
+    """A triangle with half of it, two that overlap, whichever way round; nothing by none."""
+    low, high = np.array([-1.0, 0.0]), np.array([1.0, 1.0])
+    half = np.array([[[-1.0, 0.0], [1.0, 0.0], [-1.0, 1.0]]])
+    assert splitting.covered(half, low, high) == pytest.approx(0.5, abs=0.02)
+    left = np.array([[[-1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]]])
+    assert splitting.covered(left, low, high) == pytest.approx(0.5, abs=0.02)
+    assert splitting.covered(np.concatenate([half, left[:1]]), low, high) == pytest.approx(13 / 24, abs=0.02)
+    assert splitting.covered(half[:0], low, high) == 0.0
+
+
+def test_where_the_cracks_of_a_cylinder_are() -> None:
+    """A plane through its middle, both sides, and another half as large beside it."""
+    sides = np.array([[[-0.2, 0.0], [0.2, 0.0], [0.2, 0.1]], [[-0.2, 0.0], [0.2, 0.1], [-0.2, 0.1]]])
+    middle = np.concatenate([np.zeros((2, 3, 1)), sides], axis=2)
+    beside = middle[:1] + np.array([0.05, 0.0, 0.0])
+    found = splitting.along(np.concatenate([middle, middle, beside, beside]), 0.2, 0.1)
+    assert found == pytest.approx({"along": 2 / 3, "covered": 1.0, "area": 1.5})
+    assert splitting.along(middle[:0], 0.2, 0.1) == {"along": 0.0, "covered": 0.0, "area": 0.0}
+
+
+def test_a_cylinder_that_splits_and_is_crushed_says_so() -> None:
+    """A peak 4 % over, half of it left; what was one plane is not in the end."""
+    split = {"split_along": 0.9, "split_covered": 0.7, "split_area": 1.0}
+    figures = {"peak": 104.0, "last": 50.0, "end_along": 0.3, "end_covered": 0.9, "end_area": 9.0, "pieces": 6.0}
+    held = [claim.holds for claim in splitting.claims([split | figures] * 3, 100.0, 0.1)]
+    assert held == [True, True, True, True, False]
+    assert {claim.holds for claim in splitting.claims([split | figures] * 2, 100.0, 0.1)} == {None}
+    (table,) = splitting.table([{"settings": {"h": 0.01}, "figures": split | figures}])
+    assert table.rows == ((0.01, 0.9, 0.7, 1.0, 0.3, 0.9, 9.0, 6.0),) and splitting.table([]) == ()
 
 
 def test_a_measured_curve_lies_beside_the_runs() -> None:

@@ -33,6 +33,7 @@ COARSE = {
     "cylinder": ["mesh.h=0.01"],
     "doormat": ["mesh.h=0.025"],
     "dropped-vase": ["mesh.h=0.015"],
+    "granite-cylinder": ["mesh.h=0.03"],
     "hammered-figure": ["mesh.h=0.015"],
     "hammered-vase": ["mesh.h=0.015"],
     "izod": ["mesh.h=0.002", "mesh.h_notch=0.0006"],

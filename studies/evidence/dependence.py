@@ -99,18 +99,25 @@ def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
 
     Lengths in 2D (m^2 for a thickness of 1 m), areas in 3D, of the last frame of the split surface.
     """
+    corners = crack_corners(run)
+    d = corners[:, 1:] - corners[:, :1]
+    flat = corners.shape[1] == 2
+    size = np.linalg.norm(d[:, 0], axis=1) if flat else np.linalg.norm(np.cross(d[:, 0], d[:, 1]), axis=1) / 2
+    return size, corners.mean(axis=1)
+
+
+def crack_corners(run: Path, time: float | None = None) -> npt.NDArray[np.float64]:
+    """(n, 2 or 3, 3) ends or corners of those faces at rest, m; of the last frame, or of that nearest to a time, s."""
     from fracsim.mesh.split.skeleton import CRACK
     from fracsim.output.surface.collection import read_collection
 
-    grid = read_surface(run / read_collection(run / "surface.pvd")[-1][1])
+    frames = read_collection(run / "surface.pvd")
+    chosen = frames[-1] if time is None else min(frames, key=lambda frame: abs(float(frame[0]) - time))
+    grid = read_surface(run / chosen[1])
     points = np.asarray(grid.points, float) - np.asarray(grid.point_data["displacement"], float)
     kind = 3 if 3 in grid.cells_dict else 5  # VTK: lines in 2D, triangles in 3D
-    faces = grid.cells_dict[kind]
     opened = np.asarray(grid.cell_data["origin"])[grid.celltypes == kind] == CRACK
-    corners = points[faces[opened]]
-    d = corners[:, 1:] - corners[:, :1]
-    size = np.linalg.norm(d[:, 0], axis=1) if kind == 3 else np.linalg.norm(np.cross(d[:, 0], d[:, 1]), axis=1) / 2
-    return size, corners.mean(axis=1)
+    return np.asarray(points[grid.cells_dict[kind][opened]])
 
 
 # --- the page -------------------------------------------------------------------------------------------------------
