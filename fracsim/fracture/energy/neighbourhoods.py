@@ -52,7 +52,7 @@ class Tips:
         course: (n, d) from the middle of the crack nearer than 2 R to the tip, m; only where cracks branch.
         parts: (n, d) whither it goes abreast of another in its disc; 0 where there is none, and in space.
         waits: (n,) whether it lets that other go first.    alone: (n,) whether no other tip's disc lies over its own.
-        surface: (n, d) int q n dA of the body's own surface in the disc, m^2.
+        surface: (n, d) int q n dA of the body's own surface in the disc, m^(d-1).
     """
 
     cell: Ints
@@ -158,11 +158,11 @@ class Neighbourhoods:
         return self._products
 
     def _crossed_ahead(self) -> Values:
-        """(pairs, d) int q n dA over the body's surface around tips that go for it; in the plane 0."""
+        """(pairs, d) int q n dA over the body's surface around tips that go for it."""
         tips = self.tips
         onwards, size = (np.linalg.norm(each, axis=1) for each in (tips.ahead, tips.surface))
         faces = np.einsum("ni,ni->n", tips.ahead, tips.surface) ** 2 > (onwards * size) ** 2 / 2
-        return (faces & (tips.point.shape[1] == 3))[self._place, None] * self._crossed
+        return faces[self._place, None] * self._crossed
 
     def means(self, rows: Ints, stress: Values) -> Values:
         """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, 3 or 6) which have not come apart,

@@ -63,7 +63,7 @@ class Seen:
 
         g = - sum V Sigma grad q + int q Sigma n dA + sum V q rho (H^T a - (grad v)^T v)
 
-        The surface is the body's, in space, where a front goes for it: it does not move with the crack.
+        The surface is the body's, where a crack goes for it: it does not move with the crack.
         In space that along the advance of a crack, over the area it makes (along) (collective).
         """
         force = self.around.forces(self.sigma, self.inertia)
