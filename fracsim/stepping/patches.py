@@ -115,27 +115,26 @@ class Patches:
         cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
         own = np.flatnonzero(chosen[: domain.node_count])
         inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
-        rows = [each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free)]
+        rows = (each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free))
         given = comm.allgather((self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
-        names, *rows, corners = map(np.concatenate, zip(*given, strict=True))
+        names, inertia, r, free, corners = map(np.concatenate, zip(*given, strict=True))
         order = np.argsort(names)
         names, here = names[order], np.flatnonzero(chosen)
-        own = here, np.searchsorted(names, self._names[here])
-        given = *(each[order] for each in rows), self._ties(names)
-        return _Region(balance, self._energy, cells, *own, _places(corners, names), *given)
+        of_here, at = np.searchsorted(names, self._names[here]), _places(corners, names)
+        forces = inertia[order], r[order], free[order], self._ties(names)
+        return _Region(balance, self._energy, cells, here, of_here, at, *forces)
 
     def _ties(self, names: Ints) -> coo_array:
         """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
         balance, n = self._balance, len(names)
-        rows, columns, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+        K = coo_array((n, n)).tocsr()
         for tied in filter(None, (term.tied(balance.motion.free) for term in balance.terms)):
             numbers = np.zeros(tied.K.shape[0], np.int64)
             numbers[tied.here] = self._names[tied.nodes]
-            at, K = _places(total(balance.domain.comm, numbers), names), tied.K.tocoo()
-            inside = (at[K.row] >= 0) & (at[K.col] >= 0)
-            for found, each in zip((rows, columns, values), (at[K.row], at[K.col], K.data), strict=True):
-                found.append(each[inside])
-        return coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+            at, each = _places(total(balance.domain.comm, numbers), names), tied.K.tocoo()
+            inside = (at[each.row] >= 0) & (at[each.col] >= 0)
+            K = K + coo_array((each.data[inside], (at[each.row][inside], at[each.col][inside])), shape=(n, n)).tocsr()
+        return K.tocoo()
 
     def _flags(self, nodes: Ints) -> Flags:
         """(nodes,) of this rank, ghosts too, that are among global numbers."""
