@@ -61,6 +61,9 @@ REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
 MANY = 0.02  # edges that broke, for each node, after which it is refreshed
 REFRESH_ITS = 10  # iterations that a refresh costs
+# solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): the second one is of the
+# tangent that the first has led to, and takes twice as many whichever of the two it was made for
+FRESH = 2
 
 type Loosen = Callable[[PETSc.PC], LooseParts | None]
 
@@ -113,7 +116,7 @@ class Preconditioner:
         self.its: int | None = None
         # of aggregates of all links, where strong ones are on trial; 0: nothing is known; None: it is settled
         self._all_links_its: int | None = 0 if may_change else None
-        self._fresh_its = self._whole_its = 0
+        self._fresh_its = self._whole_its = self._solves = 0
 
     def damage_changed(self, broke: int | None) -> None:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh at the next
@@ -144,7 +147,7 @@ class Preconditioner:
         self._cycle = self._hasten(self.pc)
         if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
             self._smooth_by_nodes()
-        self.due, self._broke, self._extra = Due.NOTHING, 0, 0
+        self.due, self._broke, self._extra, self._solves = Due.NOTHING, 0, 0, 0
         if self._sees_to_parts:
             self.forget_parts()
             self._loose = self._loosen(self._body)
@@ -200,6 +203,8 @@ class Preconditioner:
         its = self._last_its
         if self.due == Due.NOTHING:
             self._look_at(its)
+            if self._cycle is not None and self._solves < FRESH:
+                self._fresh_its = max(self._fresh_its, its)
         # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
         if self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
             self.due = Due.REBUILD
@@ -210,6 +215,7 @@ class Preconditioner:
 
     def _count(self) -> None:
         """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due."""
+        self._solves += 1
         if self._broke:
             self._extra += max(self._last_its - self._fresh_its, 0)
         if self._extra > REFRESH_ITS:
