@@ -1,11 +1,11 @@
 """Few nodes that hold Newton's method up are brought to rest by themselves, with everything else at its place.
 
 Where a body tears, single cells are all but flat, turn over, or hang by a node. A few nodes hold nearly all of the
-residual then, and Newton's method solves for the whole body, again and again, for their sake: 28 times in one step,
-3 times with patches. So before it solves, nodes that hold nearly all of |r|^2, and their neighbours, go down to a
+residual then, and Newton's method solves for the whole body, again and again, for their sake: 29 times in one step,
+4 times with patches. So before it solves, nodes that hold nearly all of |r|^2, and their neighbours, go down to a
 minimum of the incremental potential in which only they move,
 
-    min  sum V (psi(u + w) - psi(u))  +  m c_a w^2 / 2  +  (r - f(u)) w
+    min  sum V (psi(u + w) - psi(u))  +  w (m c_a + k) w / 2  +  (r - f(u)) w,    k: of ties (mechanics.tethers)
 
 (nonlinear elimination: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002). What bends
 there is exact, by trust regions with exact tangents (trust): a patch snaps through at once, and at its minimum the
