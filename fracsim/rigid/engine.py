@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .bodies import Bodies
+from .cores import Cores
 from .course import course_of, still
 from .events import Event, Kin
 from .finding import Finder
@@ -48,13 +49,15 @@ class Engine:
         outer: Sequence[Values] | None = None,
         turn: Values | None = None,
         helper: Helper | None = None,
+        cores: Cores | None = None,
     ) -> None:
         """`parts`: convex parts of each body, `outer`: its outermost points (None: all corners), both turned by `turn`
         (n, 3, 3) (None: not at all); `overlaps`: of bodies by their names (n,), ascending, or numbers; `helper`: a
-        second thread (None: there is none)."""
+        second thread (None: there is none); `cores` of the first bodies, which pieces that overlap keep out of."""
         self._rules, self._count = rules, len(bodies)
         self._model = model_of(bodies, parts, stands, rules, outer, turn)
-        self._finder, self._push = Finder(self._model, helper), Pushing(self._model, rules, helper)
+        self._finder = Finder(self._model, helper, cores, rules.friction)
+        self._push = Pushing(self._model, rules, helper)
         self._way: Values = np.array([stand.at for stand in stands]).reshape(-1, 3)  # where each was last, m
         known = np.arange(len(bodies)) if names is None else names
         self._parting = Parting.of(overlaps or Overlaps.none(), known, self._model.first, len(self._model.thing))

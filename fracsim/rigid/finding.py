@@ -12,9 +12,12 @@ import numpy.typing as npt
 from ..errors import NotConverged
 from .bodies import Bodies
 from .contacts import Contacts
+from .cores import Cores
 from .course import Course
 from .model import Model
+from .motion import flown
 from .planes import Looked
+from .siblings import Parting
 from .tumbling import orientation
 from .waiting import Helper
 
@@ -63,17 +66,22 @@ class _Search:
 class Finder:
     """Of the contacts of a model's bodies, and of what stands in their way."""
 
-    def __init__(self, model: Model, helper: Helper | None = None) -> None:
-        """`helper`: a second thread, with which the same is found."""
+    def __init__(
+        self, model: Model, helper: Helper | None = None, cores: Cores | None = None, friction: float = 0.0
+    ) -> None:
+        """`helper`: a second thread, with which the same is found; `cores` of the first bodies, which have a
+        `friction` there."""
         self._model, self._count, self._helper = model, len(model.mass), helper
+        self._cores, self._friction = cores, friction
         self._searches = [_Search(model, model.made)]
 
     def __call__(
-        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None
-    ) -> Contacts:
+        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None,
+        parting: Parting | None = None,
+    ) -> Contacts:  # fmt: skip
         """What comes together in a step, s, of a course, what stands being at `ways` (stands, 3), m; `looked`: at
         corners over planes in it; `only`: (n,) of some bodies, what others have with one another and with what stands
-        is not looked for."""
+        is not looked for; `parting`: of those that keep out of one another's cores (None: none does)."""
         model, places = self._model, np.concatenate([bodies.place, ways])
         reach, slide = course.reach, course.slide(step)
         margin = np.concatenate([reach[0], slide[0], [slide[0].max(initial=0.0)]])
@@ -83,7 +91,17 @@ class Finder:
         every = Contacts.found(geoms, model.thing[geoms], point, axes, gap, friction, places)
         for each in self._of_planes(bodies, ways, reach[1], slide[1], step, looked, only):
             every = every.and_more(each)
-        return every
+        if self._cores is None or parting is None:
+            return every
+        pairs = parting.pairs if only is None else parting.pairs[only[parting.pairs].any(axis=1)]
+        return every.and_more(self._in_cores(self._cores, pairs, bodies, places, step)) if len(pairs) else every
+
+    def _in_cores(self, cores: Cores, pairs: Ints, bodies: Bodies, places: Values, step: float) -> Contacts:
+        """Contacts of pairs (k, 2) of pieces with the cores of one another: of no geoms."""
+        later = flown(self._model, bodies, np.full(len(bodies), step))
+        things, point, axes, gap = cores(pairs, bodies, later, step)
+        friction = np.full(len(gap), self._friction)
+        return Contacts.found(np.full_like(things, -1), things, point, axes, gap, friction, places)
 
     def _searched(self, places: Values, quat: Values, margin: Values, looks: Flags) -> list[Any]:
         """What things find that look for others, by the numbers of their bodies: those of a first share of them, and,

@@ -13,6 +13,7 @@ from ..mesh.split.moments import Moments, moments
 from ..mesh.split.skeleton import Skeleton
 from ..meshes.data import MeshData
 from .clusters import clustered_parts
+from .cores import Core, Cores
 from .hulls import Solid, convex_parts, outermost
 from .placing import Poses
 
@@ -30,7 +31,7 @@ class Shapes:
         names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
         parts: corners (m, 3) of the convex parts of each about its centre, in the axes of the mesh, m; copies that are
         whole share theirs.    turn: (n, 3, 3) from these axes to those of the body at rest.
-        outer: (k, 3) the outermost points of each, likewise.
+        outer: (k, 3) the outermost points of each, likewise.    cores: of them, None where none has broken.
     """
 
     names: Ints
@@ -39,6 +40,7 @@ class Shapes:
     parts: list[list[Values]]
     turn: Values
     outer: list[Values]
+    cores: Cores | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class _Copy:
     piece_of_node: Ints
     parts: list[list[Values]]
     outer: list[Values]
+    core: Core
 
 
 class Geometry:
@@ -94,7 +97,16 @@ class Geometry:
         parts = [part for each in self._placed for part in each.parts]
         outer = [each for placed in self._placed for each in placed.outer]
         names, turn = (np.concatenate([getattr(each, name) for each in self._placed]) for name in ("names", "turn"))
-        return Shapes(names, of, np.concatenate(piece), parts, turn, outer)
+        return Shapes(names, of, np.concatenate(piece), parts, turn, outer, self._cores(turn))
+
+    def _cores(self, turn: Values) -> Cores | None:
+        """Of all pieces, turned by (n, 3, 3)."""
+        every = [self._known.get(number, self._whole) for number in range(len(self.poses))]
+        if not any(len(each.core.faces) for each in every):
+            return None
+        centre = np.concatenate([each.of.centre for each in every])
+        pieces = [len(each.names) for each in every]
+        return Cores([each.core for each in every], pieces, centre, turn, self.mean_edge)
 
     def _copy(self, pattern: Patterns, cut: Values | None, number: int, at: Values) -> _Copy:
         """A copy with patterns (C,), and nodes at places (N, 3)."""
@@ -112,7 +124,9 @@ class Geometry:
         found = [kept for kept in same if kept is not None]
         self._hulls[number] = dict(zip(map(int, names), found, strict=True))
         parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
-        return _Copy(at, pattern, names, of, made.piece_of_node, parts, outer)
+        drawn = made.pieces > 1 and not self._in_clusters(made)
+        core = Core.of_split(made, self.skeleton) if drawn else Core.none()
+        return _Copy(at, pattern, names, of, made.piece_of_node, parts, outer, core)
 
     def _parts(self, made: Split, piece: Ints, solids: list[Solid], chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""

@@ -7,6 +7,7 @@ which shrinks with what they part by. So pieces stay where they broke, push noth
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -94,11 +95,11 @@ class Parting:
         return cls(names, first, geoms, _code(pairs[new], geoms), code[order], overlaps.depth[~new][order])
 
     def __call__(self, geoms: Ints, things: Ints, gap: Values) -> tuple[Values, Parting]:
-        """(k,) distances of contacts of geoms (k, 2) of things (k, 2) beyond those allowed, from distances (k,), m; and
-        what is allowed from then on."""
+        """(k,) distances of contacts of geoms (k, 2), -1 of none, of things (k, 2) beyond those allowed, from distances
+        (k,), m; and what is allowed from then on."""
         if not len(self.known) and not len(self.new):
             return gap, self
-        every, deep = _code(geoms, self.geoms), np.flatnonzero(gap < 0)
+        every, deep = _code(geoms, self.geoms), np.flatnonzero((gap < 0) & (geoms[:, 0] >= 0))
         code, place = np.unique(every[deep], return_inverse=True)
         depth: Values = np.zeros(len(code))
         np.maximum.at(depth, place, -gap[deep])
@@ -111,6 +112,14 @@ class Parting:
         some = allowed > 0
         code, allowed = code[some], np.minimum(allowed, depth)[some]
         return gap + _looked_up(every, code, allowed), replace(self.gone, known=code, depth=allowed)
+
+    @cached_property
+    def pairs(self) -> Ints:
+        """(k, 2) bodies that lie in one another, or may."""
+        geoms = np.stack([self.known // self.geoms, self.known % self.geoms], axis=1)
+        known = np.searchsorted(self.first, geoms, side="right") - 1
+        new = np.stack([self.new // self.geoms, self.new % self.geoms], axis=1)
+        return np.unique(np.concatenate([known, new]), axis=0)
 
     @property
     def gone(self) -> Parting:

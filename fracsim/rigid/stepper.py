@@ -212,7 +212,8 @@ class RigidStepper:
         if others.free:
             turn = np.concatenate([turn, np.tile(np.eye(3), (len(others.free), 1, 1))])
         stands = others.stands(t)
-        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, self.names, outer, turn, self._helper)
+        rest = self.names, outer, turn, self._helper, of.cores
+        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, *rest)
         return self._engine
 
     def depths(self, state: RigidState) -> list[tuple[int, int, float]]:

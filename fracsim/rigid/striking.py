@@ -146,7 +146,7 @@ class Striking:
 
     def _find(self, bodies: Bodies, course: Course, only: Flags | None = None) -> Contacts:
         """Contacts of what comes together within the step, of all bodies or `only` some (n,)."""
-        return self._finder(bodies, self._ways, course, self._rules.step, self._looked, only)
+        return self._finder(bodies, self._ways, course, self._rules.step, self._looked, only, self._parting)
 
     def _meeting(
         self, contacts: Contacts, bodies: Bodies, rates: Values, stage: Stage, past: Values | None,
