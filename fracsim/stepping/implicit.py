@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
+from ..mesh.ranks import total
 from .after_step import Breaking, Flow, PassResult
 from .newton import Solver
 from .state import State
@@ -30,7 +31,9 @@ class ImplicitStepper(BalanceStepper):
 
     def _recalled(self) -> None:
         super()._recalled()
-        self.solver.damage_changed()
+        pattern = self.breaking.pattern
+        torn = pattern is not None and total(self.comm, np.count_nonzero(pattern))[0] > 0
+        self.solver.damage_changed(None if torn else 0)
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
         return self._solve(state, dt, self._guess(state, dt))

@@ -311,7 +311,7 @@ class Solver:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh the
         preconditioner at the next tangent, where that pays."""
         self.linear.preconditioner.damage_changed(broke)
-        if self._patches is None and self._by_steps:
+        if broke != 0 and self._patches is None and self._by_steps:
             from .patches import patches_of
 
             self._patches = patches_of(self.balance)
