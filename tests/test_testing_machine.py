@@ -142,14 +142,11 @@ def test_a_restart_knows_the_peak(tmp_path: Path) -> None:
     part.history.close()
     Run(build_scene(MPI.COMM_SELF, study(SMOOTH, **tables)), tmp_path / "part", restart=True)()
     again = history(tmp_path / "part")
-    for name in (
-        "time",
-        "dt",
-        "reaction_grip_x",
-    ):  # where a bar of uniform stress breaks first is a matter of round-off
-        np.testing.assert_allclose(
-            again[name], whole[name], rtol=1e-6, atol=1e-8 * np.nanmax(np.abs(whole[name])), err_msg=name
-        )
+    # where a bar of uniform stress breaks first is a matter of round-off, what it carries once it is torn one of how
+    # exactly Newton's method solves (4e-8 of the peak)
+    for name in ("time", "dt", "reaction_grip_x"):
+        most = np.nanmax(np.abs(whole[name]))
+        np.testing.assert_allclose(again[name], whole[name], rtol=1e-6, atol=1e-6 * most, err_msg=name)
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "part")]
     assert summaries[0]["load"]["ended_the_run"] and summaries[1]["load"] == pytest.approx(summaries[0]["load"])
 
