@@ -106,7 +106,7 @@ def test_a_run_that_ended_may_be_run_again_and_what_lies_beside_it_stays(tmp_pat
     "where",
     [
         "run.make_folder",
-        "run.InvertedCells",
+        "watched.InvertedCells",
         "output.frame_files.Frames",
         "output.frame_files.FieldsFile",
         "run.OutputClock",
