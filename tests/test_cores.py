@@ -18,9 +18,11 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.cores import LEAST, MOST, REACH, Core, Cores
 from fracsim.rigid.stepper import RigidState, RigidStepper
+from fracsim.scene.rigid import build_rigid_scene
+from fracsim.study.file import load_study
 from support.falling import DOWN, stepper_of
 from support.solids import copies
-from test_pieces_apart import in_cells
+from test_pieces_apart import as_placed, in_cells
 from test_struck_bodies import bar
 
 Values = npt.NDArray[np.float64]
@@ -43,6 +45,17 @@ def broken() -> tuple[RigidStepper, RigidState]:
             break
     assert len(state.bodies) > 7
     return stepper, state
+
+
+@cache
+def shot() -> tuple[RigidStepper, RigidState]:
+    """A slab that lies elsewhere than its mesh and is turned, in pieces."""
+    body = "body=[{position=[0.4,0.0,0.3],rotation=[0.0,0.0,1.5707963]}]"
+    scene = build_rigid_scene(load_study("rigid-slab", [body, "time.end=2e-3"]))
+    state, _ = scene.stepper.advance(scene.first)
+    count = scene.stepper.count
+    assert count > 7
+    return scene.stepper, replace(state, bodies=state.bodies.part(slice(count)))
 
 
 def fresh(stepper: RigidStepper) -> Cores:
@@ -80,7 +93,8 @@ def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
     ones."""
     body = stepper.copies.copy(0)
     domain, of_node, found = body.graph.domain, body.pieces.of_node, Found()
-    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(domain.nodes, of_node)
+    nodes = as_placed(stepper, domain.nodes)
+    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     sides = np.sort(domain.cell_nodes[:, [0, 1, 2, 0, 1, 3, 0, 2, 3, 1, 2, 3]].reshape(-1, 3))
     _, facet, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
@@ -94,15 +108,15 @@ def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
         faces = sides.reshape(-1, 4, 3)[mine][beside[facet[mine]]]
         if not len(faces):
             continue
-        nodes = torn[of_node[torn] != piece]
-        X = bodies.to_rest(x[nodes], piece)
-        inside = in_cells(X, domain.nodes[domain.cell_nodes[mine]])
+        rows = torn[of_node[torn] != piece]
+        X = bodies.to_rest(x[rows], piece)
+        inside = in_cells(X, nodes[domain.cell_nodes[mine]])
         if not inside.any():
             continue
-        surface = pyvista.make_tri_mesh(domain.nodes, faces)
+        surface = pyvista.make_tri_mesh(nodes, faces)
         depth = np.abs(pyvista.PolyData(X[inside]).compute_implicit_distance(surface)["implicit_distance"])
-        for other in np.unique(of_node[nodes[inside]]):
-            each = np.sort(depth[of_node[nodes[inside]] == other])[::-1]
+        for other in np.unique(of_node[rows[inside]]):
+            each = np.sort(depth[of_node[rows[inside]] == other])[::-1]
             edge = stepper._geometry.mean_edge
             each = each[(each > LEAST * edge) & (each < REACH * edge)][:MOST]
             if len(each):
@@ -127,6 +141,16 @@ def test_nodes_in_cores_are_those_in_whole_cells(much: float) -> None:
         same(told(fresh(stepper), stepper, bodies), expected)
         some += len(expected)
     assert some > 10
+
+
+def test_nodes_in_cores_of_a_body_that_lies_elsewhere_than_its_mesh_are_those_in_whole_cells() -> None:
+    """And turned: where a ball has shot through it, and as its pieces are moved at random."""
+    stepper, state = shot()
+    ways = [shaken(stepper, state.bodies, 0.6, seed) for seed in range(2)]
+    found = [looked_at(stepper, each) for each in (state.bodies, *ways)]
+    for bodies, expected in zip((state.bodies, *ways), found, strict=True):
+        same(told(fresh(stepper), stepper, bodies), expected)
+    assert sum(map(len, found)) > 10
 
 
 def test_what_has_moved_step_by_step_is_found_as_what_is_looked_at_once() -> None:

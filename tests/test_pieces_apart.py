@@ -28,17 +28,24 @@ SPEED, STEP, STEPS, NONE = 20.0, 1e-3, 150, 1e-3
 CORE = 0.04  # of the mean edge
 
 
+def as_placed(stepper: RigidStepper, points: Values) -> Values:
+    """(k, 3) where points of the mesh (k, 3) are of the one body that is at rest where its study puts it, m."""
+    poses = stepper._geometry.poses
+    return np.asarray(points @ poses.turn[0].T + poses.place[0])
+
+
 def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
     """Of pairs of pieces, how far corners of the drawn surface of one, crack faces as well, that are in a whole cell of
     the other are from its surface, m: they come free of one another by no shorter way."""
     body, bodies, found = stepper.copies.copy(0), state.bodies, dict[tuple[int, int], float]()
     domain, of_node = body.graph.domain, body.pieces.of_node
-    made = split(stepper._geometry.skeleton, *body.damage())
-    x, own, owner = bodies.to_space(made.points, made.piece_of_point), made.piece_of_point, made.elements[:, 0]
+    made, nodes = split(stepper._geometry.skeleton, *body.damage()), as_placed(stepper, domain.nodes)
+    own, owner = made.piece_of_point, made.elements[:, 0]
+    x = bodies.to_space(as_placed(stepper, made.points), own)
     of_cell = of_node[domain.cell_nodes]
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     for piece in range(len(bodies)):
-        corners, X = domain.nodes[domain.cell_nodes[whole & (of_cell[:, 0] == piece)]], bodies.to_rest(x, piece)
+        corners, X = nodes[domain.cell_nodes[whole & (of_cell[:, 0] == piece)]], bodies.to_rest(x, piece)
         if not len(corners):
             continue
         near = np.flatnonzero(np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1))
@@ -59,13 +66,14 @@ def in_cores(stepper: RigidStepper, state: RigidState) -> Depths:
     these, so that its roughness does not explain it."""
     body, bodies = stepper.copies.copy(0), state.bodies
     domain, of_node, found = body.graph.domain, body.pieces.of_node, dict[tuple[int, int], float]()
-    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(domain.nodes, of_node)
+    nodes = as_placed(stepper, domain.nodes)
+    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     for piece in range(len(bodies)):
         cells = domain.cell_nodes[whole & (of_cell[:, 0] == piece)]
         if not len(cells):
             continue
-        corners, X = domain.nodes[cells], bodies.to_rest(x, piece)
+        corners, X = nodes[cells], bodies.to_rest(x, piece)
         near = np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1)
         rows = np.flatnonzero(near & (of_node != piece))
         rows = rows[in_cells(X[rows], corners)] if len(rows) else rows
@@ -74,7 +82,7 @@ def in_cores(stepper: RigidStepper, state: RigidState) -> Depths:
         facets, count = np.unique(
             np.sort(cells[:, [0, 1, 2, 0, 1, 3, 0, 2, 3, 1, 2, 3]].reshape(-1, 3)), axis=0, return_counts=True
         )
-        surface = pyvista.make_tri_mesh(domain.nodes, facets[count == 1])
+        surface = pyvista.make_tri_mesh(nodes, facets[count == 1])
         depth = np.abs(pyvista.PolyData(X[rows]).compute_implicit_distance(surface)["implicit_distance"])
         for other in np.unique(of_node[rows]):
             found[int(other), piece] = float(depth[of_node[rows] == other].max())
