@@ -34,6 +34,7 @@ LARGE_GAP = 0.01
 # Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
 RESTART = 200
 
+FAST = 0.1  # of the residual before, below which Newton's method gets on by itself
 RESTS = (
     4  # of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
 )
@@ -355,6 +356,8 @@ class Solver:
         """Let the few nodes that hold most of the residual of an iterate come to rest; whether it is a solution then
         (collective). SNES goes on from there: it takes the norm of the residual anew."""
         if self._patches is None or not its or (self._down is None and self._rests >= RESTS):
+            return False
+        if snes.getFunctionNorm() < FAST * self._norms[-1]:  # nothing holds it up
             return False
         if not self._patches.rest(self._last_little):
             return False

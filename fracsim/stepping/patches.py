@@ -2,8 +2,8 @@
 
 Where a body tears, single cells are all but flat, turn over, or hang by a node. A few nodes hold nearly all of the
 residual then, and Newton's method solves for the whole body, again and again, for their sake: 29 times in one step,
-4 times with patches. So before it solves, nodes that hold nearly all of |r|^2, and their neighbours, go down to a
-minimum of the incremental potential in which only they move,
+4 times with patches. So where an iteration has not cut |r| to a tenth, nodes that hold nearly all of |r|^2, and their
+neighbours, go down to a minimum of the incremental potential in which only they move,
 
     min  sum V (psi(u + w) - psi(u))  +  w (m c_a + k) w / 2  +  (r - f(u)) w,    k: of ties (mechanics.tethers)
 
