@@ -154,6 +154,7 @@ class _Region:
 
     Attributes:
         of, of_cell: the patch of each node and of each cell.    count: of patches.
+        at_first: they where nothing has moved.
     """
 
     def __init__(
@@ -171,13 +172,15 @@ class _Region:
         rows, columns = np.repeat(at, at.shape[1], axis=1).ravel(), np.tile(at, at.shape[1]).ravel()
         self._both = (rows >= 0) & (columns >= 0)
         self._rows, self._columns = rows[self._both], columns[self._both]
-        self._ties, self._tie = ties.tocsr(), ties
+        self._ties = ties
         joined = np.concatenate([self._rows, ties.row]), np.concatenate([self._columns, ties.col])
         links = coo_array((np.ones(len(joined[0])), joined), shape=(n, n))
         self.count, self.of = connected_components(links, directed=False)
         self.of_cell = self.of[at.max(axis=1)]
         self._constant: Values = np.zeros((n, d))
-        self._constant = r - self.look(np.zeros((n, d))).forces
+        found = self.look(np.zeros((n, d)))
+        self._constant = r - found.forces
+        self.at_first = found._replace(forces=r * free)
 
     def put(self, w: Values) -> None:
         """Nodes of this rank, ghosts too, are w (n, d) from where they began (not collective)."""
@@ -198,10 +201,10 @@ class _Region:
     def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
         """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
         n, d = self._inertia.shape
-        every, ties = np.arange(n), self._tie.data[:, None, None] * np.eye(d)
+        every, ties = np.arange(n), self._ties.data[:, None, None] * np.eye(d)
         blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], ties, self._inertia[:, :, None] * np.eye(d)])
-        rows = np.concatenate([self._rows, self._tie.row, every])
-        columns = np.concatenate([self._columns, self._tie.col, every])
+        rows = np.concatenate([self._rows, self._ties.row, every])
+        columns = np.concatenate([self._columns, self._ties.col, every])
         blocks = blocks * self._free[rows, :, None] * self._free[columns, None, :]
         keys = rows * n + columns
         order = np.argsort(keys, kind="stable")
@@ -242,7 +245,7 @@ class _Look(NamedTuple):
 def _settle(region: _Region, little: float, edge: float) -> bool:
     """Each patch goes down to a minimum, or as far as it gets; whether any moved (collective)."""
     w = np.zeros(region.shape)
-    now = region.look(w)
+    now = region.at_first
     enough = np.maximum(ENOUGH * region.norms(now.forces), SMALL * little)
     radius = np.full(region.count, FIRST * edge)
     for _ in range(ITERATIONS):
