@@ -84,7 +84,7 @@ class Linear:
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
-            large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
+            large=self._blocks is not None, hangs=self._hangs, loosen=self._loosen, hasten=self._hasten,
             bring=self._bring, nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
@@ -184,6 +184,11 @@ class Linear:
         pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.vector), comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
+
+    def _hangs(self) -> bool:
+        from .loose_parts import inertia_holds
+
+        return not inertia_holds(self.balance)
 
     def _loosen(self, body: PETSc.PC) -> LooseParts | None:
         from .loose_parts import loose_parts

@@ -8,7 +8,7 @@ by themselves (balancing, Mandel 1993; deflation, Nicolaides 1987; compared by T
     P = Q + (1 - Q K) M (1 - K Q),   Q = Z E^-1 Z^T,   E = Z^T K Z
 
 M is the body's preconditioner, Z has the rigid motions of each part but the largest, of nodes that no larger part has,
-too. It takes 21 iterations. The sum of Q and M, which saves two products with K, takes 35.
+too. It takes 21 iterations. The sum of Q and M takes 35. K Z has few rows, so that P costs what M does.
 """
 
 from __future__ import annotations
@@ -46,19 +46,20 @@ class LooseParts:
         self.pc.setType("python")
         self.pc.setPythonContext(self)
 
-    def follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None = None) -> bool:
-        """Serve this tangent, and the body where it is now; `products`: what it is multiplied with, if that is another
-        matrix. False: all that hangs is held (collective)."""
+    def follow(self, tangent: PETSc.Mat) -> bool:
+        """Serve this tangent, and the body where it is now. False: all that hangs is held (collective)."""
         if self._at == (at := (tangent.handle, tangent.stateGet())):
             return True
         self._forget_parts()
         if (Z := self._motions(tangent)) is None:
             return False
-        self._K, self._Z, self._at = products or tangent, Z, at
-        self._small, self._inner = Z.createVecRight(), Z.createVecRight()
-        self._moved, self._left = tangent.createVecs()
-        E, self._solve = tangent.ptap(Z), PETSc.PC().create(tangent.comm)
-        self._made = [Z, E, self._solve, self._small, self._inner, self._moved, self._left]
+        self._Z, self._at = Z, at
+        self._KZ = tangent.matMult(Z)
+        self._KtZ = self._KZ if self._balance.symmetric else tangent.transposeMatMult(Z)
+        E, self._solve = Z.transposeMatMult(self._KZ), PETSc.PC().create(tangent.comm)
+        self._small, self._moved, self._back = (Z.createVecRight() for _ in range(3))
+        self._left = tangent.createVecRight()
+        self._made = [Z, self._KZ, self._KtZ, E, self._solve, self._small, self._moved, self._back, self._left]
         self._solve.setType("redundant" if tangent.comm.size > 1 else "lu")
         self._solve.setOperators(E)
         self._solve.setUp()
@@ -76,21 +77,16 @@ class LooseParts:
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = P x (collective)."""
-        K, moved, left = self._K, self._moved, self._left
-        self._rigidly(x, moved)
-        K.mult(moved, left)
+        small, moved, back, left = self._small, self._moved, self._back, self._left
+        self._Z.multTranspose(x, small)
+        self._solve.apply(small, moved)
+        self._KZ.mult(moved, left)
         left.aypx(-1.0, x)
         self.body.apply(left, y)
-        K.mult(y, left)
-        y.axpy(1.0, moved)
-        self._rigidly(left, moved)
-        y.axpy(-1.0, moved)
-
-    def _rigidly(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Q x (collective)."""
-        self._Z.multTranspose(x, self._small)
-        self._solve.apply(self._small, self._inner)
-        self._Z.mult(self._inner, y)
+        self._KtZ.multTranspose(y, small)
+        self._solve.apply(small, back)
+        moved.axpy(-1.0, back)
+        self._Z.multAdd(moved, y, y)
 
     def _forget_parts(self) -> None:
         for each in self._made:
@@ -104,14 +100,17 @@ class LooseParts:
 
 
 def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
-    """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part, or inertia holds what
-    hangs (collective)."""
-    stress, domain = balance.stress, balance.domain
-    if stress.multiplier is None or _inertia(balance) > HELD:
-        return None
-    count, part = parts_of_nodes(domain, stress.multiplier.x.array[: domain.cell_count] > 0)
+    """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part (collective)."""
+    domain, multiplier = balance.domain, balance.stress.multiplier
+    assert multiplier is not None  # where anything breaks
+    count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
     nodes = np.flatnonzero(part > 0)
     return LooseParts(balance, body, nodes, part[nodes] - 1, count - 1) if count > 1 else None
+
+
+def inertia_holds(balance: Balance) -> bool:
+    """Whether inertia holds what hangs (collective)."""
+    return balance.stress.multiplier is None or _inertia(balance) > HELD
 
 
 def _inertia(balance: Balance) -> float:

@@ -3,14 +3,15 @@
 It is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a Newton iteration. It
 is made anew where CG takes a third more iterations than when it was fresh, or the tangent has given up entries of dead
 cells (mechanics.tangent), and refreshed (new coarse operators and smoothers on the same coarse spaces) after edges
-broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh.
+broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh. Where its cycle is
+quick (cycle) a set-up costs a hundred iterations, and it is made anew once what CG has taken longer adds up to SET_UP.
 
 Where a body comes apart, cells hang from it by a node or an edge and turn there against nothing but their inertia.
 Smoothed aggregation with Jacobi's smoother needs three times the iterations then, and a set-up that a few broken edges
 spoil. Where steps are so long that inertia is next to nothing, it is a hundred times, and what hangs is solved for by
-itself (loose_parts). In shorter ones other aggregates do: those without smoothing cost a fifth of the set-up, and a
-sweep of SSOR deals with what hangs: 18 iterations where the whole body took 9 and the cut one 27 (33,000 tetrahedra, 10
-planes), a step in 0.85 of the time; after 100 planes 0.7.
+itself (loose_parts), which is looked for after edges broke. In shorter ones other aggregates do: those without
+smoothing cost a fifth of the set-up, and a sweep of SSOR deals with what hangs: 18 iterations where the whole body took
+9 and the cut one 27 (33,000 tetrahedra, 10 planes), a step in 0.85 of the time; after 100 planes 0.7.
 
 A whole body that is slow to solve for is thin, or all but incompressible. Aggregates are made anew of the stronger
 links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahedra) takes 38 iterations where it took
@@ -61,11 +62,10 @@ REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
 MANY = 0.02  # edges that broke, for each node, after which it is refreshed
 REFRESH_ITS = 10  # iterations that a refresh costs
+SET_UP = 60  # more than it would take when fresh, after which one whose cycle is quick is made anew
 # solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): the second one is of the
 # tangent that the first has led to, and takes twice as many whichever of the two it was made for
 FRESH = 2
-
-type Loosen = Callable[[PETSc.PC], LooseParts | None]
 
 
 class Due(IntEnum):
@@ -94,25 +94,29 @@ class Preconditioner:
         keep: bool,
         may_change: bool,
         large: bool,
-        loosen: Loosen,
+        hangs: Callable[[], bool],
+        loosen: Callable[[PETSc.PC], LooseParts | None],
         hasten: Callable[[PETSc.PC], Cycle | None],
         bring: Callable[[], bool],
         nodes: int,
     ) -> None:
-        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
-        that sees to loose parts out of `pc`, None where that would be no use; `hasten`: what does the same in less
+        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `hangs`: whether
+        nothing holds what comes loose; `loosen`: makes one that sees to loose parts out of `pc`, None: there are none
+        (both collective); `hasten`: what does the same in less
         time, None where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the
         entries of the tangent to what they are, and tells whether they are at other places; `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
-        self.serving, self._loosen, self._bring, self._nodes = self.pc, loosen, bring, nodes
+        self.serving, self._hangs, self._loosen, self._bring = self.pc, hangs, loosen, bring
+        self._nodes = nodes
         self._loose: LooseParts | None = None
         self._hasten = hasten
         self._cycle: Cycle | None = None
-        self._sees_to_parts = False
-        self._broke = self._extra = 0  # edges and iterations since it was set up
+        self._looks_for_parts = False  # before the next solve
+        self._broke, self._extra = 0, 0.0  # edges and iterations since it was set up
         self.due, self.keep = Due.REBUILD, keep
         self._large, self._by_nodes = large, False
-        self._may_change, self._broken, self._rebuild_above = may_change, False, REBUILD_ABOVE
+        self._own = self._may_change = may_change
+        self._broken, self._rebuild_above = False, REBUILD_ABOVE
         self.its: int | None = None
         # of aggregates of all links, where strong ones are on trial; 0: nothing is known; None: it is settled
         self._all_links_its: int | None = 0 if may_change else None
@@ -121,7 +125,7 @@ class Preconditioner:
     def damage_changed(self, broke: int | None) -> None:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh at the next
         tangent, where that pays."""
-        self._broken = True
+        self._broken = self._looks_for_parts = True
         self._broke += self._nodes if broke is None else broke
         if self._broke > MANY * self._nodes:
             self.due = max(self.due, Due.REFRESH)
@@ -133,7 +137,7 @@ class Preconditioner:
         self._count()
         ksp = self._ksp
         if self.due == Due.NOTHING:
-            self._follow(tangent, products)
+            self._follow(tangent)
             return
         if self._bring() or self.due == Due.REBUILD:
             self.pc.reset()
@@ -147,11 +151,9 @@ class Preconditioner:
         self._cycle = self._hasten(self.pc)
         if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
             self._smooth_by_nodes()
-        self.due, self._broke, self._extra, self._solves = Due.NOTHING, 0, 0, 0
-        if self._sees_to_parts:
-            self.forget_parts()
-            self._loose = self._loosen(self._body)
-        self._follow(tangent, products)
+        self.due, self._broke, self._extra, self._solves = Due.NOTHING, 0, 0.0, 0
+        self._looks_for_parts = self._broken
+        self._follow(tangent)
 
     def _smooth_by_nodes(self) -> None:
         """On the finest level alone."""
@@ -163,16 +165,20 @@ class Preconditioner:
         for key in BY_NODES:
             options.delValue(key)
 
-    def _follow(self, tangent: PETSc.Mat, products: PETSc.Mat | None) -> None:
+    def _follow(self, tangent: PETSc.Mat) -> None:
         """What serves is brought to a tangent that is solved with next."""
-        self.serving, loose = self._body, self._loose
+        self.serving = self._body
         if self._cycle is not None and self.serving is self._cycle.pc:
             self._cycle.follow()
+        if self._looks_for_parts and self._own and self.pc.getType() == "gamg":
+            self.forget_parts()
+            self._loose, self._looks_for_parts = self._loosen(self.serving) if self._hangs() else None, False
+        loose = self._loose
         if loose is None or loose.body is not self.serving:
             return
         if self._bring():
             self.due = Due.REBUILD
-        if loose.follow(tangent, products):
+        if loose.follow(tangent):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
 
@@ -206,7 +212,7 @@ class Preconditioner:
             if self._cycle is not None and self._solves < FRESH:
                 self._fresh_its = max(self._fresh_its, its)
         # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
-        if self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
+        if self._cycle is None and self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
             self.due = Due.REBUILD
 
     @property
@@ -214,10 +220,18 @@ class Preconditioner:
         return int(self._ksp.its) if self.its is None else self.its
 
     def _count(self) -> None:
-        """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due."""
+        """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due. Where
+        its cycle is quick whatever they are for, and to a set-up."""
         self._solves += 1
+        its, fresh = self._last_its, self._fresh_its
+        if self._cycle is not None:
+            if its > fresh > 0:
+                self._extra += int(self._ksp.its) * (1 - fresh / its)
+            if self._extra > SET_UP:
+                self.due = Due.REBUILD
+            return
         if self._broke:
-            self._extra += max(self._last_its - self._fresh_its, 0)
+            self._extra += max(its - fresh, 0)
         if self._extra > REFRESH_ITS:
             self.due = max(self.due, Due.REFRESH)
 
@@ -248,9 +262,7 @@ class Preconditioner:
         return worse
 
     def _change(self) -> None:
-        if (loose := self._loosen(self.pc)) is not None:
-            self._may_change, self._sees_to_parts, self.due = False, True, max(self.due, Due.REFRESH)
-            loose.forget()
+        if self._hangs():
             return
         self._may_change = self._by_nodes = False
         self._rebuild_above = REBUILD_ABOVE_OF_PIECES
