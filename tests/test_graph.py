@@ -146,6 +146,23 @@ def test_pieces_are_followed(dim: int) -> None:
         assert follow.look().count == 1 and searched.called
 
 
+def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
+    """Edges that break at once in two corners of a body: nothing has come off, and no search of all nodes
+    says so; then a node of one corner does, with all its edges."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.05}, fracture={"strength": 1.0})
+    graph = scene.fracture.graph
+    follow, middle = Parting(graph), graph.domain.nodes[graph.edge_nodes].mean(axis=1)
+    near = [np.argsort(np.linalg.norm(middle - corner, axis=1))[:3] for corner in ([0.2, 0.2], [0.8, 0.8])]
+    with patch.object(parting, "FAR", 3), patch.object(parting, "find_pieces") as searched:
+        graph.break_edges(np.isin(np.arange(len(middle)), np.concatenate(near)))
+        assert follow.look().count == 1
+        alone = graph.edge_nodes[near[0][0], 0]
+        graph.break_edges((graph.edge_nodes == alone).any(axis=1) | (np.arange(len(middle)) == near[1][0]))
+        pieces = follow.look()
+    assert not searched.called
+    assert pieces.count == 2 and np.array_equal(pieces.of_node, find_pieces(graph).of_node)
+
+
 @pytest.mark.parametrize("ranks", (1, 2, 3))
 @pytest.mark.parametrize("case", ("2d", "3d", "quadratic"))
 def test_pieces_are_those_of_scipy(on_ranks: OnRanks, case: str, ranks: int) -> None:

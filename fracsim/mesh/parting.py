@@ -2,8 +2,9 @@
 
 From the ends of the edges that broke one goes along whole edges, some steps far. What is reached falls into parts. A
 part that goes no further, and has no node that another rank has as well, is a piece. All others may hang together
-beyond; where a piece of before has one of them at most on each rank, they do: whoever goes through that piece and comes
-to an edge that has broken is in that part, and past all that has come off is in it again.
+beyond. Parts that hung together by what is reached, before the edges broke, are a cluster; where each has one at most
+that goes on, on each rank, nothing else has come apart: whoever goes through a piece of before and comes to an edge
+that has broken is in that part of its cluster, and past all that has come off is in it again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from .ranks import joined, largest, offset, total
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-FAR = (3, 12, 48)  # edges that one goes, where need be
+FAR = 48  # edges that one goes at most
 SOURCE = Path(__file__).with_suffix(".c")
 
 
@@ -38,25 +39,26 @@ class _Given(Structure):
 class _Room(Structure):
     """For what is reached of so many nodes, as parting.c has it, and its arrays."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("nodes", "place", "part", "goes_on", "of_part"))
+    _fields_ = tuple((name, c_void_p) for name in ("nodes", "place", "part", "cluster", "goes_on", "of_part"))
 
     def __init__(self, nodes: int) -> None:
-        self.reached, self.parts, self.of_parts = (np.empty(nodes, np.int64) for _ in range(3))
+        self.reached, self.parts, self._clusters, self.of_parts = (np.empty(nodes, np.int64) for _ in range(4))
         self.open = np.empty(nodes, bool)
         self._place = np.full(nodes, -1)
-        arrays = self.reached, self._place, self.parts, self.open, self.of_parts
+        arrays = self.reached, self._place, self.parts, self._clusters, self.open, self.of_parts
         super().__init__(*(each.ctypes.data for each in arrays))
 
 
 @dataclass(frozen=True)
 class _Found:
     """Nodes (n,), the part of each, whether parts (parts,) go on or may do so on another rank, and the piece of before
-    that each is of."""
+    that each is of; `settled`: those that do not go on are all that has come off on this rank."""
 
     nodes: Ints
     part: Ints
     goes_on: Flags
     piece: Ints
+    settled: bool
 
 
 class Parting:
@@ -93,22 +95,20 @@ class Parting:
 
     def _look_around(self, edges: Ints) -> None:
         """The pieces once edges (n,) have broken (collective)."""
-        for far in FAR:
-            found = self._reached(edges, far)
-            open_in = np.bincount(found.piece[found.goes_on], minlength=1)  # parts of each piece
-            if largest(self._domain.comm, int(open_in.max())) <= 1:
-                self._part(found)
-                self._broken = self._graph.broken.copy()
-                return
-        self._look_everywhere()
+        found = self._reached(edges)
+        if largest(self._domain.comm, int(not found.settled)):
+            self._look_everywhere()
+        else:
+            self._part(found)
+            self._broken[edges] = True
 
-    def _reached(self, edges: Ints, far: int) -> _Found:
-        """What is at most `far` whole edges from the ends of edges (n,)."""
-        room, parts = self._room, c_int64()
-        given = byref(self._given), byref(room), c_int64(len(edges)), at(edges), c_int64(far), at(self.pieces.of_node)
-        count = self._code(*given, byref(parts))
+    def _reached(self, edges: Ints) -> _Found:
+        """What is around the ends of edges (n,), as far as need be."""
+        room, parts, settled = self._room, c_int64(), c_int64()
+        given = byref(self._given), byref(room), c_int64(len(edges)), at(edges), c_int64(FAR), at(self.pieces.of_node)
+        count = self._code(*given, byref(parts), byref(settled))
         of_parts = room.open[: parts.value], room.of_parts[: parts.value]
-        return _Found(room.reached[:count], room.parts[:count], *of_parts)
+        return _Found(room.reached[:count], room.parts[:count], *of_parts, bool(settled.value))
 
     def _part(self, found: _Found) -> None:
         """Parts that do not go on are pieces of their own (collective)."""

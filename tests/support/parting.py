@@ -16,7 +16,7 @@ from .scenes import make_scene
 
 CASES = {"2d": (2, 0.06, 1), "3d": (3, 0.2, 1), "quadratic": (2, 0.1, 2)}  # dim, h and order
 AT_ONCE = 12
-NEAR = (1, 3)  # edges that one goes: bodies are small
+NEAR = 3  # edges that one goes: bodies are small
 
 
 def compared() -> dict[str, npt.NDArray[np.generic]]:
