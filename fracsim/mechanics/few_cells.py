@@ -1,4 +1,5 @@
-"""A linear form in a few cells, with fields as they are or as they were: what breaks in a step frees forces there.
+"""A linear form in some cells, with fields as they are or as they were: what breaks in a step frees forces there, and
+cells that have come apart are left out of the body's own.
 
 To bind a form to other cells, and to put the fields of before into it, takes DOLFINx longer than a hundred cells do.
 """
@@ -6,7 +7,7 @@ To bind a form to other cells, and to put the fields of before into it, takes DO
 from __future__ import annotations
 
 from collections.abc import Mapping
-from ctypes import Structure, byref, c_int64, c_void_p
+from ctypes import Array, Structure, byref, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,17 +50,22 @@ class FewCells:
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
         sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
         self._given = _Form(kernel_of(form), *sizes, *self._kept)
+        self._now = self._given_fields({})
 
-    def add(self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values]) -> None:
+    def add(self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values] | None = None) -> None:
         """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
         place of those that begin at an address."""
         self._constants[:] = constants_in(self._form.whole)
+        fields = self._given_fields(instead) if instead else self._now
+        _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
+
+    def _given_fields(self, instead: Mapping[int, Values]) -> Array[_Field]:
+        """Fields as C has them, with other numbers in place of those that begin at an address."""
         arrays = [instead.get(field.values.ctypes.data, field.values) for field in self._fields]
-        fields = (_Field * (len(arrays) + 1))(
+        return (_Field * (len(arrays) + 1))(
             *(_Field(field.dofs.shape[1], field.size, address(field.dofs), address(array))
               for field, array in zip(self._fields, arrays, strict=True))
         )  # fmt: skip
-        _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
 
 from ..mesh.compiled import machine_flags
-from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels, source_of
+from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels, only_cells, source_of
 from ..mesh.domain import Domain
 from ..mesh.ranks import raise_together
 
@@ -58,9 +58,9 @@ class OfLarge[Lanes]:
 
     def __call__(self, form: fem.Form) -> Lanes | None:
         """That of a form; None where it does not pay, or cannot be done (collective the first time)."""
-        if form not in self._made and _is_large(form):
-            self._made[form] = self._make(form)
-        return self._made.get(form)
+        if form not in self._made:
+            self._made[form] = self._make(form) if _is_large(form) else None
+        return self._made[form]
 
 
 def _is_large(form: fem.Form) -> bool:
@@ -75,7 +75,7 @@ def compile_form(form: ufl.Form) -> fem.Form:
 
 class CellForm(fem.Form):
     """A form over `cells_measure`, cells of which may be left out later: its kernels stay, and so do its facets. They
-    are bound to the cells that are left when they are asked for next.
+    are bound to the cells that are left when DOLFINx asks for them next; vectors are summed over `left` without that.
 
     fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a form
     whose derivatives let one of them vanish.
@@ -85,6 +85,8 @@ class CellForm(fem.Form):
         whole = compile_form(form)
         self._whole: Any = whole._cpp_object
         self._dead: npt.NDArray[np.bool_] | None = None  # that are not left out yet
+        self._out: npt.NDArray[np.bool_] | None = None  # that are
+        self._left: npt.NDArray[np.int64] | None = None
         super().__init__(whole._cpp_object, whole.ufcx_form, whole.code, whole.module)
         self._constants = [constant._cpp_object for constant in form.constants()]
 
@@ -105,9 +107,23 @@ class CellForm(fem.Form):
         """C++ form over all cells of the measure, as it was compiled: to ask it for anything binds nothing anew."""
         return self._whole
 
+    @property
+    def left(self) -> npt.NDArray[np.int64] | None:
+        """The cells that it is integrated over, once any have been left out; None before, and where it has other
+        integrals."""
+        if self._left is None and self._out is not None and (cells := self._cells) is not None:
+            self._left = cells[~self._out[cells]]
+        return self._left
+
+    @cached_property
+    def _cells(self) -> npt.NDArray[np.int64] | None:
+        """Those of the measure; None of a form with other integrals."""
+        return only_cells(self._whole)
+
     def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
-        self._dead = dead
+        self._dead = self._out = dead
+        self._left = None
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
         return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])

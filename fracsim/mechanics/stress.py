@@ -254,7 +254,7 @@ class Stress(Term):
         then = {field.x.array.ctypes.data: was for field, was in zip(self.fields, before, strict=True)}
 
         def add(sums: Values) -> None:
-            self._few.add(cells, sums, {})
+            self._few.add(cells, sums)
             np.negative(sums, out=sums)
             self._few.add(cells, sums, then)
 

@@ -12,9 +12,10 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_calls import assemble_into, create_vector
 from ..mesh.domain import Domain
-from .kernels import OfLarge
+from .kernels import CellForm, OfLarge
 
 if TYPE_CHECKING:
+    from .few_cells import FewCells
     from .lanes import VectorLanes
 
 Values = npt.NDArray[np.float64]
@@ -32,6 +33,7 @@ class Assembler:
         self.owned = domain.node_count * domain.dim
         self._kept = self.vector()
         self._lanes = OfLarge(_in_lanes)
+        self._few: dict[CellForm, FewCells] = {}
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the dofs, ghosts included."""
@@ -56,11 +58,24 @@ class Assembler:
         """This rank's part alone into b; returns b (collective the first time)."""
         with b.localForm() as local:
             local.set(0.0)
-            if (lanes := self._lanes(form)) is not None:
-                lanes.add(local.array_w)
-        if lanes is None:
+            added = self._added_to(local.array_w, form)
+        if not added:
             assemble_into(b, form)
         return b
+
+    def _added_to(self, values: Values, form: fem.Form) -> bool:
+        """Add this rank's part to the values of dofs, ghosts included, where DOLFINx need not do it."""
+        if (lanes := self._lanes(form)) is not None:
+            lanes.add(values)
+        elif isinstance(form, CellForm) and (left := form.left) is not None:
+            if form not in self._few:
+                from .few_cells import FewCells
+
+                self._few[form] = FewCells(form)
+            self._few[form].add(left, values)
+        else:
+            return False
+        return True
 
     def summed(self, b: PETSc.Vec) -> PETSc.Vec:
         """b with the parts that other ranks have assembled for its owned dofs (collective)."""

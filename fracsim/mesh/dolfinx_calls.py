@@ -197,9 +197,21 @@ def cells_of(form: fem.Form) -> Ints:
     return np.asarray(compiled.domains(fem.IntegralType.cell, number))
 
 
+def only_cells(compiled: Any) -> npt.NDArray[np.int64] | None:
+    """The cells of a C++ form with one integral, over cells; None of any other."""
+    if integrals_in(compiled) != [fem.IntegralType.cell]:
+        return None
+    (number,) = compiled.integral_ids(fem.IntegralType.cell)
+    return np.array(compiled.domains(fem.IntegralType.cell, number), np.int64)
+
+
 def integrals(form: fem.Form) -> list[Any]:
     """The kind of each integral of a form."""
-    compiled: Any = form._cpp_object
+    return integrals_in(form._cpp_object)
+
+
+def integrals_in(compiled: Any) -> list[Any]:
+    """The same of a C++ form."""
     return [kind for kind in compiled.integral_types for _ in compiled.integral_ids(kind)]
 
 
