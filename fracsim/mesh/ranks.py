@@ -92,6 +92,8 @@ def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late:
 
 def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
     """Sum over the ranks, element by element."""
+    if comm.size == 1:
+        return np.array(values, ndmin=1)
     local = np.atleast_1d(np.asarray(values))
     result = np.empty_like(local)
     comm.Allreduce(local, result, op=MPI.SUM)
