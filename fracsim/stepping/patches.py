@@ -198,29 +198,57 @@ class _Region:
         parts = of_each(self.of_cell, energy, self.count), of_each(self.of, work, self.count)
         return _Look(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
 
+    @cached_property
+    def _pattern(self) -> _Pattern:
+        n = len(self._inertia)
+        every = np.arange(n)
+        rows = np.concatenate([self._rows, self._ties.row, every])
+        columns = np.concatenate([self._columns, self._ties.col, every])
+        free = self._free[rows, :, None] * self._free[columns, None, :]
+        order = np.argsort(rows * n + columns, kind="stable")
+        keys = (rows * n + columns)[order]
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        rows, columns = np.divmod(keys[first], n)
+        return _Pattern(order, first, free, columns, np.searchsorted(rows, np.arange(n + 1)), rows == columns)
+
+    @cached_property
+    def _inertia_and_ties(self) -> Values:
+        """Blocks (of entries of the pattern that are not of cells)."""
+        every = np.eye(self._inertia.shape[1])
+        return np.concatenate([self._ties.data[:, None, None] * every, self._inertia[:, :, None] * every])
+
     def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
         """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
         n, d = self._inertia.shape
-        every, ties = np.arange(n), self._ties.data[:, None, None] * np.eye(d)
-        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], ties, self._inertia[:, :, None] * np.eye(d)])
-        rows = np.concatenate([self._rows, self._ties.row, every])
-        columns = np.concatenate([self._columns, self._ties.col, every])
-        blocks = blocks * self._free[rows, :, None] * self._free[columns, None, :]
-        keys = rows * n + columns
-        order = np.argsort(keys, kind="stable")
-        first = np.flatnonzero(np.diff(keys[order], prepend=-1))
-        data = np.add.reduceat(blocks[order], first)
-        rows, columns = np.divmod(keys[order][first], n)
-        values, vectors = np.linalg.eigh(data[rows == columns])
+        made = self._pattern
+        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], self._inertia_and_ties]) * made.free
+        data = np.add.reduceat(blocks[made.order], made.first)
+        values, vectors = np.linalg.eigh(data[made.diagonal])
         largest = abs(values).max(axis=1, keepdims=True)
         values = np.maximum(abs(values), np.where(largest > 0, LEAST * largest, 1.0))
         inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
-        starts = np.searchsorted(rows, np.arange(n + 1))
-        return bsr_array((data, columns, starts), shape=(n * d, n * d)), inverse
+        return bsr_array((data, made.columns, made.starts), shape=(n * d, n * d)), inverse
 
     def norms(self, forces: Values) -> Values:
         """(count,) |r| of each patch, N."""
         return np.asarray(np.sqrt(of_each(self.of, np.square(forces).sum(axis=1), self.count)))
+
+
+class _Pattern(NamedTuple):
+    """Where blocks that are summed go.
+
+    Attributes:
+        order: of blocks, by where they go.    first: (nonzeros,) of each place, in that order.
+        free: what blocks are multiplied with: 0 where motion is prescribed.    columns, starts: of the matrix.
+        diagonal: (nonzeros,) places on it.
+    """
+
+    order: Ints
+    first: Ints
+    free: Values
+    columns: Ints
+    starts: Ints
+    diagonal: Flags
 
 
 class _Look(NamedTuple):
