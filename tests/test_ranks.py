@@ -41,3 +41,9 @@ def test_a_rank_that_fails_alone_ends_all(tmp_path: Path, rank: int, kind: str, 
     assert done.stderr.count(message) == 1
     assert "Segmentation" not in done.stderr
     assert ("Traceback" in done.stderr) == (kind == "fault")
+
+
+def test_a_mesh_is_parted_alike_each_time(tmp_path: Path) -> None:
+    """Or equal runs would differ in their last digits, and where much breaks at once in more than these."""
+    cells = run_on_ranks("support.parted", 2, tmp_path, seconds=60)["cells"]
+    assert len(cells) == 5 and (cells == cells[0]).all()

@@ -22,6 +22,7 @@ identity_rows, assemble_into, apply_lifting, expanded_csr, create_matrix. What F
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,6 +71,7 @@ def create_mesh(
 ) -> dolfinx.mesh.Mesh:
     """A mesh without ghost cells from (n, d + 1) nodes of cells and (m, d) points in m, each rank giving its share
     (collective)."""
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # with threads each run would be parted otherwise
     partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
     return dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
 
