@@ -118,10 +118,24 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
     """Ten planes through a bar and steps in which inertia holds nothing: at most half the iterations that it
     takes by multigrid of another kind."""
     its = []
-    for held in (loose_parts.HELD, 0.0):
-        monkeypatch.setattr(loose_parts, "HELD", held)
+    for held in (preconditioner.HELD, 0.0):
+        monkeypatch.setattr(preconditioner, "HELD", held)
         its.append(sum(shattered(0.04, 10, {}, 6, step=0.1)[1][-3:]))
     assert its[0] < its[1] / 2, f"{its[0]} iterations, {its[1]} without"
+
+
+def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten planes through a bar: SSOR takes over, to the same motion as by a user's own preconditioner, and multigrid
+    again once inertia holds less."""
+    monkeypatch.setattr(preconditioner, "IN_PIECES", 0.5)
+    scene, its = shattered(0.04, 10, {"ksp_rtol": 1e-9}, 6, step=5e-3)
+    asked, _ = shattered(0.04, 10, {"ksp_rtol": 1e-9, "pc_type": "jacobi"}, 6, step=5e-3)
+    solver, u, v = scene.solver, scene.balance.u.x.array, asked.balance.u.x.array
+    assert isinstance(solver, Solver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
+    np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
+    monkeypatch.setattr(preconditioner, "SWEPT", 1.0)
+    solver.linear_response(np.ones(scene.balance.owned))
+    assert set(smoothers(scene)) == {("sor", 1)}
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ descent, downhill  what its line search goes down, with moduli made positive whe
 blocks             products with the tangent in blocks of a node's dofs
 cycle              multigrid's cycle in single precision; levels: PETSc's, copied; rows: products in C
 woodbury           few stiff pairs beside what a preconditioner knows
-preconditioner     when multigrid is made anew
+preconditioner     when multigrid is made anew, and what takes over from it; inertia_share: what decides
 rigid_modes        its near null space; loose_parts: the same of parts that hang by a node or an edge
 petsc_options      options of one solver
 frequencies        bounds on how fast cells vibrate, for explicit steps

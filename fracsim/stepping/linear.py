@@ -18,6 +18,7 @@ from ..mesh.domain import Domain
 from .blocks import Blocks, worth_it
 from .factors import FACTORISED, Factors
 from .forcing import Forcing, Sparing
+from .inertia_share import inertia_share
 from .one_solve import Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
@@ -84,8 +85,9 @@ class Linear:
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
-            large=self._blocks is not None, hangs=self._hangs, loosen=self._loosen, hasten=self._hasten,
-            bring=self._bring, nodes=balance.domain.space.dofmap.index_map.size_global,
+            large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
+            bring=self._bring, inertia=lambda: inertia_share(balance),
+            nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self.linearly = is_linear(balance, given, ksp.getType())
@@ -184,11 +186,6 @@ class Linear:
         pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.vector), comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
-
-    def _hangs(self) -> bool:
-        from .loose_parts import inertia_holds
-
-        return not inertia_holds(self.balance)
 
     def _loosen(self, body: PETSc.PC) -> LooseParts | None:
         from .loose_parts import loose_parts

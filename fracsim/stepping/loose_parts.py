@@ -25,7 +25,6 @@ from ..mesh.ranks import total
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-HELD = 1e-3  # share of the stiffness of a cell that its inertia has, above which iterations manage
 DEPENDENT = 1e-8  # of the largest eigenvalue of a part's Gram matrix: motions that are the same on its nodes
 
 
@@ -106,19 +105,6 @@ def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
     count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
     nodes = np.flatnonzero(part > 0)
     return LooseParts(balance, body, nodes, part[nodes] - 1, count - 1) if count > 1 else None
-
-
-def inertia_holds(balance: Balance) -> bool:
-    """Whether inertia holds what hangs (collective)."""
-    return balance.stress.multiplier is None or _inertia(balance) > HELD
-
-
-def _inertia(balance: Balance) -> float:
-    """c_a rho h^2 / Y, the inertia of a cell as a share of its stiffness (collective)."""
-    domain, material = balance.domain, balance.stress.material
-    sums = [np.sum(each * domain.volumes) for each in (material.young, material.density)]
-    stiffness, mass = total(domain.comm, np.array(sums))
-    return float(balance.c_a * mass * domain.mean_edge**2 / stiffness)
 
 
 def _motions(

@@ -11,7 +11,9 @@ Smoothed aggregation with Jacobi's smoother needs three times the iterations the
 spoil. Where steps are so long that inertia is next to nothing, it is a hundred times, and what hangs is solved for by
 itself (loose_parts), which is looked for after edges broke. In shorter ones other aggregates do: those without
 smoothing cost a fifth of the set-up, and a sweep of SSOR deals with what hangs: 18 iterations where the whole body took
-9 and the cut one 27 (33,000 tetrahedra, 10 planes), a step in 0.85 of the time; after 100 planes 0.7.
+9 and the cut one 27 (33,000 tetrahedra, 10 planes), a step in 0.85 of the time; after 100 planes 0.7. In steps so short
+that inertia has a hundredth of the stiffness of a cell, or more, SSOR alone does: a porcelain figure that shatters
+(46,000 tetrahedra, a sixth) takes 2.5 times the iterations and half the time.
 
 A whole body that is slow to solve for is thin, or all but incompressible. Aggregates are made anew of the stronger
 links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahedra) takes 38 iterations where it took
@@ -31,6 +33,7 @@ from typing import TYPE_CHECKING
 
 from petsc4py import PETSc
 
+from .inertia_share import HELD, SWEPT
 from .petsc_options import Options, OptionSet
 
 if TYPE_CHECKING:
@@ -50,6 +53,8 @@ OF_PIECES: Options = {
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
+SWEEPS: Options = {"pc_type": "sor"}
+LEVELS: Options = {"pc_type": "gamg"}
 # on the finest level: one step, with blocks of a node's dofs, within bounds of their own spectrum
 BY_NODES: Options = {"pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"}
 STRONG_LINKS: Options = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
@@ -94,24 +99,25 @@ class Preconditioner:
         keep: bool,
         may_change: bool,
         large: bool,
-        hangs: Callable[[], bool],
         loosen: Callable[[PETSc.PC], LooseParts | None],
         hasten: Callable[[PETSc.PC], Cycle | None],
         bring: Callable[[], bool],
+        inertia: Callable[[], float],
         nodes: int,
     ) -> None:
-        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `hangs`: whether
-        nothing holds what comes loose; `loosen`: makes one that sees to loose parts out of `pc`, None: there are none
-        (both collective); `hasten`: what does the same in less
-        time, None where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the
-        entries of the tangent to what they are, and tells whether they are at other places; `nodes`: of the body."""
+        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
+        that sees to loose parts out of `pc`, None: there are none; `hasten`: what does the same in less time, None
+        where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the entries of
+        the tangent to what they are, and tells whether they are at other places; `inertia`: of a cell, as a share of
+        its stiffness (all collective); `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
-        self.serving, self._hangs, self._loosen, self._bring = self.pc, hangs, loosen, bring
-        self._nodes = nodes
+        self.serving, self._loosen, self._bring = self.pc, loosen, bring
+        self._inertia, self._nodes = inertia, nodes
         self._loose: LooseParts | None = None
         self._hasten = hasten
         self._cycle: Cycle | None = None
         self._looks_for_parts = False  # before the next solve
+        self._sweeps: bool | None = None  # of a body in pieces: whether sweeps do for it
         self._broke, self._extra = 0, 0.0  # edges and iterations since it was set up
         self.due, self.keep = Due.REBUILD, keep
         self._large, self._by_nodes = large, False
@@ -135,6 +141,7 @@ class Preconditioner:
         another matrix. Done here, since SNES knows a fixed lag only."""
         self.look()
         self._count()
+        self._see_to_pieces()
         ksp = self._ksp
         if self.due == Due.NOTHING:
             self._follow(tangent)
@@ -172,7 +179,9 @@ class Preconditioner:
             self._cycle.follow()
         if self._looks_for_parts and self._own and self.pc.getType() == "gamg":
             self.forget_parts()
-            self._loose, self._looks_for_parts = self._loosen(self.serving) if self._hangs() else None, False
+            self._loose, self._looks_for_parts = None, False
+            if self._inertia() <= HELD:
+                self._loose = self._loosen(self.serving)
         loose = self._loose
         if loose is None or loose.body is not self.serving:
             return
@@ -237,6 +246,9 @@ class Preconditioner:
 
     def _look_at(self, its: int) -> None:
         """Iterations of a solve since it was set up."""
+        if self._sweeps:
+            self.due = Due.REFRESH
+            return
         if not self._fresh_its:
             self._fresh_its = its
             if not self._broken and self._tries_links(its):
@@ -262,11 +274,18 @@ class Preconditioner:
         return worse
 
     def _change(self) -> None:
-        if self._hangs():
+        if self._inertia() <= HELD:
             return
-        self._may_change = self._by_nodes = False
+        self._may_change = self._by_nodes = self._sweeps = False
         self._rebuild_above = REBUILD_ABOVE_OF_PIECES
         self._become(OF_PIECES)
+
+    def _see_to_pieces(self) -> None:
+        """In the way that goes with how long steps are."""
+        if self._sweeps is None or self._sweeps == (self._inertia() > SWEPT):
+            return
+        self._sweeps, self._fresh_its = not self._sweeps, 0
+        self._become(SWEEPS if self._sweeps else LEVELS)
 
     def _become(self, kind: Options) -> None:
         self.due = Due.REBUILD
