@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.sparse import csr_matrix
 
 from cases import BAR, study
 from fracsim.mechanics.stiffness import Stiffness
 from fracsim.mechanics.tangent import Assembly
+from fracsim.mechanics.tied import Tied
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import blocks, loose_parts, preconditioner
+from fracsim.stepping import blocks, preconditioner
 from fracsim.stepping.newton import Solver
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
@@ -177,13 +179,30 @@ def cut(scene: Scene, planes: list[Any]) -> None:
     scene.solver.damage_changed()
 
 
-def test_a_rank_on_which_nothing_hangs_has_a_share_of_the_motions() -> None:
-    """Its rows of Z are empty."""
-    tangent = PETSc.Mat().createAIJ((6, 6))
-    tangent.setUp()
-    nodes, none = np.empty(0, np.int64), np.empty((0, 3, 6))
-    Z = loose_parts._matrix(tangent, nodes, np.empty((0, 6), np.int64), none, 6)
-    assert Z.getSize() == (6, 6) and Z.getInfo()["nz_used"] == 0
+@pytest.mark.parametrize("first", [True, False])
+def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar in pieces: rows of some nodes, of blocks with ties beside them or of the matrix, against products with unit
+    vectors."""
+    if first:
+        monkeypatch.setattr(blocks, "SMALL", 0)
+    scene, _ = shattered(0.06, 10, {}, 2)
+    solver, nodes = scene.solver, np.array([5, 0, 17, 40])
+    assert isinstance(solver, Solver) and (solver.linear._blocks is not None) is first
+    K, d = solver.linear.operator, scene.domain.dim
+    if first:
+        random, tied = np.random.default_rng(1), np.array([17, 3, 5])
+        ties = csr_matrix(random.normal(size=(3, 3)))
+        free = random.uniform(size=(3, d)) > 0.3
+        products = scene.balance.stiffness._assembly.blocks
+        assert products is not None
+        products.beside = [Tied(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
+    x, y = scene.balance.vector.duplicate(), scene.balance.vector.duplicate()
+    rows = scene.balance.stiffness.rows(nodes).toarray()
+    for row, dof in zip(rows, (d * nodes[:, None] + np.arange(d)).reshape(-1), strict=True):
+        x.array_w[:] = 0.0
+        x.array_w[dof] = 1.0
+        K.mult(x, y)
+        np.testing.assert_allclose(row, y.array_r, atol=1e-12 * np.abs(rows).max())
 
 
 @pytest.mark.parametrize("first", [True, False])

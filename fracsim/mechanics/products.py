@@ -9,6 +9,8 @@ from ctypes import CDLL, c_int64
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -16,7 +18,11 @@ from petsc4py import PETSc
 from ..mesh.compiled import FASTER, at, built_together
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
     from .tied import Tied
+
+Ints = npt.NDArray[np.int64]
 
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -57,6 +63,25 @@ class Products:
         matrix = self.matrix
         arrays = matrix.indptr, matrix.indices, matrix.data, x.array_r, y.array_w
         self._code.multiply(c_int64(self._rows), *map(at, arrays))
+
+    def rows(self, nodes: Ints) -> csr_matrix:
+        """(d n, dofs of all ranks) those of owned nodes (n,), with what is beside them (collective)."""
+        from scipy.sparse import csr_matrix
+
+        K, d, columns = self.matrix, self.matrix.block_size[0], self.matrix.index_map(1)
+        names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
+        lengths = K.indptr[nodes + 1] - K.indptr[nodes]
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        block = np.repeat(K.indptr[nodes] - starts[:-1], lengths) + np.arange(starts[-1])
+        axes = np.arange(d)
+        row = d * np.repeat(np.arange(len(nodes)), lengths)[:, None, None] + axes[:, None]
+        column = d * names[K.indices[block]][:, None, None] + axes
+        values = K.data.reshape(-1, d, d)[block]
+        at = tuple(np.broadcast_to(each, values.shape).reshape(-1) for each in (row, column))
+        result = csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * columns.size_global))
+        for each in self.beside:
+            result = result + each.rows(nodes, names, columns.size_global)
+        return result
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

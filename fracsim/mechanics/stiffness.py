@@ -28,10 +28,13 @@ from .tangent import Assembly
 from .term import Term, sum_of_forms
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
     from .positive import Positive
     from .products import Products
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 # of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
 STILL = 0.01
@@ -92,6 +95,23 @@ class Stiffness:
             for coupling in [term.coupling() for term in self._terms]:
                 if coupling is not None:
                     self._couple(coupling, constant=True)
+
+    def rows(self, nodes: Ints) -> csr_matrix:
+        """(d n, dofs of all ranks) those of owned nodes (n,), of blocks where there are any (collective)."""
+        if (blocks := self._assembly.blocks) is not None:
+            return blocks.rows(nodes)
+        from scipy.sparse import csr_matrix
+
+        d = self.domain.dim
+        first = d * self.domain.space.dofmap.index_map.local_range[0]
+        at = (first + d * nodes[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
+        which = PETSc.IS().createGeneral(at, comm=self.domain.comm)
+        part = self.matrix.createSubMatrix(which)
+        starts, columns, values = part.getValuesCSR()
+        result = csr_matrix((values, columns, starts), shape=(len(at), self.matrix.getSize()[1]))
+        which.destroy()
+        part.destroy()
+        return result
 
     @property
     def is_incomplete(self) -> bool:

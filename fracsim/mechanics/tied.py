@@ -33,3 +33,21 @@ class Tied:
         every = np.zeros((self.K.shape[0], x.shape[1]))
         every[self.here] = x * self._free
         return np.asarray((self.K @ total(self._comm, every))[self.here] * self._free)
+
+    def rows(self, nodes: Ints, names: Ints, count: int) -> csr_matrix:
+        """(d n, dofs of all ranks) those of owned nodes (n,); `names`: global numbers of this rank's nodes, of so many
+        (collective)."""
+        d = self._free.shape[1]
+        told = np.zeros((self.K.shape[0], d + 1))
+        told[self.here] = np.concatenate([names[self.nodes][:, None], self._free], axis=1)
+        told = total(self._comm, told)
+        place = np.full(len(names), -1)
+        place[nodes] = np.arange(len(nodes))
+        row_of = np.full(len(told), -1)
+        row_of[self.here] = place[self.nodes]
+        K, axes = self.K.tocoo(), np.arange(d)
+        inside = row_of[K.row] >= 0
+        row, column = row_of[K.row[inside]], told[K.col[inside], 0].astype(np.int64)
+        values = K.data[inside][:, None] * told[K.row[inside], 1:] * told[K.col[inside], 1:]
+        at = tuple((d * each[:, None] + axes).reshape(-1) for each in (row, column))
+        return csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * count))

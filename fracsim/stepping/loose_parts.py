@@ -15,7 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import splu
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
@@ -39,69 +42,64 @@ class LooseParts:
         """`nodes`: (n,) owned ones that move with their `part` (n,) of so many."""
         self._balance, self.body = balance, body
         self._nodes, self._part, self._count = nodes, part, count
-        self._at: tuple[int, int] | None = None
-        self._made: list[PETSc.Object] = []
         self.pc = PETSc.PC().create(balance.domain.comm)
         self.pc.setType("python")
         self.pc.setPythonContext(self)
+        self._rest = balance.vector.duplicate()
 
     def follow(self, tangent: PETSc.Mat) -> bool:
-        """Serve this tangent, and the body where it is now. False: all that hangs is held (collective)."""
-        if self._at == (at := (tangent.handle, tangent.stateGet())):
-            return True
-        self._forget_parts()
-        if (Z := self._motions(tangent)) is None:
-            return False
-        self._Z, self._at = Z, at
-        self._KZ = tangent.matMult(Z)
-        self._KtZ = self._KZ if self._balance.symmetric else tangent.transposeMatMult(Z)
-        E, self._solve = Z.transposeMatMult(self._KZ), PETSc.PC().create(tangent.comm)
-        self._small, self._moved, self._back = (Z.createVecRight() for _ in range(3))
-        self._left = tangent.createVecRight()
-        self._made = [Z, self._KZ, self._KtZ, E, self._solve, self._small, self._moved, self._back, self._left]
-        self._solve.setType("redundant" if tangent.comm.size > 1 else "lu")
-        self._solve.setOperators(E)
-        self._solve.setUp()
-        self.pc.setOperators(tangent)
-        return True
-
-    def _motions(self, tangent: PETSc.Mat) -> PETSc.Mat | None:
-        """Z (collective)."""
+        """Serve the tangent of now, and the body where it is. False: all that hangs is held (collective)."""
         balance, domain = self._balance, self._balance.domain
         x, free = domain.nodes[self._nodes], balance.motion.free.reshape(-1, domain.dim)[self._nodes]
         if not balance.linear:
             x = x + balance.u.x.array.reshape(-1, domain.dim)[self._nodes]
         columns, values, width = _motions(domain, self._part, x, free, self._count)
-        return _matrix(tangent, self._nodes, columns, values, width) if width else None
+        if not width:
+            return False
+        self._take(columns, values, width)
+        self.pc.setOperators(tangent)
+        return True
+
+    def _take(self, columns: Ints, values: Values, width: int) -> None:
+        """Z, K Z and the factors of E (collective)."""
+        domain = self._balance.domain
+        comm, d = domain.comm, domain.dim
+        nodes = domain.space.dofmap.index_map
+        first, size = d * nodes.local_range[0], d * nodes.size_global
+        self._at: Ints = (d * self._nodes[:, None] + np.arange(d)).reshape(-1)
+        there = np.broadcast_to((columns >= 0)[:, None], values.shape)
+        row, column = (np.broadcast_to(each, values.shape)[there] for each in
+                       (first + self._at.reshape(-1, d, 1), columns[:, None]))  # fmt: skip
+        Z = csr_matrix((values[there], (row, column)), shape=(size, width))
+        self._Z = Z[first + self._at]
+        ZtK = _summed(comm, self._Z.T @ self._balance.stiffness.rows(self._nodes))
+        E = ZtK @ _summed(comm, Z)
+        self._solve = splu(E.tocsc()).solve
+        own = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
+        self._near = np.flatnonzero(np.diff(own.indptr))
+        self._KZ = own[self._near]
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = P x (collective)."""
-        small, moved, back, left = self._small, self._moved, self._back, self._left
-        self._Z.multTranspose(x, small)
-        self._solve.apply(small, moved)
-        self._KZ.mult(moved, left)
-        left.aypx(-1.0, x)
-        self.body.apply(left, y)
-        self._KtZ.multTranspose(y, small)
-        self._solve.apply(small, back)
-        moved.axpy(-1.0, back)
-        self._Z.multAdd(moved, y, y)
-
-    def _forget_parts(self) -> None:
-        for each in self._made:
-            each.destroy()
-        self._made = []
+        comm, at, near, rest = self._balance.domain.comm, self._at, self._near, self._rest
+        x.copy(rest)
+        moved = self._solve(total(comm, self._Z.T @ rest.array_r[at]))
+        rest.array_w[near] -= self._KZ @ moved
+        self.body.apply(rest, y)
+        moved -= self._solve(total(comm, self._KZ.T @ y.array_r[near]))
+        y.array_w[at] += self._Z @ moved
 
     def forget(self) -> None:
         """Give the memory of PETSc's objects back."""
-        self._forget_parts()
         self.pc.destroy()
+        self._rest.destroy()
 
 
 def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
     """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part (collective)."""
     domain, multiplier = balance.domain, balance.stress.multiplier
-    assert multiplier is not None  # where anything breaks
+    if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
+        return None
     count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
     nodes = np.flatnonzero(part > 0)
     return LooseParts(balance, body, nodes, part[nodes] - 1, count - 1) if count > 1 else None
@@ -138,16 +136,11 @@ def _rigid(r: Values) -> Values:
     return B
 
 
-def _matrix(tangent: PETSc.Mat, nodes: Ints, columns: Ints, values: Values, width: int) -> PETSc.Mat:
-    """Z (owned dofs, width) (collective)."""
-    d = values.shape[1]
-    rows = tangent.getLocalSize()[0]
-    there = np.broadcast_to((columns >= 0)[:, None], values.shape)
-    lengths = np.zeros(rows, PETSc.IntType)
-    lengths[(d * nodes[:, None] + np.arange(d)).reshape(-1)] = there.sum(axis=2).reshape(-1)
-    starts = np.concatenate([[0], np.cumsum(lengths)]).astype(PETSc.IntType)
-    where = np.broadcast_to(columns[:, None], values.shape)[there].astype(PETSc.IntType)
-    size = ((rows, None), (None, width))
-    Z = PETSc.Mat().createAIJ(size, csr=(starts, where, values[there]), comm=tangent.comm)
-    Z.assemble()
-    return Z
+def _summed(comm: MPI.Comm, part: csr_matrix) -> csr_matrix:
+    """Over the ranks, on all of them (collective)."""
+    if comm.size == 1:
+        return csr_matrix(part)
+    entries = part.tocoo()
+    rows, columns, values = zip(*comm.allgather((entries.row, entries.col, entries.data)), strict=True)
+    every = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return csr_matrix(every, shape=part.shape)

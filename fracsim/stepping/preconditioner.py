@@ -185,8 +185,6 @@ class Preconditioner:
         loose = self._loose
         if loose is None or loose.body is not self.serving:
             return
-        if self._bring():
-            self.due = Due.REBUILD
         if loose.follow(tangent):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
