@@ -69,18 +69,17 @@ class Products:
         from scipy.sparse import csr_matrix
 
         K, d, columns = self.matrix, self.matrix.block_size[0], self.matrix.index_map(1)
-        names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
         lengths = K.indptr[nodes + 1] - K.indptr[nodes]
         starts = np.concatenate([[0], np.cumsum(lengths)])
         block = np.repeat(K.indptr[nodes] - starts[:-1], lengths) + np.arange(starts[-1])
         axes = np.arange(d)
         row = d * np.repeat(np.arange(len(nodes)), lengths)[:, None, None] + axes[:, None]
-        column = d * names[K.indices[block]][:, None, None] + axes
+        column = d * columns.local_to_global(K.indices[block])[:, None, None] + axes
         values = K.data.reshape(-1, d, d)[block]
         at = tuple(np.broadcast_to(each, values.shape).reshape(-1) for each in (row, column))
         result = csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * columns.size_global))
         for each in self.beside:
-            result = result + each.rows(nodes, names, columns.size_global)
+            result = result + each.rows(nodes, columns)
         return result
 
     def destroy(self) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx.common import IndexMap
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
@@ -34,14 +35,14 @@ class Tied:
         every[self.here] = x * self._free
         return np.asarray((self.K @ total(self._comm, every))[self.here] * self._free)
 
-    def rows(self, nodes: Ints, names: Ints, count: int) -> csr_matrix:
-        """(d n, dofs of all ranks) those of owned nodes (n,); `names`: global numbers of this rank's nodes, of so many
-        (collective)."""
+    def rows(self, nodes: Ints, every: IndexMap) -> csr_matrix:
+        """(d n, dofs of all ranks) those of owned nodes (n,); `every`: the nodes of the body (collective)."""
         d = self._free.shape[1]
+        names = every.local_to_global(self.nodes.astype(np.int32))
         told = np.zeros((self.K.shape[0], d + 1))
-        told[self.here] = np.concatenate([names[self.nodes][:, None], self._free], axis=1)
+        told[self.here] = np.concatenate([names[:, None], self._free], axis=1)
         told = total(self._comm, told)
-        place = np.full(len(names), -1)
+        place = np.full(every.size_local, -1)
         place[nodes] = np.arange(len(nodes))
         row_of = np.full(len(told), -1)
         row_of[self.here] = place[self.nodes]
@@ -50,4 +51,4 @@ class Tied:
         row, column = row_of[K.row[inside]], told[K.col[inside], 0].astype(np.int64)
         values = K.data[inside][:, None] * told[K.row[inside], 1:] * told[K.col[inside], 1:]
         at = tuple((d * each[:, None] + axes).reshape(-1) for each in (row, column))
-        return csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * count))
+        return csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * every.size_global))

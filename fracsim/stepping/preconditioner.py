@@ -179,7 +179,7 @@ class Preconditioner:
             self._cycle.follow()
         if self._looks_for_parts and self._own and self.pc.getType() == "gamg":
             self.forget_parts()
-            self._loose, self._looks_for_parts = None, False
+            self._looks_for_parts = False
             if self._inertia() <= HELD:
                 self._loose = self._loosen(self.serving)
         loose = self._loose
