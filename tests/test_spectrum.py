@@ -56,6 +56,28 @@ def test_powers(spectrum: tuple[float, ...], exponent: float) -> None:
     np.testing.assert_allclose(found, [expected[:, i, j] for i, j in PAIRS], atol=scale)
 
 
+@pytest.mark.parametrize("least", (1e-16, 1e-20, 0.0))
+def test_a_tensor_that_is_all_but_singular(least: float) -> None:
+    """Its eigenvalues are positive, and its powers numbers, whatever round-off has made of the smallest one."""
+    _, C = tensors((1.0, 0.5, least))
+    values = eigenvalues(C)
+    assert np.all(values > 0)
+    np.testing.assert_allclose(values[:2].T, np.tile([1.0, 0.5], (C.shape[1], 1)), atol=1e-14)
+    logs = np.log(values)
+    assert np.isfinite(deviatoric_power(C, values, logs - logs.mean(axis=0), np.full(C.shape[1], -0.5))).all()
+
+
+@pytest.mark.parametrize("stretch", (1e3, 1e6, 1e9, 1e12))
+def test_products_whose_determinant_is_round_off(stretch: float) -> None:
+    """A stretch and its inverse in other planes: by what cancels in the determinant nothing is scaled."""
+    _, S = tensors((1.5, 1.0, 1 / 1.5))
+    Q = np.array([rotation(3, seed) for seed in range(S.shape[1])])
+    A = np.einsum("nij,j,nkj->nik", Q, np.array([stretch, 1.0, 1 / stretch]), Q[::-1])
+    found = times(A.reshape(-1, 9).T, S).T.reshape(-1, 3, 3)
+    product = A @ tensors((1.5, 1.0, 1 / 1.5))[0]
+    np.testing.assert_allclose(found, product, atol=5e-2 * stretch)
+
+
 def test_products_have_determinant_one() -> None:
     """A S scaled by det^(-1/3)."""
     random = np.random.default_rng(0)

@@ -16,9 +16,13 @@ import numpy.typing as npt
 
 Values = npt.NDArray[np.float64]
 
+EPS = float(np.finfo(float).eps)
+KNOWN = 100 * EPS  # of the product of its rows' lengths: a determinant below that is round-off
+
 
 def eigenvalues(C: Values) -> Values:
-    """(3, n) eigenvalues of (6, n) tensors, falling, by the cosine formula on the deviator."""
+    """(3, n) eigenvalues of positive (6, n) tensors, falling, by the cosine formula on the deviator; none below
+    round-off of the greatest, which hides those of a cell that is all but flat."""
     mean = (C[0] + C[1] + C[2]) / 3
     x, y, z = C[0] - mean, C[1] - mean, C[2] - mean
     xy, xz, yz = C[3], C[4], C[5]
@@ -28,7 +32,8 @@ def eigenvalues(C: Values) -> Values:
     cosine = np.divide(J3, 2 * radius * radius * radius, out=np.zeros_like(J3), where=radius > 0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0)) / 3
     first, last = 2 * np.cos(angle), 2 * np.cos(angle + 2 * np.pi / 3)
-    return mean + radius * np.stack([first, -first - last, last])
+    values = mean + radius * np.stack([first, -first - last, last])
+    return np.maximum(values, EPS * values[0])
 
 
 def deviatoric_power(C: Values, values: Values, logs: Values, exponent: Values) -> Values:
@@ -60,10 +65,12 @@ def _slope(gap: Values, log_ratio: Values, end: Values, rate: Values) -> Values:
 
 
 def times(A: Values, S: Values) -> Values:
-    """(9, n) products A S of (9, n) row-wise and symmetric (6, n) tensors, scaled to determinant 1."""
+    """(9, n) products A S of (9, n) row-wise and symmetric (6, n) tensors, scaled to determinant 1 where it is known to
+    a digit."""
     x, y, z, xy, xz, yz = S
     columns = ((x, xy, xz), (xy, y, yz), (xz, yz, z))
     P = np.stack([A[3 * i] * u + A[3 * i + 1] * v + A[3 * i + 2] * w for i in range(3) for u, v, w in columns])
     det = P[0] * (P[4] * P[8] - P[5] * P[7]) - P[1] * (P[3] * P[8] - P[5] * P[6]) + P[2] * (P[3] * P[7] - P[4] * P[6])
-    P /= np.cbrt(det)
+    lengths = np.sqrt(np.prod((P * P).reshape(3, 3, -1).sum(axis=1), axis=0))
+    P /= np.cbrt(np.where(det > KNOWN * lengths, det, 1.0))
     return P
