@@ -31,8 +31,8 @@ class Way(NamedTuple):
     goes_on: bool = False
 
 
-# with positive moduli; the second goes on from where exact tangents have misled the first
-POSITIVE = Way(1e-2, 1e-2), Way(0.0, 0.0, goes_on=True), Way(0.0, 0.0, anew=True)
+# with positive moduli; the second and the third go on from where exact tangents have misled the one before
+POSITIVE = Way(1e-2, 1e-2), Way(1e-2, 0.0, goes_on=True), Way(0.0, 0.0, goes_on=True), Way(0.0, 0.0, anew=True)
 EXACT = Way(math.inf, 0.0, goes_on=True)  # exact tangents throughout
 PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
 
