@@ -338,3 +338,14 @@ def test_the_bound_on_their_frequency() -> None:
     dense = K.convert("dense").getDenseArray() / scene.balance.mass.lumped[:, None]
     highest = float(np.linalg.eigvals(dense).real.max())
     assert highest <= tethers.frequency() < 10 * highest
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_multigrid_knows_of_rotations_once_nodes_are_tied(dim: int) -> None:
+    """Ties add entries to the matrix that multigrid is made of, by which PETSc forgets its near null space: all rigid
+    motions are there once it is solved with."""
+    scene, state, _ = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0}, solver={})
+    state.advance()
+    assert scene.solver is not None
+    found = scene.balance.stiffness.matrix.getNearNullSpace()
+    assert found and len(found.getVecs()) == {2: 3, 3: 6}[dim]

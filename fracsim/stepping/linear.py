@@ -114,7 +114,12 @@ class Linear:
 
             parts, springs = (lambda: self.stiffness.low_rank), (lambda: self.stiffness.springs)
             self.operator = Condensed(self.operator, parts, springs).matrix()
-        if self._near_null is not None:
+        self._know_rigid_motions()
+
+    def _know_rigid_motions(self) -> None:
+        """Tell the matrix of them, once more where entries beyond its pattern were added: PETSc's sum is another matrix
+        under the same name, which forgets them, and multigrid would know of translations alone."""
+        if self._near_null is not None and not self.stiffness.matrix.getNearNullSpace():
             self.stiffness.matrix.setNearNullSpace(self._near_null)
 
     def _use_blocks(self) -> None:
@@ -170,6 +175,7 @@ class Linear:
             self.ksp.setType("gmres")  # factors are of the rest
         if self.stiffness.pattern_changed:
             self.preconditioner.due, self.stiffness.pattern_changed = Due.REBUILD, False
+        self._know_rigid_motions()
         self.preconditioner.refresh(self.stiffness.matrix, self._products)
         self._hold()
 
@@ -201,6 +207,7 @@ class Linear:
 
     def _bring(self) -> bool:
         self.stiffness.bring_entries()
+        self._know_rigid_motions()
         changed, self.stiffness.pattern_changed = self.stiffness.pattern_changed, False
         return changed
 
