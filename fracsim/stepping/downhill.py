@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from .descent import Descent
+from .leaps import hold_back
 
 
 class Way(NamedTuple):
@@ -46,7 +47,7 @@ class Downhill:
 
     def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
         """Makes the incremental potential of `balance`, which has one, the objective of `snes`."""
-        self.snes = snes
+        self.snes, self._balance = snes, balance
         self.descent = descent = Descent(balance, snes)
         snes.setObjective(lambda _, x: descent(x))
         snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
@@ -65,6 +66,12 @@ class Downhill:
         norm = self.snes.getFunctionNorm()
         self._highest = max(self._highest, norm)
         return None if norm < self._how.exact_below * self._highest else self._how.small
+
+    def hold_back(self, y: PETSc.Vec) -> None:
+        """Of a correction what would throw few nodes far, where moduli are made positive (leaps). Without inertia
+        nothing tells where a part goes that hangs by a thread (collective)."""
+        if self._balance.scheme.inertia and self.small is not None:
+            hold_back(self._balance.domain, y, self.snes.getFunction()[0])
 
     def stalls(self, norm: float, its: int) -> bool:
         """Whether it goes about in circles: exact tangents that are not positive, though CG does not notice, lead past

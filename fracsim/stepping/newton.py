@@ -17,7 +17,6 @@ from ..mechanics.balance import Balance
 from .choice import Choice
 from .downhill import EXACT, POSITIVE
 from .factors import SOONER_THAN_GMRES
-from .leaps import hold_back
 from .linear import Linear, chosen_options
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import Due
@@ -322,8 +321,7 @@ class Solver:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
         if self._down is not None:
             self._down.descent.set_out()
-            if self.balance.scheme.inertia and self._down.small is not None:
-                hold_back(self.balance.domain, y, self.snes.getFunction()[0])
+            self._down.hold_back(y)
         if not self.balance.limits_steps:
             return
         share = self.balance.longest_step(-y.array_r)
