@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping import blocks, cycle
+from fracsim.stepping import linear as linear_room
 from fracsim.stepping.linear import Linear
 from fracsim.stepping.preconditioner import Due
 from support.scenes import Walk
@@ -125,6 +126,40 @@ def test_it_takes_as_many_iterations_as_in_double_precision(monkeypatch: pytest.
         assert (linear_of(scene).preconditioner._cycle is None) == bool(given)
     assert np.abs(np.subtract(*its)).max() <= 1 < min(its[1])
     np.testing.assert_allclose(*u, rtol=0, atol=1e-6 * np.abs(u[1]).max())
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six digits of K, written out; solves by themselves go by all of them."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    scene = bar(dim, {"snes_type": "newtonls"})
+    Walk(scene).advance()
+    linear = linear_of(scene)
+    context = linear.operator.getPythonContext()
+    assert context.single is linear.preconditioner.finest
+    linear.stiffness.bring_entries()
+    K = dense(linear.stiffness.matrix)
+    assert 0 < np.abs(written_out(linear.operator.mult, scene.balance.vector) - K).max() < 1e-6 * np.abs(K).max()
+    assert linear.solve() and context.single is None
+    linear.stiffness.bring_entries()
+    K = dense(linear.stiffness.matrix)
+    assert np.abs(written_out(linear.operator.mult, scene.balance.vector) - K).max() < 1e-14 * np.abs(K).max()
+
+
+def test_what_is_rounded_is_found_by_the_next_correction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same motion as with corrections in double precision, in as many iterations; which those are where inertia
+    holds next to nothing."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    its, u = [], []
+    for rounded in (linear_room.ROUNDED, np.inf):
+        monkeypatch.setattr(linear_room, "ROUNDED", rounded)
+        scene = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-9})
+        walk = Walk(scene)
+        its.append([walk.advance().solve.newton for _ in range(4)])
+        u.append(walk.u)
+        assert (linear_of(scene).operator.getPythonContext().single is None) == (rounded == np.inf)
+    assert its[0] == its[1]
+    np.testing.assert_allclose(*u, rtol=0, atol=1e-8 * np.abs(u[1]).max())
 
 
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from ..mechanics.products import Products
+    from .cycle import Level
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
 
@@ -26,11 +27,13 @@ class Blocks:
     Attributes:
         tangent: the matrix of single entries that it is a copy of.
         assembled: products with the blocks, where they are assembled first.
+        single: what is multiplied with instead, in single precision.
     """
 
     def __init__(self, tangent: PETSc.Mat, assembled: Products | None) -> None:
         self.tangent = tangent
         self.assembled = assembled
+        self.single: Level | None = None
         self._copy: PETSc.Mat | None = None
         self._entries, self._state = 0.0, -1
 
@@ -46,6 +49,9 @@ class Blocks:
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
+        if self.single is not None:
+            self.single.multiply(x, y)
+            return
         by = self.assembled or self._copy
         assert by is not None
         by.mult(x, y)

@@ -2,7 +2,8 @@
 
 CG with multigrid is bound by what it reads: five products with the finest level an iteration, four of them in the
 cycle, where six digits are plenty. Floats in blocks are 40 bytes for nine entries, doubles in blocks 76, single entries
-108; an iteration takes 0.4 to 0.5 of the time. CG itself goes by the tangent in double precision.
+108; an iteration takes 0.4 to 0.5 of the time. CG itself goes by the tangent in double precision, but for corrections
+of Newton's method (linear), which finds the last digits by its residuals.
 
 Each level is scaled by its diagonal, A' = S A S, S = diag(A)^(-1/2), and P' = S_fine^-1 P S_coarse, so that Jacobi's
 smoother is a plain one: Chebyshev's polynomial p (first kind) of A' within LOW and HIGH of its largest eigenvalue, as
@@ -117,6 +118,17 @@ class Level:
     def _by_nodes(self, vector: Vector) -> npt.NDArray[np.float32]:
         return vector.array[: self._owned].reshape(-1, self._size)
 
+    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = A x, neither of them scaled (collective)."""
+        n = self._owned
+        np.divide(x.array_r, self.scale[:n], out=self.x.array[:n], casting="same_kind")
+        self.x.fetch()
+        self.left.array[:n] = 0.0
+        self._rows.add(self.x, self.left)
+        for nodes, product in self._beside():
+            self._by_nodes(self.left)[nodes] += product
+        np.divide(self.left.array[:n], self.scale[:n], out=y.array_w)
+
     def begin(self) -> None:
         """Smooth from 0, and what is left (collective)."""
         n, take = self._owned, np.float32(self._weights[0][1])
@@ -183,18 +195,23 @@ class Cycle:
         self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
 
     @property
+    def finest(self) -> Level:
+        """The tangent's own."""
+        return self._levels[-1]
+
+    @property
     def _values(self) -> Values:
         """Of the tangent's blocks."""
         return np.asarray(self._tangent.data, np.float64)
 
     def follow(self) -> None:
         """Take the tangent as it is now for the finest level (collective)."""
-        self._levels[-1].follow(self._values)
-        self._levels[-1].beside = self._products.beside
+        self.finest.follow(self._values)
+        self.finest.beside = self._products.beside
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x (collective)."""
-        finest, n = self._levels[-1], x.getLocalSize()
+        finest, n = self.finest, x.getLocalSize()
         np.multiply(x.array_r, finest.scale[:n], out=finest.b.array[:n], casting="same_kind")
         self._go_through(len(self._levels) - 1)
         np.multiply(finest.x.array[:n], finest.scale[:n], out=y.array_w)

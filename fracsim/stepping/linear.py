@@ -47,6 +47,10 @@ DEFAULTS: Options = {
 # preconditioner is made anew anyhow, every dead cell goes.
 SHRINK_BELOW = 0.9
 
+# Inertia of a cell, as a share of its stiffness, above which corrections are those of a tangent in single precision: it
+# holds what hangs by a node or an edge a thousand times more stiffly than rounding does.
+ROUNDED = 1e-4
+
 
 class Linear:
     """K, and solving with it.
@@ -146,6 +150,8 @@ class Linear:
     # --- K at the present u ---
 
     def _assemble(self) -> None:
+        if self._blocks is not None:
+            self._blocks.single = None
         self._small = self._smallness()
         self.stiffness.assemble(small=self._small, blocks_alone=True)
 
@@ -161,6 +167,7 @@ class Linear:
             kept = forcing.reach(norm, little) and self._small == self._smallness()
             if not kept:
                 self._assemble_tangent()
+                self._multiply_in_single()
             self.ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
             return
         self._assemble_tangent()
@@ -178,6 +185,12 @@ class Linear:
         self._know_rigid_motions()
         self.preconditioner.refresh(self.stiffness.matrix, self._products)
         self._hold()
+
+    def _multiply_in_single(self) -> None:
+        """Let CG go by the tangent that its preconditioner keeps in single precision, half the bytes, where what that
+        leaves of a correction is less than what the next one is for anyhow (collective)."""
+        if self._blocks is not None and self.ksp.getType() == "cg" and inertia_share(self.balance) > ROUNDED:
+            self._blocks.single = self.preconditioner.finest
 
     def _hold(self) -> None:
         """Precondition with the body's springs as well, where there are any."""

@@ -37,7 +37,7 @@ from .inertia_share import HELD, SWEPT
 from .petsc_options import Options, OptionSet
 
 if TYPE_CHECKING:
-    from .cycle import Cycle
+    from .cycle import Cycle, Level
     from .loose_parts import LooseParts
 
 MULTIGRID: Options = {
@@ -194,6 +194,12 @@ class Preconditioner:
         """That of the body alone, in single precision where there is such a one."""
         cycle = self._cycle
         return self.pc if cycle is None or cycle.body is not self.pc else cycle.pc
+
+    @property
+    def finest(self) -> Level | None:
+        """The tangent that is solved with next, in single precision; None: it is not kept so."""
+        cycle = self._cycle
+        return None if cycle is None or cycle.body is not self.pc else cycle.finest
 
     def forget(self) -> None:
         """Give the memory of what was made of `pc` back."""
