@@ -192,14 +192,18 @@ class Preconditioner:
     @property
     def _body(self) -> PETSc.PC:
         """That of the body alone, in single precision where there is such a one."""
-        cycle = self._cycle
-        return self.pc if cycle is None or cycle.body is not self.pc else cycle.pc
+        return self.pc if (quick := self._quick) is None else quick.pc
 
     @property
     def finest(self) -> Level | None:
         """The tangent that is solved with next, in single precision; None: it is not kept so."""
+        return None if (quick := self._quick) is None else quick.finest
+
+    @property
+    def _quick(self) -> Cycle | None:
+        """The cycle that serves in place of `pc`."""
         cycle = self._cycle
-        return None if cycle is None or cycle.body is not self.pc else cycle.finest
+        return None if cycle is None or cycle.body is not self.pc else cycle
 
     def forget(self) -> None:
         """Give the memory of what was made of `pc` back."""
