@@ -51,18 +51,35 @@ def written_out(apply: Any, like: PETSc.Vec) -> Values:
     return np.array(columns).T
 
 
-def by_hand(A: list[Values], P: list[Values], scales: list[Values], largest: list[float]) -> Values:
-    """M of the finest level in double precision, p by Chebyshev's polynomial of eigenvalues: r after two steps is
-    T_2((m - l) / h) / T_2(m / h) of r before, T_2(t) = 2 t^2 - 1; the coarsest matrix is inverted."""
+def inverse_blocks(A: Values, size: int) -> Values:
+    """Of the blocks of A on the diagonal, as a matrix; of the size of their diagonals where they are not positive."""
+    B = np.zeros_like(A)
+    for at in (slice(first, first + size) for first in range(0, len(A), size)):
+        D = A[at, at]
+        B[at, at] = np.linalg.inv(D if np.linalg.eigvalsh(D)[0] > 0 else np.diag(np.abs(np.diag(D))))
+    return B
+
+
+def by_hand(A: list[Values], P: list[Values], sizes: list[int], largest: list[float]) -> Values:
+    """M of the finest level in double precision, p by Chebyshev's polynomial of the eigenvalues of L^T A L, L L^T = B:
+    r after two steps is T_2((m - l) / h) / T_2(m / h) of r before, T_2(t) = 2 t^2 - 1; the coarsest matrix is
+    inverted."""
     M = np.linalg.inv(A[0])
-    for here, between, S, most in zip(A[1:], P, scales, largest, strict=True):
-        values, vectors = np.linalg.eigh(S[:, None] * here * S)
+    for here, between, size, most in zip(A[1:], P, sizes, largest, strict=True):
+        L = np.linalg.cholesky(inverse_blocks(here, size))
+        values, vectors = np.linalg.eigh(L.T @ here @ L)
         m, h = (1.1 + 0.1) / 2 * most, (1.1 - 0.1) / 2 * most
         left = (2 * ((m - values) / h) ** 2 - 1) / (2 * (m / h) ** 2 - 1)
-        p = S[:, None] * (vectors * ((1 - left) / values)) @ vectors.T * S
+        p = L @ (vectors * ((1 - left) / values)) @ vectors.T @ L.T
         rest = np.eye(len(here)) - p @ here
         M = 2 * p - p @ here @ p + rest @ between @ M @ between.T @ rest.T
     return M
+
+
+def largest_eigenvalue(B: Values, A: Values) -> float:
+    """Of B A."""
+    L = np.linalg.cholesky(B)
+    return float(np.linalg.eigvalsh(L.T @ A @ L)[-1])
 
 
 def largest_of(level: cycle.Level) -> float:
@@ -78,8 +95,8 @@ def dense(matrix: PETSc.Mat) -> Values:
 @pytest.mark.parametrize("dim", (2, 3))
 def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of PETSc's matrices, at the tangent that it was set up from, and with that of a body which has moved since as the
-    finest, also where it has stiffened by more than the smoother was made for; symmetric and positive. Of the largest
-    eigenvalue Lanczos' method finds nine tenths at least."""
+    finest, also where it has stiffened by more than smoothers of before would bear; symmetric and positive. Of the
+    largest eigenvalue Lanczos' method finds nine tenths at least."""
     monkeypatch.setattr(blocks, "SMALL", 0)
     scene = bar(dim, {})
     Walk(scene).advance()
@@ -90,10 +107,12 @@ def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) 
     assert isinstance(made, cycle.Cycle) and preconditioner.serving.handle == made.pc.handle
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
-    scales = [np.diag(each) ** -0.5 for each in A[1:]]
+    sizes = [level._size for level in made._levels]
+    assert sizes[-1] == dim < sizes[0]
     largest = [largest_of(level) for level in made._levels]
-    for most, each, S in zip(largest, A[1:], scales, strict=True):
-        assert 0.9 <= most / np.linalg.eigvalsh(S[:, None] * each * S)[-1] < 1 + 1e-5
+    inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
+    at_first = [largest_eigenvalue(B, each) for B, each in zip(inverses, A[1:], strict=True)]
+    assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
     balance, free = scene.balance, scene.balance.motion.free
     for moved in (0.0, 0.2, 0.4):
         wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge
@@ -106,16 +125,17 @@ def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) 
         largest[-1] = largest_of(made._levels[-1])
         reference, M = (
             each[np.ix_(free, free)]
-            for each in (by_hand(A, P, scales, largest), written_out(preconditioner.serving.apply, balance.vector))
+            for each in (by_hand(A, P, sizes, largest), written_out(preconditioner.serving.apply, balance.vector))
         )
         assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
         assert np.abs(M - M.T).max() < 1e-5 * np.abs(M).max()
         assert np.linalg.eigvalsh(M + M.T)[0] > 0
-    assert np.linalg.eigvalsh(scales[-1][:, None] * A[-1] * scales[-1])[-1] > 1.1 * made._levels[-1]._at_first
+    assert largest_eigenvalue(inverses[-1], A[-1]) > 1.1 * 1.1 * at_first[-1]
 
 
-def test_it_takes_as_many_iterations_as_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PETSc's own cycle, which a user who names its smoother keeps: the same motion to the solver's tolerance."""
+def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of PETSc's own cycle, which a user who names its smoother keeps, and which goes by single entries of the
+    diagonal: the same motion to the solver's tolerance."""
     monkeypatch.setattr(blocks, "SMALL", 0)
     its, u = [], []
     for given in ({}, {"mg_levels_pc_type": "jacobi"}):
@@ -124,7 +144,7 @@ def test_it_takes_as_many_iterations_as_in_double_precision(monkeypatch: pytest.
         its.append([walk.advance().solve.krylov for _ in range(4)])
         u.append(walk.u)
         assert (linear_of(scene).preconditioner._cycle is None) == bool(given)
-    assert np.abs(np.subtract(*its)).max() <= 1 < min(its[1])
+    assert all(0.8 * double <= single <= double for single, double in zip(*its, strict=True)) and min(its[0]) > 5
     np.testing.assert_allclose(*u, rtol=0, atol=1e-6 * np.abs(u[1]).max())
 
 

@@ -29,6 +29,11 @@ class Tied:
         dofs."""
         self.K, self.nodes, self.here, self._comm, self._free = K, nodes, here, comm, free
 
+    @property
+    def diagonal(self) -> Values:
+        """(m, d) of K at the nodes of this rank."""
+        return np.asarray(self.K.diagonal()[self.here][:, None] * self._free)
+
     def product(self, x: Reals) -> Values:
         """(m, d) K x at the nodes of this rank, of x there (collective)."""
         every = np.zeros((self.K.shape[0], x.shape[1]))

@@ -1,6 +1,8 @@
 /* Rows of blocks in single precision (stepping.rows).    R, C: rows and columns of a block, whose numbers come column by
-   column, eight more behind the last block; LANES: 2, 4 or 8, at least R. starts: of rows; columns: of blocks. */
+   column, eight more behind the last block; LANES: 2, 4 or 8, at least R. starts: of rows; columns: of blocks.
+   B: one symmetric block of R x R a row, eight more numbers behind the last one. */
 
+#include <math.h>
 #include <stdint.h>
 
 typedef float lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
@@ -31,17 +33,39 @@ void residual(int64_t rows, const int64_t* starts, const int32_t* columns, const
   }
 }
 
-/* d = keep d + take (b - A x),  to = x + d */
-void smooth(int64_t rows, const int64_t* starts, const int32_t* columns, const float* blocks, float keep, float take,
-    const float* b, const float* x, float* d, float* to)
+/* B left, and whatever comes behind it */
+static inline lanes by_block(const float* B, const float* left)
+{
+  lanes sum = {0};
+#pragma GCC unroll 6
+  for (int s = 0; s < R; ++s) sum += *(const lanes*)(B + R * s) * left[s];
+  return sum;
+}
+
+/* d = x = take B b */
+void begin(int64_t rows, const float* B, float take, const float* b, float* d, float* x)
+{
+  for (int64_t row = 0; row < rows; ++row)
+  {
+    const lanes first = take * by_block(B + R * R * row, b + R * row);
+    for (int r = 0; r < R; ++r) d[R * row + r] = x[R * row + r] = first[r];
+  }
+}
+
+/* d = keep d + take B (b - A x),  to = x + d */
+void smooth(int64_t rows, const int64_t* starts, const int32_t* columns, const float* blocks, const float* B, float keep,
+    float take, const float* b, const float* x, float* d, float* to)
 {
   for (int64_t row = 0; row < rows; ++row)
   {
     const lanes sum = product(starts[row], starts[row + 1], columns, blocks, x);
+    float left[R];
+    for (int r = 0; r < R; ++r) left[r] = b[R * row + r] - sum[r];
+    const lanes step = by_block(B + R * R * row, left);
     for (int r = 0; r < R; ++r)
     {
       const int64_t i = R * row + r;
-      d[i] = keep * d[i] + take * (b[i] - sum[r]);
+      d[i] = keep * d[i] + take * step[r];
       to[i] = x[i] + d[i];
     }
   }
@@ -87,4 +111,44 @@ void scale(int64_t rows, const int64_t* starts, const int32_t* columns, const do
 #pragma GCC unroll 6
         for (int t = 0; t < R; ++t) B[R * s + t] = (float)(l[t] * A[C * t + s] * r[s]);
     }
+}
+
+/* The Cholesky factor L of D, the reciprocals of its diagonal in place of that; 0: D is not positive, or not as far as
+   single precision tells. */
+static int factor(const float* D, double L[R][R])
+{
+  for (int i = 0; i < R; ++i)
+    for (int j = 0; j <= i; ++j)
+    {
+      double left = (D[R * i + j] + (double)D[R * j + i]) / 2;
+      for (int k = 0; k < j; ++k) left -= L[i][k] * L[j][k];
+      if (i == j && !(left > 1e-5 * D[R * i + i])) return 0;
+      L[i][j] = i == j ? 1 / sqrt(left) : left * L[j][j];
+    }
+  return 1;
+}
+
+/* B = D^-1; where D is not positive, the inverse of its diagonal's size, 1 where that is 0. */
+void invert(int64_t rows, const float* D, float* B)
+{
+  for (int64_t row = 0; row < rows; ++row, D += R * R, B += R * R)
+  {
+    double L[R][R], x[R];
+    const int positive = factor(D, L);
+    for (int s = 0; s < R; ++s)
+    {
+      for (int i = 0; i < R; ++i) x[i] = i == s && !positive ? (D[R * i + i] ? 1 / fabs(D[R * i + i]) : 1) : i == s;
+      for (int i = 0; i < R && positive; ++i)
+      {
+        for (int k = 0; k < i; ++k) x[i] -= L[i][k] * x[k];
+        x[i] *= L[i][i];
+      }
+      for (int i = R - 1; i >= 0 && positive; --i)
+      {
+        for (int k = i + 1; k < R; ++k) x[i] -= L[k][i] * x[k];
+        x[i] *= L[i][i];
+      }
+      for (int i = 0; i < R; ++i) B[R * s + i] = (float)x[i];
+    }
+  }
 }

@@ -59,25 +59,32 @@ class Vector:
 
 
 class Rows:
-    """Rows of this rank. Vectors to be multiplied with have their ghosts."""
+    """Rows of this rank. Vectors to be multiplied with have their ghosts.
+
+    Attributes:
+        blocks: (blocks, numbers of one) column by column.
+    """
 
     def __init__(self, made: Code, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
         """`starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
-        self._code, self._blocks = made.functions, np.zeros(int(starts[-1]) * made.size + BEHIND, np.float32)
+        self._code, numbers = made.functions, np.zeros(int(starts[-1]) * made.size + BEHIND, np.float32)
+        self.blocks: Single = numbers[:-BEHIND].reshape(-1, made.size)
         self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
-        self._all = *self._pattern, at(self._blocks)
+        self._all = *self._pattern, at(numbers)
 
     def take(self, blocks: Values, left: Values, right: Values) -> None:
         """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
-        self._code.scale(*self._pattern, at(blocks), at(left), at(right), at(self._blocks))
+        self._code.scale(*self._pattern, at(blocks), at(left), at(right), self._all[-1])
 
     def residual(self, b: Vector, x: Vector, left: Vector) -> None:
         """left = b - A x."""
         self._code.residual(*self._all, b.place, x.place, left.place)
 
-    def smooth(self, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
-        """d = keep d + take (b - A x), to = x + d."""
-        self._code.smooth(*self._all, c_float(keep), c_float(take), b.place, x.place, d.place, to.place)
+    def smooth(self, by: Diagonal, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
+        """d = keep d + take B (b - A x), to = x + d."""
+        self._code.smooth(
+            *self._all, by.place, c_float(keep), c_float(take), b.place, x.place, d.place, to.place
+        )  # fmt: skip
 
     def add(self, x: Vector, y: Vector) -> None:
         """y += A x."""
@@ -86,6 +93,28 @@ class Rows:
     def add_transposed(self, x: Vector, y: Vector) -> None:
         """y += A^T x, ghosts of y included."""
         self._code.add_transposed(*self._all, x.place, y.place)
+
+
+class Diagonal:
+    """Blocks of this rank's rows on the diagonal, B, symmetric.
+
+    Attributes:
+        blocks: (rows, size, size).    place: where they begin.
+    """
+
+    def __init__(self, made: Code, rows: int, size: int) -> None:
+        """`made`: for blocks of size x size."""
+        numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
+        self._code, self._rows, self.place = made.functions, c_int64(rows), at(numbers)
+        self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
+
+    def invert(self, D: Single) -> None:
+        """B = D^-1 of blocks as these; where D is not positive, of the size of its diagonal."""
+        self._code.invert(self._rows, at(D), self.place)
+
+    def begin(self, take: float, b: Vector, d: Vector, x: Vector) -> None:
+        """d = x = take B b."""
+        self._code.begin(self._rows, self.place, c_float(take), b.place, d.place, x.place)
 
 
 def code(comm: MPI.Comm, rows: int, columns: int) -> Code | None:
