@@ -182,6 +182,25 @@ def test_what_is_rounded_is_found_by_the_next_correction(monkeypatch: pytest.Mon
     np.testing.assert_allclose(*u, rtol=0, atol=1e-8 * np.abs(u[1]).max())
 
 
+def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once CG has taken longer by some iterations, the cycle is made anew on the same ones; once by more of them, or
+    where edges broke, everything is."""
+    monkeypatch.setattr(blocks, "SMALL", 0)
+    scene = bar(3, {})
+    Walk(scene).advance()
+    linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
+    for extra, broke, cycle_kept, spaces_kept in (
+        (10, 0, True, True), (30, 0, False, True), (40, 0, True, True), (55, 0, False, True), (70, 0, False, False),
+        (30, 1, True, True), (70, 1, False, False), (30, 0, False, True),
+    ):  # fmt: skip
+        preconditioner._extra = extra
+        preconditioner.damage_changed(broke)
+        made, spaces = preconditioner._cycle, preconditioner.pc.getMGInterpolation(1)
+        assert linear.solve()
+        assert (preconditioner._cycle is made) == cycle_kept, (extra, broke)
+        assert (preconditioner.pc.getMGInterpolation(1).handle == spaces.handle) == spaces_kept, (extra, broke)
+
+
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blocks, "SMALL", 0)
     monkeypatch.setattr(cycle, "code", lambda *_: None)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from fracsim.stepping import newton
 from fracsim.stepping.downhill import EXACT, PATIENCE, POSITIVE, Downhill, Way
+from support.scenes import Walk
+from test_cycle import bar
 
 
 def stalls_after(norms: list[float], how: Way | None) -> int | None:
@@ -43,3 +47,30 @@ ROUND = [100.0, 10.0, 0.1, *[0.11] * 30]  # exact below a hundredth: from the th
 )
 def test_what_goes_about_in_circles_gives_up(norms: list[float], how: Way | None, at: int | None) -> None:
     assert stalls_after(norms, how) == at
+
+
+def ways_of(calls: list[str], solver: Any) -> None:
+    """Write down what each solve sets out with: e of exact tangents, d downhill with positive moduli."""
+    for name, letter in (("_attempt_exactly_first", "e"), ("_attempt_downhill", "d")):
+        call = getattr(solver, name)
+        setattr(solver, name, lambda *given, call=call, letter=letter: (calls.append(letter), call(*given))[1])
+
+
+def test_what_was_misled_twice_goes_downhill_at_once_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar whose nodes are thrown about in each of three steps: to where it comes with exact tangents first."""
+    found, u = [], []
+    for astray in (2, 0):
+        monkeypatch.setattr(newton, "ASTRAY", astray)
+        scene, calls = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-8}), [""]
+        ways_of(calls, scene.solver)
+        walk, rng = Walk(scene), np.random.default_rng(3)
+        for thrown in (0, 1, 1, 1, 0, 0):
+            away = rng.uniform(-0.6, 0.6, len(walk.u)) * scene.domain.mean_edge * scene.balance.motion.free
+            if thrown:
+                walk.v = away / 5e-3
+            calls.append("|")
+            assert walk.advance().solve.converged
+        found.append("".join(calls))
+        u.append(walk.u)
+    assert found == ["|e|ed|ed|d|d|e", "|e|ed|ed|ed|e|e"]
+    np.testing.assert_allclose(*u, rtol=0, atol=1e-7 * np.abs(u[1]).max())

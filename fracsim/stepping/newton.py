@@ -39,6 +39,7 @@ RESTS = (
     4  # of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
 )
 CRAWL = 5  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
+ASTRAY = 8  # solves that go downhill at once, after two running whose first exact tangents have misled
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
 ON_THE_WAY = 1e-2  # rtol of all but the last of them
@@ -86,6 +87,9 @@ class Solver:
         self._patches: Patches | None = None  # of a body that breaks
         self._first = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
+        self._led_astray = self._astray = (
+            0  # solves running that were misled at once; to come, that go downhill at once
+        )
         self._rests = 0  # how often few nodes came to rest in it
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
@@ -160,10 +164,34 @@ class Solver:
             self._choice.watches = watched
 
     def _attempt_iteratively(self, guess: Values) -> SolveResult:
+        if self._astray:
+            self._astray -= 1
+            start: Values | None = guess
+            result = self._attempt_downhill(guess, POSITIVE)
+        else:
+            result, start = self._attempt_exactly_first(guess)
+        stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self.linear.may_factorise()
+        stalled = stalled or self.linear.may_factorise(SOONER_THAN_GMRES[self.balance.domain.dim])
+        if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
+            # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
+            self.snes.ksp.setType("gmres")
+            self.snes.ksp.setGMRESRestart(RESTART)
+            result = self._attempt(start)
+            self.snes.ksp.setType("cg")
+        return result
+
+    def _attempt_exactly_first(self, guess: Values) -> tuple[SolveResult, Values | None]:
+        """With exact tangents, and what is tried where they mislead; and where another attempt may start from."""
         result = self._attempt(guess)
         if self._crawls:
             result = self._attempt_downhill(None, (EXACT,))
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
+        at_once = (
+            self._misled(result) and not result.newton and self.balance.scheme.inertia and self.balance.conservative
+        )
+        self._led_astray = self._led_astray + 1 if at_once else 0
+        if self._led_astray > 1:
+            self._astray = ASTRAY
         if self._misled(result):
             if self._sets_out_anew:
                 start = self.balance.level.u
@@ -175,15 +203,7 @@ class Solver:
             else:
                 with self.linear.set_up_anew():
                     result = self._attempt(start)
-        stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self.linear.may_factorise()
-        stalled = stalled or self.linear.may_factorise(SOONER_THAN_GMRES[self.balance.domain.dim])
-        if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
-            # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
-            self.snes.ksp.setType("gmres")
-            self.snes.ksp.setGMRESRestart(RESTART)
-            result = self._attempt(start)
-            self.snes.ksp.setType("cg")
-        return result
+        return result, start
 
     @cached_property
     def _sets_out_anew(self) -> bool:
@@ -194,7 +214,7 @@ class Solver:
 
     def _attempt_downhill(self, guess: Values | None, ways: tuple[Way, ...]) -> SolveResult:
         """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive
-        moduli would cost more than they save.)"""
+        moduli would cost more than they save, where exact tangents do: an iteration more.)"""
         down = self._downhill = self._downhill or self._another_downhill()
         for way in ways:
             down.made_positive(way)

@@ -4,7 +4,9 @@ It is kept from tangent to tangent: making multigrid's coarse spaces costs more 
 is made anew where CG takes a third more iterations than when it was fresh, or the tangent has given up entries of dead
 cells (mechanics.tangent), and refreshed (new coarse operators and smoothers on the same coarse spaces) after edges
 broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh. Where its cycle is
-quick (cycle) a set-up costs a hundred iterations, and it is made anew once what CG has taken longer adds up to SET_UP.
+quick (cycle) a set-up costs a hundred iterations and more, and it is made anew once what CG has taken longer adds up to
+SET_UP; where no edge has broken since its coarse spaces were made these are good still, and a refresh, a third of a
+set-up, is enough for REFRESHED of it.
 
 Where a body comes apart, cells hang from it by a node or an edge and turn there against nothing but their inertia.
 Smoothed aggregation with Jacobi's smoother needs three times the iterations then, and a set-up that a few broken edges
@@ -67,7 +69,9 @@ REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
 IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
 MANY = 0.02  # edges that broke, for each node, after which it is refreshed
 REFRESH_ITS = 10  # iterations that a refresh costs
-SET_UP = 60  # more than it would take when fresh, after which one whose cycle is quick is made anew
+# more than it would take when fresh, after which one whose cycle is quick is made anew, or, of a body that nothing has
+# broken in, refreshed
+SET_UP, REFRESHED = 60, 20
 # solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): the second one is of the
 # tangent that the first has led to, and takes twice as many whichever of the two it was made for
 FRESH = 2
@@ -119,6 +123,7 @@ class Preconditioner:
         self._looks_for_parts = False  # before the next solve
         self._sweeps: bool | None = None  # of a body in pieces: whether sweeps do for it
         self._broke, self._extra = 0, 0.0  # edges and iterations since it was set up
+        self._refreshed_at, self._torn = 0.0, False  # such iterations, and whether edges broke since it was made anew
         self.due, self.keep = Due.REBUILD, keep
         self._large, self._by_nodes = large, False
         self._own = self._may_change = may_change
@@ -133,6 +138,7 @@ class Preconditioner:
         tangent, where that pays."""
         self._broken = self._looks_for_parts = True
         self._broke += self._nodes if broke is None else broke
+        self._torn = self._torn or broke != 0
         if self._broke > MANY * self._nodes:
             self.due = max(self.due, Due.REFRESH)
 
@@ -146,9 +152,10 @@ class Preconditioner:
         if self.due == Due.NOTHING:
             self._follow(tangent)
             return
-        if self._bring() or self.due == Due.REBUILD:
+        if anew := self._bring() or self.due == Due.REBUILD:
             self.pc.reset()
-            self._fresh_its = 0
+            self._fresh_its = self._solves = 0
+            self._torn = False
         self._forget_cycle()
         ksp.setPC(self.pc)
         self.pc.setReusePreconditioner(False)
@@ -158,7 +165,8 @@ class Preconditioner:
         self._cycle = self._hasten(self.pc)
         if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
             self._smooth_by_nodes()
-        self.due, self._broke, self._extra, self._solves = Due.NOTHING, 0, 0.0, 0
+        self.due, self._broke = Due.NOTHING, 0
+        self._refreshed_at = self._extra = 0.0 if anew or self._cycle is None else self._extra
         self._looks_for_parts = self._broken
         self._follow(tangent)
 
@@ -238,7 +246,7 @@ class Preconditioner:
 
     def _count(self) -> None:
         """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due. Where
-        its cycle is quick whatever they are for, and to a set-up."""
+        its cycle is quick whatever they are for, and to a set-up, or to a refresh where no edge broke."""
         self._solves += 1
         its, fresh = self._last_its, self._fresh_its
         if self._cycle is not None:
@@ -246,6 +254,8 @@ class Preconditioner:
                 self._extra += int(self._ksp.its) * (1 - fresh / its)
             if self._extra > SET_UP:
                 self.due = Due.REBUILD
+            elif not self._torn and self._extra > self._refreshed_at + REFRESHED:
+                self.due = max(self.due, Due.REFRESH)
             return
         if self._broke:
             self._extra += max(its - fresh, 0)
