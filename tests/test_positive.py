@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.positive import made_positive
+from fracsim.stepping import newton
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
 
@@ -97,8 +98,8 @@ def test_what_crawls_goes_on_down_the_potential(monkeypatch: pytest.MonkeyPatch)
     """A step of a block that is swung, by the norm of its residual and, from the first iteration on, down its
     potential: to the same place, which no norm has to be halved for."""
     found = []
-    for crawl in (5, 0):
-        monkeypatch.setattr("fracsim.stepping.newton.CRAWL", crawl)
+    for crawl in (newton.CRAWL, 0):
+        monkeypatch.setattr(newton, "CRAWL", crawl)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, solver={"snes_rtol": 1e-10},
             material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},

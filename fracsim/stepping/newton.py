@@ -38,7 +38,7 @@ FAST = 0.1  # of the residual before, below which Newton's method gets on by its
 RESTS = (
     4  # of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
 )
-CRAWL = 5  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
+CRAWL = 2  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
 ASTRAY = 8  # solves that go downhill at once, after two running whose first exact tangents have misled
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
@@ -87,9 +87,8 @@ class Solver:
         self._patches: Patches | None = None  # of a body that breaks
         self._first = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
-        self._led_astray = self._astray = (
-            0  # solves running that were misled at once; to come, that go downhill at once
-        )
+        self._led_astray = 0  # solves running whose first exact tangents have misled
+        self._astray = 0  # solves to come that go downhill at once
         self._rests = 0  # how often few nodes came to rest in it
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
@@ -186,12 +185,7 @@ class Solver:
         if self._crawls:
             result = self._attempt_downhill(None, (EXACT,))
         start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
-        at_once = (
-            self._misled(result) and not result.newton and self.balance.scheme.inertia and self.balance.conservative
-        )
-        self._led_astray = self._led_astray + 1 if at_once else 0
-        if self._led_astray > 1:
-            self._astray = ASTRAY
+        self._see_whether_astray(result)
         if self._misled(result):
             if self._sets_out_anew:
                 start = self.balance.level.u
@@ -204,6 +198,13 @@ class Solver:
                 with self.linear.set_up_anew():
                     result = self._attempt(start)
         return result, start
+
+    def _see_whether_astray(self, result: SolveResult) -> None:
+        """Of an attempt with exact tangents: whether its first one has misled, as that of the solve before."""
+        down = self.balance.scheme.inertia and self.balance.conservative
+        self._led_astray = self._led_astray + 1 if down and not result.newton and self._misled(result) else 0
+        if self._led_astray > 1:
+            self._astray = ASTRAY
 
     @cached_property
     def _sets_out_anew(self) -> bool:
