@@ -60,7 +60,7 @@ class Level:
     """
 
     def __init__(self, copy: Copy, own: Blocks, made: Code, beside: list[Tied]) -> None:
-        """`own`: the blocks of A (collective)."""
+        """`own`: where the blocks of A are, which it has yet to `take`."""
         nodes, size = copy.nodes, copy.size
         large = np.abs(copy.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
@@ -71,7 +71,6 @@ class Level:
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
         self._row = np.repeat(np.arange(nodes.size_local), np.diff(own.starts))
         self._on_diagonal = np.flatnonzero(own.columns == self._row)
-        self.take(own.values)
 
     def take(self, values: Values) -> None:
         """Those of the blocks of A, as many as at first, and smooth for what they are (collective)."""
@@ -186,8 +185,8 @@ class Cycle:
     """
 
     def __init__(self, body: PETSc.PC, products: Products, codes: Codes) -> None:
-        """`body`: of the kind that `in_single` takes; `products`: with the tangent that it was set up from; `codes`:
-        for the sizes of blocks (collective)."""
+        """`body`: of the kind that `in_single` takes; `products`: with the tangent, which it has yet to `follow`;
+        `codes`: for the sizes of blocks (collective)."""
         self.body, self._products, self._tangent = body, products, products.matrix
         coarsest, *found = copied(body, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
@@ -199,6 +198,8 @@ class Cycle:
         for here in found:
             beside = [] if here.own else products.beside
             level = Level(here, here.own or tangent, codes[here.size, here.size], beside)
+            if here.own:
+                level.take(here.own.values)
             self._levels.append(level)
             assert here.between is not None
             between = Rows(codes[here.size, below.size], here.between.starts, here.between.columns)
