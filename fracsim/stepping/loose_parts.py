@@ -8,7 +8,9 @@ by themselves (balancing, Mandel 1993; deflation, Nicolaides 1987; compared by T
     P = Q + (1 - Q K) M (1 - K Q),   Q = Z E^-1 Z^T,   E = Z^T K Z
 
 M is the body's preconditioner, Z has the rigid motions of each part but the largest, of nodes that no larger part has,
-too. It takes 21 iterations. The sum of Q and M takes 35. K Z has few rows, so that P costs what M does.
+too, and of those that are tied to it (mechanics.tethers): without them a single cell with a node that it drags along is
+a motion that CG looks for, 134 iterations instead of 77. It takes 21 iterations. The sum of Q and M takes 35. K Z has
+few rows, so that P costs what M does.
 """
 
 from __future__ import annotations
@@ -101,8 +103,22 @@ def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
     if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
         return None
     count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
+    _join_tied(balance, part)
     nodes = np.flatnonzero(part > 0)
     return LooseParts(balance, body, nodes, part[nodes] - 1, count - 1) if count > 1 else None
+
+
+def _join_tied(balance: Balance, part: Ints) -> None:
+    """Nodes without a whole cell go with that which they are tied to: the part (owned nodes,) of which is the smallest
+    one around its corners (collective)."""
+    for tied in filter(None, (term.tied(balance.motion.free) for term in balance.terms)):
+        known = np.zeros(tied.K.shape[0], np.int64)
+        known[tied.here] = part[tied.nodes] + 1
+        known = total(balance.domain.comm, known)
+        smallest, K = known.copy(), tied.K.tocoo()
+        np.maximum.at(smallest, K.row, known[K.col])
+        alone = part[tied.nodes] < 0
+        part[tied.nodes[alone]] = smallest[tied.here[alone]] - 1
 
 
 def _motions(
