@@ -38,7 +38,7 @@ Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 HELD, LEAST_HELD = 0.99, 0.9  # of |r|^2, by nodes that are brought to rest: no more of them than it takes, and at least
-FEW = 0.01  # of all nodes, which these may be
+FEW = 0.003  # of all nodes, which these may be: with their neighbours some hundredths of the body
 ITERATIONS = 40
 ENOUGH = 1e-2  # of a patch's residual, which it may keep
 SMALL = 0.1  # of what is little for the whole body, which it may keep, too
