@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import blocks, cycle
+from fracsim.stepping import blocks, cycle, smoother
 from fracsim.stepping import linear as linear_room
 from fracsim.stepping.linear import Linear
 from fracsim.stepping.preconditioner import Due
@@ -60,19 +60,24 @@ def inverse_blocks(A: Values, size: int) -> Values:
     return B
 
 
-def by_hand(A: list[Values], P: list[Values], sizes: list[int], largest: list[float]) -> Values:
+def by_hand(A: list[Values], P: list[Values], levels: list[smoother.Level]) -> Values:
     """M of the finest level in double precision, p by Chebyshev's polynomial of the eigenvalues of L^T A L, L L^T = B:
-    r after two steps is T_2((m - l) / h) / T_2(m / h) of r before, T_2(t) = 2 t^2 - 1; the coarsest matrix is
-    inverted."""
+    r after n steps is T_n((m - l) / h) / T_n(m / h) of r before; C is as many cycles as there shall be, each of what
+    the one before has left; the coarsest matrix is inverted."""
     M = np.linalg.inv(A[0])
-    for here, between, size, most in zip(A[1:], P, sizes, largest, strict=True):
-        L = np.linalg.cholesky(inverse_blocks(here, size))
+    for here, between, level in zip(A[1:], P, levels, strict=True):
+        L = np.linalg.cholesky(inverse_blocks(here, level._size))
         values, vectors = np.linalg.eigh(L.T @ here @ L)
-        m, h = (1.1 + 0.1) / 2 * most, (1.1 - 0.1) / 2 * most
-        left = (2 * ((m - values) / h) ** 2 - 1) / (2 * (m / h) ** 2 - 1)
+        most, effort = largest_of(level), level.effort
+        m, h = (1.1 + effort.low) / 2 * most, (1.1 - effort.low) / 2 * most
+        T = np.polynomial.Chebyshev.basis(effort.steps)
+        left = T((m - values) / h) / T(m / h)
         p = L @ (vectors * ((1 - left) / values)) @ vectors.T @ L.T
         rest = np.eye(len(here)) - p @ here
-        M = 2 * p - p @ here @ p + rest @ between @ M @ between.T @ rest.T
+        once = 2 * p - p @ here @ p + rest @ between @ M @ between.T @ rest.T
+        M = np.zeros_like(once)
+        for _ in range(effort.cycles):
+            M = M + once @ (np.eye(len(here)) - here @ M)
     return M
 
 
@@ -82,9 +87,9 @@ def largest_eigenvalue(B: Values, A: Values) -> float:
     return float(np.linalg.eigvalsh(L.T @ A @ L)[-1])
 
 
-def largest_of(level: cycle.Level) -> float:
+def largest_of(level: smoother.Level) -> float:
     """The eigenvalue that it smooths for."""
-    return 2 / (level._weights[0][1] * (1.1 + 0.1))
+    return 2 / (level._weights[0][1] * (1.1 + level.effort.low))
 
 
 def dense(matrix: PETSc.Mat) -> Values:
@@ -92,12 +97,14 @@ def dense(matrix: PETSc.Mat) -> Values:
     return np.asarray(copy.getDenseArray().copy())
 
 
-@pytest.mark.parametrize("dim", (2, 3))
-def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("dim", "slowly"), [(2, 0.75), (3, 0.75), (2, 0.0), (3, 0.0)])
+def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of PETSc's matrices, at the tangent that it was set up from, and with that of a body which has moved since as the
     finest, also where it has stiffened by more than smoothers of before would bear; symmetric and positive. Of the
-    largest eigenvalue Lanczos' method finds nine tenths at least."""
+    largest eigenvalue Lanczos' method finds nine tenths at least. `slowly`: 0 where more is done with coarser
+    levels."""
     monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(cycle, "SLOWLY", slowly)
     scene = bar(dim, {})
     Walk(scene).advance()
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
@@ -110,6 +117,9 @@ def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) 
     sizes = [level._size for level in made._levels]
     assert sizes[-1] == dim < sizes[0]
     largest = [largest_of(level) for level in made._levels]
+    efforts = [level.effort for level in made._levels]
+    assert efforts[-1] == (2, 0.1, 1)
+    assert efforts[-2::-1] == list((cycle.COARSER if slowly else cycle.THOROUGH)[: len(efforts) - 1]) != []
     inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
     at_first = [largest_eigenvalue(B, each) for B, each in zip(inverses, A[1:], strict=True)]
     assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
@@ -122,10 +132,9 @@ def test_it_is_multigrid_written_out(dim: int, monkeypatch: pytest.MonkeyPatch) 
         linear.stiffness.bring_entries()
         before, A[-1] = A[-1], dense(linear.stiffness.matrix)
         assert np.abs(A[-1] - before).max() >= moved / 2 * np.abs(before).max()
-        largest[-1] = largest_of(made._levels[-1])
         reference, M = (
             each[np.ix_(free, free)]
-            for each in (by_hand(A, P, sizes, largest), written_out(preconditioner.serving.apply, balance.vector))
+            for each in (by_hand(A, P, made._levels), written_out(preconditioner.serving.apply, balance.vector))
         )
         assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
         assert np.abs(M - M.T).max() < 1e-5 * np.abs(M).max()

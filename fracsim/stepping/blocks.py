@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from ..mechanics.products import Products
-    from .cycle import Level
+    from .smoother import Level
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
 

@@ -39,8 +39,9 @@ from .inertia_share import HELD, SWEPT
 from .petsc_options import Options, OptionSet
 
 if TYPE_CHECKING:
-    from .cycle import Cycle, Level
+    from .cycle import Cycle
     from .loose_parts import LooseParts
+    from .smoother import Level
 
 MULTIGRID: Options = {
     "pc_type": "gamg",
