@@ -16,11 +16,11 @@ The cycle from 0 is
 which is symmetric and, where p A' is within (0, 2), positive, whatever rounding has made of A' where it is almost
 singular: rigid motions of what hardly anything holds are C's, which is positive by itself.
 
-Coarser levels have a twelfth of the finest's numbers and less, so that more is done with them than PETSc's V cycle of
-two steps: more steps on all but the first of them, that reach further down; and where a cycle of coarser levels leaves
-much even so (`Cycle.converges_slowly`), C is two of them, 2 B - B A' B (a W cycle). That is where a body has torn: it
-bends as strips of two cells, and what coarser levels leave of that CG goes on for. A doormat after 110 steps takes 31
-iterations for 98, in 0.4 of the time (with an exact C 24); a compact body as many as in a V cycle, and would pay for
+Coarser levels are smoothed as the finest, in two steps, as PETSc's V cycle has them. But where cycles of theirs leave
+much (`Cycle.converges_slowly`) they have more steps, that reach further down, and C is two of such cycles, 2 B - B A' B
+(a W cycle): they have a twelfth of the finest's numbers and less. That is where a body is thin, and where it has torn:
+it bends as strips of two cells, and what coarser levels leave of that CG goes on for. A doormat after 110 steps takes
+31 iterations for 98, in 0.4 of the time (with an exact C 24); a compact body as many as in a V cycle, and would pay for
 them.
 """
 
@@ -44,11 +44,10 @@ Values = npt.NDArray[np.float64]
 type Codes = dict[tuple[int, int], Code]
 
 SMOOTHED = ("chebyshev", "jacobi", 2)  # how PETSc's levels are, which these replace
-# of the levels below the finest, the last of these for all that follow; and where cycles of theirs converge slowly. The
-# lowest ones have so few numbers that calls are what they cost.
-COARSER = Effort(2, 0.03), Effort(8, 0.03)
+# where coarser levels converge slowly: the effort of the first of them, of the next, and of all that follow, which have
+# so few numbers that calls are what they cost
 THOROUGH = Effort(4, 0.03, 2), Effort(8, 0.03, 2), Effort(8, 0.03)
-TRIED, SLOWLY = 4, 0.75  # such cycles; share that the last of them leaves where they converge slowly
+TRIED, SLOWLY = 4, 0.8  # cycles of theirs; share that the last of them leaves where they do
 
 
 class Cycle:
@@ -85,14 +84,9 @@ class Cycle:
         self._ends = self._solver.getOperators()[1].createVecs()
         self.pc = PETSc.PC().createPython(self, comm=body.comm)
         self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
-        self._exert(COARSER)
         if len(self._levels) > 1 and self.converges_slowly():
-            self._exert(THOROUGH)
-
-    def _exert(self, efforts: tuple[Effort, ...]) -> None:
-        """From the second finest level down."""
-        for level, effort in zip(self._levels[-2::-1], chain(efforts, repeat(efforts[-1])), strict=False):
-            level.exert(effort)
+            for level, effort in zip(self._levels[-2::-1], chain(THOROUGH, repeat(THOROUGH[-1])), strict=False):
+                level.exert(effort)
 
     def converges_slowly(self) -> bool:
         """Whether cycles from the second finest level down do, of what is left of anything after a few of them; not

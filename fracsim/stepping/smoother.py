@@ -45,7 +45,7 @@ class Effort(NamedTuple):
     cycles: int = 1
 
 
-FINEST = Effort(2, 0.1)  # as PETSc has it
+USUAL = Effort(2, 0.1)  # as PETSc has it
 
 
 class Level:
@@ -67,7 +67,7 @@ class Level:
         self._inverse = Diagonal(made, nodes.size_local, size)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
         self._so_far = Vector(nodes, size) if copy.own else None
-        self.effort = FINEST
+        self.effort = USUAL
         self._row = np.repeat(np.arange(nodes.size_local), np.diff(own.starts))
         self._on_diagonal = np.flatnonzero(own.columns == self._row)
 
