@@ -7,7 +7,7 @@ import pytest
 
 from fracsim.mechanics.cell_energy import CellEnergy
 from fracsim.mechanics.stiffness import Stiffness
-from fracsim.stepping import newton, patches
+from fracsim.stepping import patches, solver
 from support.ranks import OnRanks, Results, starting
 from support.reference import dense_tangent
 from support.scenes import make_scene, positions
@@ -47,11 +47,11 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(patches, "FEW", 0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)
-    assert scene.solver is not None and scene.solver._patches is not None
+    assert scene.solver is not None and scene.solver._newton._patches is not None
     made.clear()
-    monkeypatch.setattr(newton.Solver, "damage_changed", lambda *_: None)
+    monkeypatch.setattr(solver.Solver, "damage_changed", lambda *_: None)
     scene, state = thrown()
-    assert scene.solver is not None and scene.solver._patches is None
+    assert scene.solver is not None and scene.solver._newton._patches is None
     np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
     assert tangents < len(made)
 

@@ -20,7 +20,7 @@ from fracsim.mesh.places import Group
 from fracsim.meshes.builders.box import Box
 from fracsim.stepping.after_step import NoFlow, Unbreakable
 from fracsim.stepping.implicit import ImplicitStepper
-from fracsim.stepping.newton import Solver
+from fracsim.stepping.solver import Solver
 from fracsim.stepping.stepper import StepSizes
 
 LENGTH, YOUNG, DENSITY = 2.0, 8.0, 2.0  # m, Pa, kg/m^3: waves of 2 m/s

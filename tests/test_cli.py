@@ -242,7 +242,7 @@ def test_a_fault_on_one_rank_ends_all(tmp_path: Path) -> None:
 import sys
 from mpi4py import MPI
 from fracsim.mesh import ranks
-from fracsim.stepping.newton import Solver
+from fracsim.stepping.solver import Solver
 ranks.PATIENCE = 1.0
 solve = Solver.solve
 def faulty(self, guess):

@@ -16,7 +16,7 @@ from fracsim.mechanics.tangent import Assembly
 from fracsim.mechanics.tied import Tied
 from fracsim.scene import Scene, build_scene
 from fracsim.stepping import blocks, preconditioner
-from fracsim.stepping.newton import Solver
+from fracsim.stepping.solver import Solver
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 

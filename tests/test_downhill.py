@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.stepping import newton
+from fracsim.stepping import solver as solver_room
 from fracsim.stepping.downhill import EXACT, PATIENCE, POSITIVE, Downhill, Way
 from support.scenes import Walk
 from test_cycle import bar
@@ -60,7 +60,7 @@ def test_what_was_misled_twice_goes_downhill_at_once_for_a_while(monkeypatch: py
     """A bar whose nodes are thrown about in each of three steps: to where it comes with exact tangents first."""
     found, u = [], []
     for astray in (2, 0):
-        monkeypatch.setattr(newton, "ASTRAY", astray)
+        monkeypatch.setattr(solver_room, "ASTRAY", astray)
         scene, calls = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-8}), [""]
         ways_of(calls, scene.solver)
         walk, rng = Walk(scene), np.random.default_rng(3)

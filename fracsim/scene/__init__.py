@@ -25,7 +25,7 @@ from ..mesh.ranks import on_root
 from ..output.history import Probe, Probes
 from ..stepping.after_step import Breaking, Flow, Unbreakable
 from ..stepping.initial import initial_velocity
-from ..stepping.newton import Solver
+from ..stepping.solver import Solver
 from ..stepping.state import State
 from ..stepping.stepper import Stepper, StepSizes
 from ..study import Study, Time

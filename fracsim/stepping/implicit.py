@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..mechanics.balance import Balance
 from ..mesh.ranks import total
 from .after_step import Breaking, Flow, PassResult
-from .newton import Solver
+from .solver import Solver
 from .state import State
 from .stepper import BalanceStepper, SolveResult, StepSizes
 from .stress_release import released_state

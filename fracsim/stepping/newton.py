@@ -1,11 +1,9 @@
-"""One nonlinear solve: PETSc SNES with line search, options from the study, and what is tried where it fails."""
+"""Newton's method: an attempt to solve a balance by PETSc's SNES with line search, options from the study."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,16 +12,12 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
-from .choice import Choice
-from .downhill import EXACT, POSITIVE
-from .factors import SOONER_THAN_GMRES
 from .linear import Linear, chosen_options
 from .petsc_options import Options, OptionSet, refusing
-from .preconditioner import Due
 from .stepper import SolveResult
 
 if TYPE_CHECKING:
-    from .downhill import Downhill, Way
+    from .downhill import Downhill
     from .patches import Patches
 
 Values = npt.NDArray[np.float64]
@@ -31,15 +25,10 @@ Values = npt.NDArray[np.float64]
 # A jump of prescribed dofs larger than this share of an edge is carried into the body before Newton starts.
 LARGE_GAP = 0.01
 
-# Of GMRES, where CG has failed: with PETSc's 30 it stalls where a body is nearly incompressible.
-RESTART = 200
-
 FAST = 0.1  # of the residual before, below which Newton's method gets on by itself
-RESTS = (
-    4  # of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
-)
+# of an attempt that goes by the norm, which may rise where few nodes come to rest: it could go about in circles
+RESTS = 4
 CRAWL = 2  # iterations that halve |r| at least, where Newton's method by its norm gets anywhere
-ASTRAY = 8  # solves that go downhill at once, after two running whose first exact tangents have misled
 LINEAR_SOLVES = 3  # of a step that is linear, before Newton's method with all that it tries takes over
 LEGS, LEAST_LEGS = 20, 5  # solves of a step in which obstacles that are jammed come on, and before they are given up
 ON_THE_WAY = 1e-2  # rtol of all but the last of them
@@ -48,20 +37,24 @@ _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items()
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
-class Solver:
-    """SNES on a `Balance`, set up once and kept for the whole run.
+class Newton:
+    """SNES on a `Balance`, and others that share its linear solver.
 
     Attributes:
-        snes: that of the last attempt.    linear: what its linear systems are solved with.
+        snes: that of the last attempt.    first_down: what the first SNES goes by; None: the norm of r.
+        linear: what linear systems are solved with.
+        gets_dear: of Krylov iterations and Newton's, whether an attempt is given up for them.
     """
 
     def __init__(self, balance: Balance, given: Options) -> None:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance = balance
+        self.first_down: Downhill | None = None
         self._down: Downhill | None = None  # what the SNES of the last attempt goes by
+        self.gets_dear: Callable[[int, int], bool] = lambda krylov, its: False
         chosen = chosen_options(balance, given)
         self._options = OptionSet(chosen)
-        snes = self.snes = PETSc.SNES().create(balance.domain.comm)
+        snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
         self._made = [snes]
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(lambda _, x, b: balance.free_residual(x, b), balance.vector)
@@ -79,154 +72,16 @@ class Solver:
             if balance.conservative:
                 from .downhill import Downhill
 
-                self._down = Downhill(balance, snes)
-        self._first_choice, self._downhill = (snes, self._down), self._down
+                self.first_down = self._down = Downhill(balance, snes)
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._by_steps = chosen["snes_type"] == "newtonls"
         self._patches: Patches | None = None  # of a body that breaks
-        self._first = self._last_little = 0.0
+        self._first_norm = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
-        self._led_astray = 0  # solves running whose first exact tangents have misled
-        self._astray = 0  # solves to come that go downhill at once
         self._rests = 0  # how often few nodes came to rest in it
-        own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
-        may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
-        self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
 
-    @property
-    def linear_failures(self) -> int:
-        """Linear solves that failed outright and were taken as no correction."""
-        return self.linear.failures
-
-    def _take_tangent(self) -> None:
-        """Linearise into the matrix that the balance has now."""
-        linear = self.linear
-        for snes in self._made:
-            snes.setJacobian(
-                lambda *_: linear.linearise(self.snes.getFunctionNorm(), self._last_little),
-                linear.operator, self.balance.stiffness.matrix,
-            )  # fmt: skip
-
-    @property
-    def _smallness(self) -> float | None:
-        return None if self._down is None else self._down.small
-
-    def _shrink(self) -> None:
-        if self.linear.shrink():
-            self._take_tangent()
-
-    # --- a solve, and what is tried where it fails ---
-
-    def solve(self, guess: Values) -> SolveResult:
-        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice)."""
-        choice = self._choice
-        if choice.begins_with_factors() and choice.trusts(result := self._attempt_directly(guess)):
-            return result
-        result = self._attempt_iteratively(guess)
-        if choice.dear:
-            return self._go_on_directly(guess)
-        if self._misled(result) and self.linear.may_factorise():
-            result = self._attempt_directly(self.balance.level.u if self._sets_out_anew else guess)
-            if result.converged:
-                choice.take(preferred=False)
-        elif choice.was_dear(result, positively=self._positively):
-            choice.take(preferred=True)
-        elif not self._misled(result):
-            choice.iterate()
-        return result
-
-    def _go_on_directly(self, guess: Values) -> SolveResult:
-        """From where iterations have become dear; all the way by them where factors find nothing that is stable."""
-        choice, positively = self._choice, self._positively
-        choice.dear, krylov, newton = False, self.snes.getLinearSolveIterations(), self.snes.its
-        result = self._attempt_directly(None)
-        if result.converged and self.linear.factors.positive:
-            if krylov > choice.worth(newton, positively=positively):
-                choice.take(preferred=True)
-            return result
-        with self._to_the_end():
-            return self._attempt_iteratively(guess)
-
-    @property
-    def _positively(self) -> bool:
-        """Whether the last attempt was with moduli made positive, and without inertia."""
-        return self.snes is not self._first_choice[0] and not self.balance.scheme.inertia
-
-    @contextmanager
-    def _to_the_end(self) -> Iterator[None]:
-        """However dear iterations get."""
-        watched, self._choice.watches = self._choice.watches, False
-        try:
-            yield
-        finally:
-            self._choice.watches = watched
-
-    def _attempt_iteratively(self, guess: Values) -> SolveResult:
-        if self._astray:
-            self._astray -= 1
-            start: Values | None = guess
-            result = self._attempt_downhill(guess, POSITIVE)
-        else:
-            result, start = self._attempt_exactly_first(guess)
-        stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self.linear.may_factorise()
-        stalled = stalled or self.linear.may_factorise(SOONER_THAN_GMRES[self.balance.domain.dim])
-        if self._misled(result) and self.snes.ksp.getType() == "cg" and not stalled:
-            # CG met negative curvature (a buckling, softening or nearly incompressible body): GMRES does not mind it.
-            self.snes.ksp.setType("gmres")
-            self.snes.ksp.setGMRESRestart(RESTART)
-            result = self._attempt(start)
-            self.snes.ksp.setType("cg")
-        return result
-
-    def _attempt_exactly_first(self, guess: Values) -> tuple[SolveResult, Values | None]:
-        """With exact tangents, and what is tried where they mislead; and where another attempt may start from."""
-        result = self._attempt(guess)
-        if self._crawls:
-            result = self._attempt_downhill(None, (EXACT,))
-        start = None if self._down is not None and not self.balance.left() else guess  # on the way down: goes on
-        self._see_whether_astray(result)
-        if self._misled(result):
-            if self._sets_out_anew:
-                start = self.balance.level.u
-            if self.snes.ksp.reason != PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:  # which is K's own doing
-                # Smoothers of an older tangent need not be positive for this one.
-                self.linear.preconditioner.due = Due.REBUILD
-            if self.balance.conservative:
-                result = self._attempt_downhill(start, POSITIVE)
-            else:
-                with self.linear.set_up_anew():
-                    result = self._attempt(start)
-        return result, start
-
-    def _see_whether_astray(self, result: SolveResult) -> None:
-        """Of an attempt with exact tangents: whether its first one has misled, as that of the solve before."""
-        down = self.balance.scheme.inertia and self.balance.conservative
-        self._led_astray = self._led_astray + 1 if down and not result.newton and self._misled(result) else 0
-        if self._led_astray > 1:
-            self._astray = ASTRAY
-
-    @cached_property
-    def _sets_out_anew(self) -> bool:
-        """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
-        inside out, and without a potential (a pressure has none) there is no going down from it. Where prescribed dofs
-        or contact set the pace that place is no better."""
-        return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_steps
-
-    def _attempt_downhill(self, guess: Values | None, ways: tuple[Way, ...]) -> SolveResult:
-        """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive
-        moduli would cost more than they save, where exact tangents do: an iteration more.)"""
-        down = self._downhill = self._downhill or self._another_downhill()
-        for way in ways:
-            down.made_positive(way)
-            with self.linear.set_up_anew() if way.anew else nullcontext():
-                result = self._attempt(None if way.goes_on else guess, (down.snes, down))
-            if not self._misled(result):
-                break
-        down.made_positive(None)
-        return result
-
-    def _another_downhill(self) -> Downhill:
+    def another_downhill(self) -> Downhill:
         """A second SNES, with the linear solver of the first."""
         from .downhill import Downhill
 
@@ -241,28 +96,43 @@ class Solver:
         snes.setConvergenceTest(self._converged)
         return down
 
-    def _attempt_directly(self, guess: Values | None) -> SolveResult:
-        with self._to_the_end(), self.linear.factors.of(self.snes.ksp):
-            result = self._attempt(guess)
-            if result.newton and result.converged and self.snes.ksp.getType() == "preonly":
-                self.linear.factors.learn(self.snes.ksp)
-        return result
+    @property
+    def was_first(self) -> bool:
+        """Whether the last attempt was by the first SNES."""
+        return self.snes is self._first
 
-    def _misled(self, result: SolveResult) -> bool:
-        """Whether it was the linear solves that failed: outright, or by what they found.
+    @property
+    def goes_down(self) -> bool:
+        """Whether the last attempt went by the incremental potential."""
+        return self._down is not None
 
-        A solution of K d = -r lowers |r| for short steps along it, so a line search that fails was given none: CG may
-        stop on a tangent that is not positive before it notices. Whether it does is a matter of the last digits, and
-        so would be a step that is halved for it.
-        """
-        line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
-        return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
+    # --- the tangent ---
 
-    def _attempt(self, guess: Values | None, other: tuple[PETSc.SNES, Downhill] | None = None) -> SolveResult:
-        """From `guess`; None: from where the last attempt has come to."""
-        self.snes, self._down = other or self._first_choice
+    def _take_tangent(self) -> None:
+        """Linearise into the matrix that the balance has now."""
+        linear = self.linear
+        for snes in self._made:
+            snes.setJacobian(
+                lambda *_: linear.linearise(self.snes.getFunctionNorm(), self._last_little),
+                linear.operator, self.balance.stiffness.matrix,
+            )  # fmt: skip
+
+    @property
+    def _smallness(self) -> float | None:
+        return None if self._down is None else self._down.small
+
+    def shrink(self) -> None:
+        """Take a smaller tangent where one does (collective)."""
+        if self.linear.shrink():
+            self._take_tangent()
+
+    # --- an attempt ---
+
+    def attempt(self, guess: Values | None, down: Downhill | None = None) -> SolveResult:
+        """From `guess`; None: from where the last attempt has come to. `down`: by which SNES, None: by the first."""
+        self.snes, self._down = (self._first, self.first_down) if down is None else (down.snes, down)
         self._norms, self._rests = [], 0
-        self._shrink()
+        self.shrink()
         self.balance.set_out()
         extended = 0 if guess is None else self._start_from(guess)
         if self.linear.linearly and (solved := self._solve_as_linear()) is not None:
@@ -324,11 +194,6 @@ class Solver:
         self.linear.preconditioner.its = None
         return None
 
-    def linear_response(self, force: Values) -> Values:
-        """(owned dofs,) displacement that a force on free dofs causes in a step at the present u (Linear.response)."""
-        self._shrink()
-        return self.linear.response(force, directly=bool(self._choice.left))
-
     def damage_changed(self, broke: int | None = None) -> None:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh the
         preconditioner at the next tangent, where that pays."""
@@ -367,12 +232,12 @@ class Solver:
             return int(reason.DIVERGED_FNORM_NAN)
         if self._is_small(norms[2], its) or self._is_small_at_rest(snes, its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
-        if self._choice.gets_dear(snes.getLinearSolveIterations(), its, positively=self._positively):
+        if self.gets_dear(snes.getLinearSolveIterations(), its):
             return int(reason.DIVERGED_INNER)
         if self._down is not None and self.balance.scheme.inertia and self._down.stalls(snes.getFunctionNorm(), its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
         self._norms.append(snes.getFunctionNorm())
-        return int(reason.DIVERGED_LINE_SEARCH if self._crawls else reason.ITERATING)
+        return int(reason.DIVERGED_LINE_SEARCH if self.crawls else reason.ITERATING)
 
     def _is_small_at_rest(self, snes: PETSc.SNES, its: int) -> bool:
         """Let the few nodes that hold most of the residual of an iterate come to rest; whether it is a solution then
@@ -393,7 +258,7 @@ class Solver:
         return self._is_small(snes.getFunctionNorm(), its)
 
     @property
-    def _crawls(self) -> bool:
+    def crawls(self) -> bool:
         """Whether the line search has cut the last steps to next to nothing, by a norm that is no merit of them: the
         residual of one cell that is all but flat grows before it falls. Down the potential, if there is one that this
         attempt does not go by, they would be whole ones. (Without inertia factors see to what is slow.)"""
@@ -406,8 +271,8 @@ class Solver:
         """Whether that is so of |r| after so many iterations (collective)."""
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
-            self._first = 0.0 if self.balance.limits_steps else norm
-        return norm <= self._little(self._first if its else 0.0)
+            self._first_norm = 0.0 if self.balance.limits_steps else norm
+        return norm <= self._little(self._first_norm if its else 0.0)
 
     def _little(self, first: float) -> float:
         """|r| of a solution, N, where that of the guess is `first` (collective)."""
@@ -420,5 +285,3 @@ class Solver:
         self._options.remove()
         for kept in (self.linear, *self._made, self._x):
             kept.destroy()
-        if self._downhill is not None:
-            self._downhill.destroy()
