@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fracsim.studies.evidence import rows
 from fracsim.studies.table import SCENES, SLOW, overrides, row, words
 from fracsim.study import Study
 from fracsim.study.check import check_study
@@ -42,3 +45,30 @@ def test_a_row_is_that_of_the_history(tmp_path: Path) -> None:
     assert found["median / paper's"] == pytest.approx(1.0)
     text = words([found, {"scene": "loaf", "failed": ["out of memory"]}])
     assert text.splitlines()[1].split()[0] == "jade-figure" and text.endswith("loaf: out of memory")
+
+
+def record_of(name: str, seconds: float) -> dict[str, Any]:
+    """Of a row in the report, with so many seconds a step; infinite: it failed."""
+    figures = {"scene": name, "cells": 4632, "median s": seconds, "median / paper's": seconds / SCENES[name].seconds}
+    failed = {"outcome": "failed", "message": "no room", "figures": {}}
+    done = {"outcome": "done", "figures": figures}
+    return {"group": "rows", "case": "paper", "name": name} | (done if seconds < math.inf else failed)
+
+
+@pytest.mark.parametrize(
+    ("jade", "vase", "holds"),
+    [
+        (0.010, 0.1, [True, True]),
+        (0.020, 0.1, [True, False]),
+        (0.010, 0.2, [False, True]),
+        (0.010, math.inf, [False, True]),
+        (math.inf, math.inf, [None, None]),
+    ],
+)
+def test_the_report_claims_the_papers_seconds(jade: float, vase: float, holds: list[bool | None]) -> None:
+    """0.04 s of the figure, of which 0.015 are asked for as it is small, and 0.18 s of the vase; a row that has not run
+    holds nothing, and its place in the table says so."""
+    [section] = rows.sections([record_of("jade-figure", jade), record_of("glass-vase", vase)])
+    assert [claim.holds for claim in section.claims] == holds
+    assert [line[-1] for line in section.tables[0].rows] == ["done" if s < math.inf else "failed" for s in (jade, vase)]
+    assert {trial.name for trial in rows.trials()} == set(SCENES)

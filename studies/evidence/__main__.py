@@ -21,7 +21,7 @@ from .runner import RECORD, fingerprint, folder_in, run_trial, time_again
 from .trial import Trial
 
 UNTIMED = ("stability", "dependence", "experiments")  # what counts there is not time: runs of one rank go two at a time
-GROUPS = ("precision", "peers", "stability", "ladder", "growth", "dependence", "experiments")
+GROUPS = ("precision", "peers", "stability", "ladder", "growth", "rows", "dependence", "experiments")
 Records = list[dict[str, Any]]
 
 

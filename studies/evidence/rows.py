@@ -1,0 +1,79 @@
+"""The rows of M22's table 2 beside the paper's seconds (studies.table), each a run at the paper's cells and step.
+
+python -m fracsim.studies.evidence.rows ROW [--limit 600] -o figures.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ..table import COLUMNS, SCENES, run
+from .section import Cell, Claim, Section, Table, again
+from .trial import Trial
+
+RANKS = 2
+LIMITS = {"loaf": 600.0, "doormat": 900.0, "jelly-figure": 200.0}  # s, of rows that are left to `make report-full`
+LIMIT = 30.0  # s, of the others
+SMALL, AT_MOST = "jade-figure", 15e-3  # the smallest body, and s that a step of it may take
+TEXT = (
+    "Bodies that tear, snap and shatter at the paper's cells (within a seventh), materials and steps, on two ranks; "
+    "the paper has 12 threads at 2.6 GHz. Medians over the steps of a run, which ends with its scene or at a limit."
+)
+
+
+def trials() -> list[Trial]:
+    """One for each row; the three large ones are long."""
+    return [
+        Trial(
+            "rows", "paper", name, script=("fracsim.studies.evidence.rows", name, "--limit", f"{limit:g}"),
+            settings={"ranks": RANKS}, limit=limit + 120.0, full=name in LIMITS,
+        )
+        for name, limit in ((name, LIMITS.get(name, LIMIT)) for name in SCENES)
+    ]  # fmt: skip
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """The table, and whether each row is at or below the paper's seconds."""
+    done = {record["name"]: record["figures"] for record in records if record["outcome"] == "done"}
+    rows = tuple(_row(record) for record in records)
+    table = Table("paper-rows", "M22's table 2; s: of a step", (*COLUMNS, "outcome"), rows)
+    return [Section("The paper's table", TEXT + again(records), (_claim(done, len(records)), _small(done)), (table,))]
+
+
+def _row(record: dict[str, Any]) -> tuple[Cell, ...]:
+    figures = record["figures"] if record["outcome"] == "done" else {"scene": record["name"]}
+    return (*(figures.get(column) for column in COLUMNS), record["outcome"])
+
+
+def _claim(done: dict[str, dict[str, Any]], tried: int) -> Claim:
+    shares = {name: figures["median / paper's"] for name, figures in done.items()}
+    measured = ", ".join(f"{name} {share:.2f}" for name, share in shares.items()) or "nothing"
+    holds = len(done) == tried and max(shares.values()) <= 1 if shares else None
+    return Claim("Every row takes at most the paper's seconds a step (median)", measured, holds)
+
+
+def _small(done: dict[str, dict[str, Any]]) -> Claim:
+    text = f"A body of 4.7k tetrahedra takes at most {1e3 * AT_MOST:.0f} ms a step (median)"
+    if SMALL not in done:
+        return Claim(text, "nothing", None)
+    seconds = done[SMALL]["median s"]
+    return Claim(text, f"{1e3 * seconds:.1f} ms, {done[SMALL]['cells']:,.0f} tetrahedra", seconds <= AT_MOST)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence.rows", description=__doc__)
+    parser.add_argument("row", choices=SCENES)
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds of the run")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    found = run(given.row, given.out.parent, small=False, ranks=RANKS, limit=given.limit)
+    if "failed" in found:
+        raise SystemExit(f"{given.row}: {' '.join(found['failed'])}")
+    given.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
