@@ -164,7 +164,7 @@ class Linear:
             return
         self.preconditioner.its = forcing.iterations(self.ksp.its)
         if isinstance(forcing, Sparing):
-            kept = forcing.reach(norm, little) and self._small == self._smallness()
+            kept = forcing.reach(norm, little, self._left_by_cg) and self._small == self._smallness()
             if not kept:
                 self._assemble_tangent()
                 self._multiply_in_single()
@@ -172,6 +172,10 @@ class Linear:
             return
         self._assemble_tangent()
         self.ksp.setTolerances(rtol=forcing.rough(norm, little) if self.stiffness.couples else forcing.exact())
+
+    def _left_by_cg(self) -> float:
+        """|r| that the last solve has left of the linear system, N, which CG has at hand; 0 of other methods."""
+        return float(self.ksp.buildResidual(self.correction).norm()) if self.ksp.getType() == "cg" else 0.0
 
     def _assemble_tangent(self) -> None:
         """K and what its preconditioner is due."""
