@@ -8,7 +8,7 @@ from dolfinx import fem
 
 from fracsim.mechanics import kernels, lanes
 from fracsim.mechanics.kernels import jit_options
-from fracsim.mechanics.lanes import ExpressionLanes, MatrixLanes, VectorLanes, compiled, in_lanes
+from fracsim.mechanics.lanes import ExpressionLanes, MatrixLanes, ScalarLanes, VectorLanes, compiled, in_lanes
 from fracsim.mechanics.tangent import Assembly
 from fracsim.mesh import compiled as compiling
 from fracsim.mesh.dolfinx_calls import evaluate, source_of
@@ -72,6 +72,22 @@ def test_forces_as_one_by_one(case: str, dim: int) -> None:
         one, other = theirs.array_r, ours.array_r
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-14 * np.abs(other).max())
         assert np.abs(other).max() > 0
+
+
+@pytest.mark.parametrize(("case", "dim"), [("damped", 2), ("damped", 3), ("rotated", 3), ("extrapolated", 3)])
+def test_energies_as_one_by_one(case: str, dim: int) -> None:
+    """Of the same bodies, moved otherwise, and of one that has a node nowhere."""
+    balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
+    form = balance.stress._energy_form
+    several = ScalarLanes.of(form)
+    assert several is not None
+    found = []
+    for factor in (1.0, -3.0, np.nan):
+        balance.displace(factor * balance.u.x.array[: balance.owned])
+        expected = fem.assemble_scalar(form)
+        found.append(several.sum())
+        np.testing.assert_allclose(found[-1], expected, rtol=1e-13)
+    assert 0 < found[0] != found[1]
 
 
 @pytest.mark.parametrize("dim", (2, 3))

@@ -64,8 +64,8 @@ class OfLarge[Lanes]:
 
 
 def _is_large(form: fem.Form) -> bool:
-    dofmap = form.function_spaces[0].dofmap
-    return bool(dofmap.index_map.size_global * dofmap.index_map_bs >= MANY)
+    spaces = form.function_spaces or [field.function_space for field in form._cpp_object.coefficients]
+    return any(each.dofmap.index_map.size_global * each.dofmap.index_map_bs >= MANY for each in spaces)
 
 
 def compile_form(form: ufl.Form) -> fem.Form:

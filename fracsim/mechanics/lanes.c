@@ -16,22 +16,20 @@ static inline void kernel(real* restrict A, const real* restrict w, const real* 
     const real* restrict coordinate_dofs)
 // kernel
 
-/* A function in the cells of an expression: dofs (cells, nodes), and some numbers at each of them. */
+/* A function: dofs (cells, nodes), and some numbers at each of them. */
 typedef struct {
   const int32_t* dofs;
   const double* values;
 } Field;
 
-/* What a form is integrated over, and with: numbers (count, width) of its fields in cells, and constants. An expression
-   has its fields instead. */
+/* What a form is integrated over, and with: `width` numbers of its fields in a cell, and `size` constants. */
 typedef struct {
   int64_t count, width, size;
   const int32_t *cells, *dofs, *corners;
-  const double *x, *w, *c;
+  const double *x, *c;
   const Field* fields;
 } Form;
 
-#if RANK == 0
 /* Numbers of a field in a cell, into one lane. */
 static inline double* taken(const Field* field, int nodes, int size, int64_t cell, double* lane)
 {
@@ -43,7 +41,6 @@ static inline double* taken(const Field* field, int nodes, int size, int64_t cel
 
 #define TAKE(number, nodes, size) lane = taken(form->fields + number, nodes, size, cell, lane);
 static inline void look_up(const Form* form, int64_t cell, double* lane) { FIELDS }
-#endif
 
 /* A of LANES cells from the first on, the last of which may be one again; returns how many are not. */
 static inline int values(const Form* form, int64_t first, const real* constants, real* numbers, real* A)
@@ -53,11 +50,7 @@ static inline int values(const Form* form, int64_t first, const real* constants,
   for (int lane = 0; lane < LANES; ++lane)
   {
     const int64_t at = first + (lane < left ? lane : 0);
-#if RANK == 0
     look_up(form, form->cells[at], (double*)numbers + lane);
-#else
-    for (int i = 0; i < form->width; ++i) numbers[i][lane] = form->w[form->width * at + i];
-#endif
     const int32_t* cell = form->corners + (int64_t)CORNERS * form->cells[at];
     for (int i = 0; i < CORNERS; ++i)
       for (int axis = 0; axis < 3; ++axis) points[3 * i + axis][lane] = form->x[3 * (int64_t)cell[i] + axis];

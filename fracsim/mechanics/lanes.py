@@ -11,7 +11,7 @@ DOLFINx's work.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from ctypes import CDLL, Structure, byref, c_int64, c_void_p, cast
 from pathlib import Path
 from typing import Any, Self
@@ -23,7 +23,9 @@ from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from ..mesh.compiled import address, at, built_together
-from ..mesh.dolfinx_calls import cells_of, constants_of, fields_of, identity_rows, integrals, nodes_of_cells, packed
+from ..mesh.dolfinx_calls import (
+    FormField, cells_of, constants_of, expression_fields, form_fields, identity_rows, integrals, nodes_of_cells,
+)  # fmt: skip
 
 Values = npt.NDArray[np.float64]
 
@@ -45,7 +47,7 @@ class _Form(Structure):
 
     _fields_ = (
         *((name, c_int64) for name in ("count", "width", "size")),
-        *((name, c_void_p) for name in ("cells", "dofs", "corners", "x", "w", "c")),
+        *((name, c_void_p) for name in ("cells", "dofs", "corners", "x", "c")),
         ("fields", c_void_p),
     )  # fmt: skip
 
@@ -54,6 +56,20 @@ class _Field(Structure):
     """The same."""
 
     _fields_ = (("dofs", c_void_p), ("values", c_void_p))
+
+
+class _Fields:
+    """What a kernel is given of functions: looked up in their own arrays, cell by cell.
+
+    Attributes:
+        width: numbers in a cell.    place: where C has them.
+    """
+
+    def __init__(self, fields: Sequence[FormField]) -> None:
+        self._kept = [(address(field.dofs), address(field.values)) for field in fields]
+        self._here = (_Field * (len(fields) + 1))(*(_Field(*each) for each in self._kept))
+        self.width = sum(field.dofs.shape[1] * field.size for field in fields)
+        self.place = cast(self._here, c_void_p)
 
 
 class Lanes:
@@ -67,16 +83,26 @@ class Lanes:
 
     def __init__(self, form: fem.Form, code: CDLL) -> None:
         """`code`: what `compiled` has made of the form."""
-        self._form, self._code, self._nodes = form, code, nodes_of_cells(form)
-        code.add.restype = c_int64
+        self._form, self._code = form, code
+        self._nodes = nodes_of_cells(form) if form.rank else form.mesh.geometry.dofmap
+        self._fields = _Fields(form_fields(form))
 
-    def _add(self, *given: npt.NDArray[Any]) -> int:
-        """What C's `add` returns."""
-        cells, geometry, (w, c) = cells_of(self._form), self._form.mesh.geometry, packed(self._form)
-        arrays = cells, self._nodes, geometry.dofmap, geometry.x, w, c
-        form = _Form(len(cells), w.shape[1], len(c), *map(address, arrays))
-        result: int = self._code.add(byref(form), *map(at, given))
-        return result
+    def _call(self, function: Any, *given: npt.NDArray[Any]) -> int:
+        """What a function of C returns."""
+        cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
+        arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
+        form = _Form(len(cells), self._fields.width, len(c), *map(address, arrays), self._fields.place)
+        return int(function(byref(form), *map(at, given)))
+
+
+class ScalarLanes(Lanes):
+    """A functional of cells."""
+
+    def sum(self) -> float:
+        """Of this rank's cells."""
+        values = np.empty(len(cells_of(self._form)))
+        self._call(self._code.fill, values)
+        return float(values.sum())
 
 
 class VectorLanes(Lanes):
@@ -84,7 +110,7 @@ class VectorLanes(Lanes):
 
     def add(self, values: Values) -> None:
         """Add this rank's part to the values of dofs, ghosts included."""
-        self._add(values)
+        self._call(self._code.add, values)
 
 
 class MatrixLanes(Lanes):
@@ -92,6 +118,7 @@ class MatrixLanes(Lanes):
 
     def __init__(self, form: fem.Form, code: CDLL, matrix: la.MatrixCSR) -> None:
         super().__init__(form, code)
+        code.add.restype = c_int64
         dofmap = form.function_spaces[0].dofmap
         self._bs = dofmap.index_map_bs
         self._held = np.zeros(dofmap.index_map.size_local + dofmap.index_map.num_ghosts, np.uint8)
@@ -110,7 +137,7 @@ class MatrixLanes(Lanes):
         for bc in bcs:
             dofs = bc.dof_indices()[0]
             np.bitwise_or.at(self._held, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
-        if missing := self._add(self._places, self._strides, self._held, matrix.data):
+        if missing := self._call(self._code.add, self._places, self._strides, self._held, matrix.data):
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")
         identity_rows(matrix, self._form, bcs)
 
@@ -124,28 +151,22 @@ class ExpressionLanes:
         kernel = in_lanes(source.read_text())
         if kernel is None:
             return None
-        maps = [field.function_space.dofmap for field in fields_of(expression)]
-        takes = (f"TAKE({number},{each.list.shape[1]},{each.bs})" for number, each in enumerate(maps))
         sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
-        code = _built(mesh.comm, kernel, sizes | {"FIELDS": "".join(takes)}, "-O3")
+        code = _built(mesh.comm, kernel, sizes, expression_fields(expression), "-O3")
         return None if code is None else cls(expression, mesh, code)
 
     def __init__(self, expression: fem.Expression, mesh: Mesh, code: CDLL) -> None:
         """`code`: what `of` has made of the expression."""
         self._expression, self._geometry, self._code = expression, mesh.geometry, code
-        fields = fields_of(expression)
-        self._kept = [(address(field.function_space.dofmap.list), address(field.x.array)) for field in fields]
-        self._fields = (_Field * len(fields))(*(_Field(*each) for each in self._kept))
-        self._width = sum(each.dofmap.list.shape[1] * each.dofmap.bs for each in (f.function_space for f in fields))
+        self._fields = _Fields(expression_fields(expression))
 
     def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
         """Fill values (cells, components) with those of cells."""
         c = constants_of(self._expression)
         of_mesh = address(self._geometry.dofmap), address(self._geometry.x)
         form = _Form(
-            len(cells), self._width, len(c), address(cells), None, *of_mesh, None, address(c),
-            cast(self._fields, c_void_p),
-        )  # fmt: skip
+            len(cells), self._fields.width, len(c), address(cells), None, *of_mesh, address(c), self._fields.place
+        )
         self._code.fill(byref(form), at(values))
 
 
@@ -156,23 +177,29 @@ def compiled(form: fem.Form) -> CDLL | None:
     """What `Lanes` takes of a form; None where there is no such thing (collective)."""
     if integrals(form) != [fem.IntegralType.cell]:
         return None
-    space = form.function_spaces[0]
-    bs, corners = space.dofmap.index_map_bs, form.mesh.geometry.cmap.dim
-    sizes = {"RANK": form.rank, "D": bs, "NODES": space.element.space_dimension // bs, "CORNERS": corners}
-    if sizes["NODES"] > corners:  # bent cells gain half as much, and take 15 s to compile
+    fields, corners = form_fields(form), form.mesh.geometry.cmap.dim
+    bs, nodes = 1, 1
+    if form.rank:
+        space = form.function_spaces[0]
+        bs, nodes = space.dofmap.index_map_bs, space.element.space_dimension // space.dofmap.index_map_bs
+    if max([nodes, *(each.dofs.shape[1] for each in fields)]) > corners:  # bent cells gain half, and compile in 15 s
         return None
+    sizes = {"RANK": form.rank, "D": bs, "NODES": nodes, "CORNERS": corners}
     source = Path(str(form.module.__file__))  # type: ignore[union-attr]
     kernel = in_lanes(source.with_name(source.name.split(".")[0] + ".c").read_text())
     if kernel is None:
         return None
-    return _built(form.mesh.comm, kernel, sizes)
+    return _built(form.mesh.comm, kernel, sizes, fields)
 
 
-def _built(comm: MPI.Comm, kernel: str, sizes: Mapping[str, int | str], *more: str) -> CDLL | None:
-    """lanes.c around a kernel, with `more` flags (collective)."""
+def _built(
+    comm: MPI.Comm, kernel: str, sizes: Mapping[str, int], fields: Sequence[FormField], *more: str
+) -> CDLL | None:
+    """lanes.c around a kernel that is given fields, with `more` flags (collective)."""
+    takes = (f"TAKE({number},{each.dofs.shape[1]},{each.size})" for number, each in enumerate(fields))
     functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
     text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
-    defined = [f"-D{name}={value}" for name, value in sizes.items()]
+    defined = [f"-D{name}={value}" for name, value in sizes.items()] + [f"-DFIELDS={''.join(takes)}"]
     return built_together(comm, "lanes", text, [*_FLAGS, *more, *defined])
 
 

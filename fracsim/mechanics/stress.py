@@ -25,7 +25,7 @@ from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.simplices import local_edges
 from .few_cells import FewCells
-from .kernels import CellForm, cells_measure, compile_form
+from .kernels import CellForm, OfLarge, cells_measure, compile_form
 from .material import MaterialFields
 from .rotation import RotationField
 from .term import Form, Level, Term
@@ -33,6 +33,7 @@ from .vectors import Assembler
 
 if TYPE_CHECKING:
     from ..forms.plasticity import ImplicitFlow
+    from .lanes import ScalarLanes
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -90,6 +91,7 @@ class Stress(Term):
         self.linear = self.energy.linear and not self.closes and material.plastic is None
         whole = cells_measure(domain)
         self._energy_form = compile_form(self._stored_energy(whole))
+        self._sums = OfLarge(_sums_in_lanes)
         self._alone = CellForm(self.work(ufl.TestFunction(domain.space), whole))
 
     # --- the energy and its fields ---
@@ -231,8 +233,9 @@ class Stress(Term):
         return internal_work(energy, self.u, w, dx, chi=chi, rotation=self.R)
 
     def stored(self) -> float:
-        """int psi dX at the current u, this rank's share, J."""
-        return float(fem.assemble_scalar(self._energy_form))
+        """int psi dX at the current u, this rank's share, J (collective the first time)."""
+        lanes = self._sums(self._energy_form)
+        return float(fem.assemble_scalar(self._energy_form)) if lanes is None else lanes.sum()
 
     def potential(self) -> float | None:
         """int psi dX at the current u, J; None where the tangent is not symmetric, or steps are solved with their own
@@ -274,3 +277,9 @@ class Stress(Term):
         nodes, d = self.domain.cell_nodes[cells], self.domain.dim
         corners = self.domain.nodes.take(nodes, axis=0)  # a third of the time of an index
         return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d).take(nodes, axis=0)
+
+
+def _sums_in_lanes(form: fem.Form) -> ScalarLanes | None:
+    from .lanes import ScalarLanes
+
+    return ScalarLanes.of(form)

@@ -15,7 +15,7 @@ after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is g
 any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
             keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
-Nothing was found of the others: packed, cells_of, integrals, nodes_of_cells, source_of, fields_of, constants_of,
+Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, fields_of, constants_of,
 identity_rows, assemble_into, apply_lifting, expanded_csr, create_matrix. What FFCx writes is read by mechanics.lanes.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
@@ -146,12 +146,6 @@ def source_of(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict
     return made.with_name(made.name.split(".")[0] + ".c")
 
 
-def fields_of(expression: fem.Expression) -> list[fem.Function]:
-    """The functions that the kernel of an expression is given, in that order."""
-    fields, kernel = extract_coefficients(expression.ufl_expression), expression.ufcx_expression
-    return [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
-
-
 def constants_of(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
     """The constants that the kernel of a form or an expression is given."""
     return constants_in(kind._cpp_object)
@@ -161,13 +155,6 @@ def constants_in(compiled: Any) -> npt.NDArray[np.float64]:
     """The same of a C++ form."""
     constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(compiled)
     return constants
-
-
-def packed(form: fem.Form) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """What the kernel of a form over cells is given: (cells, width) numbers of its fields, and its constants."""
-    compiled: Any = form._cpp_object
-    (fields,) = dolfinx.cpp.fem.pack_coefficients(compiled).values()
-    return fields, constants_of(form)
 
 
 @dataclass(frozen=True)
@@ -184,6 +171,14 @@ def form_fields(form: fem.Form) -> list[FormField]:
     compiled: Any = form._cpp_object
     maps = ((each, each.function_space.dofmap) for each in compiled.coefficients)
     return [FormField(np.asarray(dofmap.map()), dofmap.bs, each.x.array) for each, dofmap in maps]
+
+
+def expression_fields(expression: fem.Expression) -> list[FormField]:
+    """The same of an expression."""
+    fields, kernel = extract_coefficients(expression.ufl_expression), expression.ufcx_expression
+    given = [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
+    maps = ((each, each.function_space.dofmap) for each in given)
+    return [FormField(dofmap.list, dofmap.bs, each.x.array) for each, dofmap in maps]
 
 
 def kernel_of(form: fem.Form) -> int:
