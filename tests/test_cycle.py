@@ -178,7 +178,8 @@ def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytes
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six digits of K, written out; solves by themselves go by all of them."""
+    """Six digits of K, written out, and all of how it resists what moves along as one; solves by themselves go by all
+    of them."""
     monkeypatch.setattr(blocks, "SMALL", 0)
     scene = bar(dim, {"snes_type": "newtonls"})
     Walk(scene).advance()
@@ -187,7 +188,12 @@ def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch
     assert context.single is linear.preconditioner.finest
     linear.stiffness.bring_entries()
     K = dense(linear.stiffness.matrix)
-    assert 0 < np.abs(written_out(linear.operator.mult, scene.balance.vector) - K).max() < 1e-6 * np.abs(K).max()
+    error = written_out(linear.operator.mult, scene.balance.vector) - K
+    assert 0 < np.abs(error).max() < 1e-6 * np.abs(K).max()
+    assert np.abs(error - error.T).max() < 1e-14 * np.abs(K).max()
+    rows = error.reshape(len(K) // dim, dim, -1, dim).sum(axis=2)  # what a translation meets at each node
+    assert 1e-9 * np.abs(K).max() < np.abs(rows).max()
+    assert np.abs(rows + rows.transpose(0, 2, 1)).max() < 1e-14 * np.abs(K).max()
     assert linear.solve() and context.single is None
     linear.stiffness.bring_entries()
     K = dense(linear.stiffness.matrix)

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from ..mechanics.products import Products
-    from .smoother import Level
+    from .finest import Finest
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
 
@@ -33,7 +33,7 @@ class Blocks:
     def __init__(self, tangent: PETSc.Mat, assembled: Products | None) -> None:
         self.tangent = tangent
         self.assembled = assembled
-        self.single: Level | None = None
+        self.single: Finest | None = None
         self._copy: PETSc.Mat | None = None
         self._entries, self._state = 0.0, -1
 

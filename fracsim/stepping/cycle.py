@@ -33,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from .finest import Finest
 from .levels import Blocks, copied
 from .rows import Code, Rows, Vector, code
 from .smoother import Effort, Level
@@ -54,7 +55,7 @@ class Cycle:
     """The context of a PETSc preconditioner.
 
     Attributes:
-        body: PETSc's multigrid.    pc: the preconditioner.
+        body: PETSc's multigrid.    pc: the preconditioner.    finest: the level of the tangent.
     """
 
     def __init__(self, body: PETSc.PC, products: Products, codes: Codes) -> None:
@@ -69,10 +70,12 @@ class Cycle:
         below = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
         for here in found:
-            beside = [] if here.own else products.beside
-            level = Level(here, here.own or tangent, codes[here.size, here.size], beside)
+            made = codes[here.size, here.size]
             if here.own:
+                level = Level(here, here.own, made)
                 level.take(here.own.values)
+            else:
+                level = self.finest = Finest(here, tangent, made)
             self._levels.append(level)
             assert here.between is not None
             between = Rows(codes[here.size, below.size], here.between.starts, here.between.columns)
@@ -99,11 +102,6 @@ class Cycle:
             level.set_out_again()
             left.append(level.size_of_b())
         return SLOWLY * left[-2] < left[-1] < left[-2]
-
-    @property
-    def finest(self) -> Level:
-        """The tangent's own."""
-        return self._levels[-1]
 
     @property
     def _values(self) -> Values:

@@ -49,7 +49,7 @@ SHRINK_BELOW = 0.9
 
 # Inertia of a cell, as a share of its stiffness, above which corrections are those of a tangent in single precision: it
 # holds what hangs by a node or an edge a thousand times more stiffly than rounding does.
-ROUNDED = 1e-4
+ROUNDED = 1e-6
 
 
 class Linear:

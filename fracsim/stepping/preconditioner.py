@@ -40,8 +40,8 @@ from .petsc_options import Options, OptionSet
 
 if TYPE_CHECKING:
     from .cycle import Cycle
+    from .finest import Finest
     from .loose_parts import LooseParts
-    from .smoother import Level
 
 MULTIGRID: Options = {
     "pc_type": "gamg",
@@ -204,7 +204,7 @@ class Preconditioner:
         return self.pc if (quick := self._quick) is None else quick.pc
 
     @property
-    def finest(self) -> Level | None:
+    def finest(self) -> Finest | None:
         """The tangent that is solved with next, in single precision; None: it is not kept so."""
         return None if (quick := self._quick) is None else quick.finest
 

@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 typedef float lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef double wide __attribute__((vector_size(8 * LANES)));
 
 /* R numbers of A x, and whatever comes behind them; a sum of its own for each column, or each would wait for the last. */
 static inline lanes product(int64_t from, int64_t to, const int32_t* columns, const float* blocks, const float* x)
@@ -149,6 +150,62 @@ void invert(int64_t rows, const float* D, float* B)
         x[i] *= L[i][i];
       }
       for (int i = 0; i < R; ++i) B[R * s + i] = (float)x[i];
+    }
+  }
+}
+
+/* What rounding has taken from the rows of A, as A is without left and right, B = left A right: the symmetric parts of
+   the sums of A_ij - left_i^-1 B_ij right_j^-1 over j. A row by row, B column by column. */
+void lose(int64_t rows, const int64_t* starts, const int32_t* columns, const float* B, const double* A,
+    const double* left, const double* right, float* lost)
+{
+  for (int64_t row = 0; row < rows; ++row, lost += R * R)
+  {
+    double sum[R][R] = {0};
+    const double* l = left + R * row;
+    for (int64_t at = starts[row]; at < starts[row + 1]; ++at)
+    {
+      const double *whole = A + R * R * at, *r = right + R * (int64_t)columns[at];
+      const float* rounded = B + R * R * at;
+      for (int t = 0; t < R; ++t)
+        for (int s = 0; s < R; ++s) sum[t][s] += whole[R * t + s] - l[t] * rounded[R * s + t] * r[s];
+    }
+    for (int t = 0; t < R; ++t)
+      for (int s = 0; s < R; ++s) lost[R * t + s] = (float)((sum[t][s] + sum[s][t]) / 2);
+  }
+}
+
+/* Some numbers in double precision. (GCC 14 makes __builtin_convertvector of two halves.) */
+static inline wide widened(const float* from)
+{
+  const lanes some = *(const lanes*)from;
+  wide to;
+#pragma GCC unroll 8
+  for (int i = 0; i < LANES; ++i) to[i] = some[i];
+  return to;
+}
+
+/* y = left A z + lost x, z = right x of ghosts as well: in double precision but for A and what it has lost. */
+void multiply(int64_t rows, const int64_t* starts, const int32_t* columns, const float* blocks, const float* lost,
+    const double* left, const double* z, const double* x, double* restrict y)
+{
+  for (int64_t row = 0; row < rows; ++row, lost += R * C, left += R, x += R, y += R)
+  {
+    wide sums[C] = {0}, sum = {0};
+    for (int64_t at = starts[row]; at < starts[row + 1]; ++at)
+    {
+      const float* A = blocks + R * C * at;
+      const double* in = z + C * (int64_t)columns[at];
+#pragma GCC unroll 6
+      for (int s = 0; s < C; ++s) sums[s] += widened(A + R * s) * in[s];
+    }
+#pragma GCC unroll 6
+    for (int s = 0; s < C; ++s) sum += sums[s];
+    for (int r = 0; r < R; ++r)
+    {
+      double given = left[r] * sum[r];
+      for (int s = 0; s < C; ++s) given += lost[R * s + r] * x[s];
+      y[r] = given;
     }
   }
 }

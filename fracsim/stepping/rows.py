@@ -5,6 +5,7 @@ from __future__ import annotations
 from ctypes import CDLL, c_float, c_int64
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,10 +41,10 @@ class Vector:
         array: all of them.    place: where they begin.
     """
 
-    def __init__(self, nodes: IndexMap, size: int) -> None:
-        """`size`: numbers of a node."""
-        self._vector = la.vector(nodes, size, np.float32)
-        self.array: Single = self._vector.array
+    def __init__(self, nodes: IndexMap, size: int, kind: type = np.float32) -> None:
+        """`size`: numbers of a node; `kind`: of number."""
+        self._vector = la.vector(nodes, size, kind)
+        self.array: npt.NDArray[Any] = self._vector.array
         self.place = at(self.array)
         self._alone = nodes.comm.size == 1
 
@@ -75,6 +76,14 @@ class Rows:
     def take(self, blocks: Values, left: Values, right: Values) -> None:
         """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
         self._code.scale(*self._pattern, at(blocks), at(left), at(right), self._all[-1])
+
+    def lose(self, blocks: Values, left: Values, right: Values, lost: Single) -> None:
+        """What rounding has taken from each row of A's blocks, where left and right are undone (C tells)."""
+        self._code.lose(*self._all, at(blocks), at(left), at(right), at(lost))
+
+    def multiply(self, lost: Single, left: Values, z: Vector, x: Values, y: Values) -> None:
+        """y = diag(left) A z + lost x in double precision, z of ghosts as well."""
+        self._code.multiply(*self._all, at(lost), at(left), z.place, at(x), at(y))
 
     def residual(self, b: Vector, x: Vector, left: Vector) -> None:
         """left = b - A x."""

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from petsc4py import PETSc
 
 from ..mesh.ranks import total
 from .levels import Blocks, Copy
@@ -56,13 +55,13 @@ class Level:
         beside: what is added to the blocks of A.    effort: what is done with it.
     """
 
-    def __init__(self, copy: Copy, own: Blocks, made: Code, beside: list[Tied]) -> None:
+    def __init__(self, copy: Copy, own: Blocks, made: Code) -> None:
         """`own`: where the blocks of A are, which it has yet to `take`."""
         nodes, size = copy.nodes, copy.size
         large = np.abs(copy.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
         self._comm, self._owned, self._size = nodes.comm, nodes.size_local * size, size
-        self.beside = beside
+        self.beside: list[Tied] = []
         self._rows = Rows(made, own.starts, own.columns)
         self._inverse = Diagonal(made, nodes.size_local, size)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
@@ -151,13 +150,6 @@ class Level:
 
     def _by_nodes(self, vector: Vector) -> npt.NDArray[np.float32]:
         return vector.array[: self._owned].reshape(-1, self._size)
-
-    def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = A x, neither of them scaled (collective)."""
-        n = self._owned
-        np.divide(x.array_r, self.scale[:n], out=self.x.array[:n], casting="same_kind")
-        self._multiply()
-        np.divide(self.left.array[:n], self.scale[:n], out=y.array_w)
 
     def begin(self) -> None:
         """Smooth from 0, and what is left (collective)."""
