@@ -26,9 +26,11 @@ def test_matrices_are_made_positive(size: int, small: float) -> None:
     lifted[6] = True
     assert 0 < lifted.sum() < len(A)
     expected = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1) * lifted[:, None, None]
-    found = np.full((len(A) + 1, size, size), 7.0)
-    made_positive(A, small, found)
-    np.testing.assert_allclose(found[:-1], expected, atol=1e-10)
+    found, filled = np.full((len(A) + 1, size, size), 7.0), np.ones(len(A), np.uint8)
+    for order in (slice(None), slice(None, None, -1)):  # once more with what the first time has left
+        made_positive(np.ascontiguousarray(A[order]), small, found, filled)
+        np.testing.assert_allclose(found[:-1], expected[order], atol=1e-10)
+        np.testing.assert_array_equal(filled, lifted[order])
     assert (found[-1] == 7.0).all()
 
 

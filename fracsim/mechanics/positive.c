@@ -2,6 +2,7 @@
 
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 
 typedef double real __attribute__((vector_size(8 * LANES)));
 
@@ -90,18 +91,20 @@ static void lift(const double *A, const int64_t *cells, int count, double *C) {
 }
 
 // C (count, N, N) = - sum of negative eigenvalues times their projectors, of those A that have one below - small of
-// their mean; 0 for all others. A matrix of nothing has none.
-void positive(int64_t count, double small, const double *A, double *C) {
+// their mean; 0 for all others. A matrix of nothing has none. filled: (count,) which of C are not 0.
+void positive(int64_t count, double small, const double *A, double *C, uint8_t *filled) {
   int64_t found[2 * LANES], cells[LANES];
   int waiting = 0;
-  for (int64_t k = 0; k < count * N * N; ++k) C[k] = 0.0;
   for (int64_t first = 0; first < count; first += LANES) {
     real a[N][N];
     for (int lane = 0; lane < LANES; ++lane) cells[lane] = first + lane < count ? first + lane : count - 1;
     take(A, cells, a);
     const real least = least_pivots(a, small);
-    for (int lane = 0; lane < LANES && first + lane < count; ++lane)
-      if (least[lane] < 0.0) found[waiting++] = cells[lane];
+    for (int lane = 0; lane < LANES && first + lane < count; ++lane) {
+      const int64_t cell = cells[lane];
+      if (filled[cell]) memset(C + cell * N * N, 0, N * N * sizeof(double));
+      if ((filled[cell] = least[lane] < 0.0)) found[waiting++] = cell;
+    }
     if (waiting >= LANES) {
       lift(A, found, LANES, C);
       waiting -= LANES;
