@@ -212,6 +212,21 @@ class Domain:
     def gather_cells(self) -> Gather:
         return Gather(self.comm, self.cell_input)
 
+    @property
+    def cell_facets(self) -> Ints:
+        """(owned cells, d + 1) their facets."""
+        array = self.mesh.topology.connectivity(self.dim, self.dim - 1).array
+        return np.asarray(array.reshape(-1, self.dim + 1)[: self.cell_count])
+
+    @cached_property
+    def neighbours(self) -> Ints:
+        """(n, 2) owned cells that share a facet."""
+        facets = self.cell_facets
+        order = np.argsort(facets, axis=None, kind="stable")
+        twice = np.flatnonzero(np.diff(facets.reshape(-1)[order]) == 0)
+        pairs = np.stack([order[twice], order[twice + 1]], axis=1) // facets.shape[1]
+        return pairs.astype(np.int32)
+
     @cached_property
     def volumes(self) -> npt.NDArray[np.float64]:
         """Volume (area in 2D) of each owned cell in the reference configuration, m^d."""

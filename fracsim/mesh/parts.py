@@ -33,17 +33,10 @@ def parts_of_nodes(domain: Domain, whole: Flags) -> tuple[int, Ints]:
 
 def _parts(domain: Domain, cells: Ints) -> tuple[int, Ints]:
     """How many parts there are on this rank, and that of each cell (n,)."""
-    facets = _facets(domain)[cells]
-    facet, cell = facets.reshape(-1), np.repeat(np.arange(len(cells)), facets.shape[1])
-    order = np.argsort(facet, kind="stable")
-    twice = np.flatnonzero(np.diff(facet[order]) == 0)
-    return components(np.stack([cell[order[twice]], cell[order[twice + 1]]], axis=1), len(cells))
-
-
-def _facets(domain: Domain) -> npt.NDArray[np.int32]:
-    """(owned cells, d + 1) their facets."""
-    array = domain.mesh.topology.connectivity(domain.dim, domain.dim - 1).array
-    return array.reshape(-1, domain.dim + 1)[: domain.cell_count]
+    number = np.full(domain.cell_count, -1)
+    number[cells] = np.arange(len(cells))
+    links = number[domain.neighbours]
+    return components(links[(links >= 0).all(axis=1)], len(cells))
 
 
 def _joined(domain: Domain, cells: Ints, part: Ints, count: int, size: Ints, lowest: Ints) -> tuple[Ints, Ints, Ints]:
@@ -55,7 +48,7 @@ def _joined(domain: Domain, cells: Ints, part: Ints, count: int, size: Ints, low
     first, facets = offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
     label = la.vector(facets, 1, np.int64)
     label.array[:] = -1
-    label.array[_facets(domain)[cells]] = (first + part)[:, None]
+    label.array[domain.cell_facets[cells]] = (first + part)[:, None]
     mine = label.array[facets.size_local :].copy()
     label.scatter_forward()
     links = np.stack([mine, label.array[facets.size_local :]], axis=1)

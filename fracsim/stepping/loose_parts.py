@@ -63,7 +63,7 @@ class LooseParts:
         return True
 
     def _take(self, columns: Ints, values: Values, width: int) -> None:
-        """Z, K Z and the factors of E (collective)."""
+        """Z, K Z, their transposes and the factors of E (collective)."""
         domain = self._balance.domain
         comm, d = domain.comm, domain.dim
         nodes = domain.space.dofmap.index_map
@@ -74,21 +74,23 @@ class LooseParts:
                        (first + self._at.reshape(-1, d, 1), columns[:, None]))  # fmt: skip
         Z = csr_matrix((values[there], (row, column)), shape=(size, width))
         self._Z = Z[first + self._at]
-        ZtK = _summed(comm, self._Z.T @ self._balance.stiffness.rows(self._nodes))
+        self._Zt = self._Z.T.tocsr()
+        ZtK = _summed(comm, self._Zt @ self._balance.stiffness.rows(self._nodes))
         E = ZtK @ _summed(comm, Z)
         self._solve = splu(E.tocsc()).solve
         own = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
         self._near = np.flatnonzero(np.diff(own.indptr))
         self._KZ = own[self._near]
+        self._KZt = self._KZ.T.tocsr()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = P x (collective)."""
         comm, at, near, rest = self._balance.domain.comm, self._at, self._near, self._rest
         x.copy(rest)
-        moved = self._solve(total(comm, self._Z.T @ rest.array_r[at]))
+        moved = self._solve(total(comm, self._Zt @ rest.array_r[at]))
         rest.array_w[near] -= self._KZ @ moved
         self.body.apply(rest, y)
-        moved -= self._solve(total(comm, self._KZ.T @ y.array_r[near]))
+        moved -= self._solve(total(comm, self._KZt @ y.array_r[near]))
         y.array_w[at] += self._Z @ moved
 
     def forget(self) -> None:
