@@ -228,11 +228,14 @@ class CellExpression:
         if cells is None:
             if self._values is None:
                 self._values = np.empty((len(self._all), self.count * self.width))
-            if self._lanes is not None:
-                self._lanes(self._all, self._values)
-                return self._values
-            return evaluate(self._compiled, self.mesh, self._all, self._values)
-        return evaluate(self._compiled, self.mesh, cells, np.empty((len(cells), self.count * self.width)))
+            return self._into(self._values, self._all)
+        return self._into(np.empty((len(cells), self.count * self.width)), cells)
+
+    def _into(self, values: npt.NDArray[np.float64], cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+        if self._lanes is None:
+            return evaluate(self._compiled, self.mesh, cells, values)
+        self._lanes(cells, values)
+        return values
 
     def _in_lanes(self) -> ExpressionLanes | None:
         from .lanes import ExpressionLanes

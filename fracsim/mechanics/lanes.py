@@ -24,7 +24,14 @@ from mpi4py import MPI
 
 from ..mesh.compiled import address, at, built_together
 from ..mesh.dolfinx_calls import (
-    FormField, cells_of, constants_of, expression_fields, form_fields, identity_rows, integrals, nodes_of_cells,
+    FormField,
+    cells_of,
+    constants_of,
+    expression_fields,
+    form_fields,
+    identity_rows,
+    integrals,
+    nodes_of_cells,
 )  # fmt: skip
 
 Values = npt.NDArray[np.float64]

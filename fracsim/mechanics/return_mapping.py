@@ -52,7 +52,8 @@ class ReturnMapping:
         self.plastic: Plasticity = plastic
         self._stress, self._flowed = stress, True
         trial = Trial(plastic.energy, stress.u, stress.R)
-        self._state, self._measures = (point_expression(domain, each) for each in (trial.state(), trial.measures()))
+        asked = trial.state(), trial.measures()
+        self._state, self._measures = (point_expression(domain, each, often=True) for each in asked)
 
     def begin(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""
