@@ -16,7 +16,8 @@ forcing            how exactly its linear systems are solved
 one_solve          steps that are one linear solve
 descent, downhill  what its line search goes down, with moduli made positive where it would go up
 blocks             products with the tangent in blocks of a node's dofs
-cycle              multigrid's cycle in single precision; levels: PETSc's, copied; rows: products in C
+cycle              multigrid's cycle in single precision; levels: PETSc's, copied; smoother: how they are smoothed
+finest             its finest level, which CG goes by, too; rows, between: products on levels and between them in C
 woodbury           few stiff pairs beside what a preconditioner knows
 preconditioner     when multigrid is made anew, and what takes over from it; inertia_share: what decides
 rigid_modes        its near null space; loose_parts: the same of parts that hang by a node or an edge

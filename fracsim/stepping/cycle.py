@@ -3,7 +3,8 @@
 CG with multigrid is bound by what it reads: five products with the finest level an iteration, four of them in the
 cycle, where six digits are plenty. Floats in blocks are 40 bytes for nine entries, doubles in blocks 76, single entries
 108; an iteration takes 0.4 to 0.5 of the time. CG itself goes by the tangent in double precision, but for corrections
-of Newton's method (linear), which finds the last digits by its residuals.
+of Newton's method (linear), which finds the last digits by its residuals: for these the cycle's finest level is what CG
+multiplies with (finest).
 
 Each level is scaled by the diagonal that it was set up with, A' = S A S, S = diag(A)^(-1/2), so that its numbers are
 about 1, and P' = S_fine^-1 P S_coarse. It is smoothed by p = q(B A') B, Chebyshev's polynomial of B A' (smoother). The
@@ -26,23 +27,28 @@ them.
 
 from __future__ import annotations
 
+from ctypes import CDLL
 from itertools import chain, pairwise, repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
+from . import between, rows
+from .between import Between
 from .finest import Finest
 from .levels import Blocks, copied
-from .rows import Code, Rows, Vector, code
+from .rows import Vector
 from .smoother import Effort, Level
 
 if TYPE_CHECKING:
     from ..mechanics.products import Products
 
 Values = npt.NDArray[np.float64]
-type Codes = dict[tuple[int, int], Code]
+# by the size of a level's blocks; by the sizes of the finer level's and the coarser's, for what is between them
+type Codes = dict[tuple[int, ...], CDLL]
 
 SMOOTHED = ("chebyshev", "jacobi", 2)  # how PETSc's levels are, which these replace
 # where coarser levels converge slowly: the effort of the first of them, of the next, and of all that follow, which have
@@ -56,38 +62,39 @@ class Cycle:
 
     Attributes:
         body: PETSc's multigrid.    pc: the preconditioner.    finest: the level of the tangent.
+        thorough: whether more is done with coarser levels, which takes as long as the finest then.
     """
 
     def __init__(self, body: PETSc.PC, products: Products, codes: Codes) -> None:
         """`body`: of the kind that `in_single` takes; `products`: with the tangent, which it has yet to `follow`;
-        `codes`: for the sizes of blocks (collective)."""
+        `codes`: for the sizes of its blocks (collective)."""
         self.body, self._products, self._tangent = body, products, products.matrix
         coarsest, *found = copied(body, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
         tangent = Blocks(starts, self._tangent.indices[: starts[-1]], self._values)
         self._levels: list[Level] = []
-        self._between: list[Rows] = []
+        self._between: list[Between] = []
         below = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
         for here in found:
-            made = codes[here.size, here.size]
+            square = codes[here.size,]
             if here.own:
-                level = Level(here, here.own, made)
+                level = Level(here, here.own, square)
                 level.take(here.own.values)
             else:
-                level = self.finest = Finest(here, tangent, made)
+                level = self.finest = Finest(here, tangent, square)
             self._levels.append(level)
             assert here.between is not None
-            between = Rows(codes[here.size, below.size], here.between.starts, here.between.columns)
-            between.take(here.between.values, 1 / level.scale, scale)
-            self._between.append(between)
+            made = codes[here.size, below.size]
+            self._between.append(Between(made, here.between, 1 / level.scale, scale))
             below, scale = here, level.scale
         self._b, self._x = (Vector(coarsest.nodes, coarsest.size) for _ in range(2))
         self._solver = body.getMGCoarseSolve()
         self._ends = self._solver.getOperators()[1].createVecs()
         self.pc = PETSc.PC().createPython(self, comm=body.comm)
         self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
-        if len(self._levels) > 1 and self.converges_slowly():
+        self.thorough = len(self._levels) > 1 and self.converges_slowly()
+        if self.thorough:
             for level, effort in zip(self._levels[-2::-1], chain(THOROUGH, repeat(THOROUGH[-1])), strict=False):
                 level.exert(effort)
 
@@ -122,11 +129,11 @@ class Cycle:
 
     def _go_through(self, at: int) -> None:
         """The cycle from a level down."""
-        level, between = self._levels[at], self._between[at]
+        level = self._levels[at]
         level.begin()
         b = self._levels[at - 1].b if at else self._b
         b.array[:] = 0.0
-        between.add_transposed(level.left, b)
+        self._between[at].add_transposed(level.left, b)
         b.give_back()
         if at:
             self._correct(at - 1)
@@ -134,7 +141,7 @@ class Cycle:
             self._solve_coarsest()
         x = self._levels[at - 1].x if at else self._x
         x.fetch()
-        between.add(x, level.x)
+        self._between[at].add(x, level.x)
         level.end()
 
     def _correct(self, at: int) -> None:
@@ -168,8 +175,13 @@ def in_single(body: PETSc.PC, products: Products) -> Cycle | None:
     if any((each.getType(), each.getPC().getType(), each.max_it) != SMOOTHED for each in solvers[1:]):
         return None
     sizes = [each.getOperators()[1].getBlockSize() for each in solvers]
-    comm = body.comm.tompi4py()
-    needed = sorted({*((size, size) for size in sizes[1:]), *pairwise(sizes[::-1])})
-    made = {size: code(comm, *size) for size in needed}
-    codes = {size: each for size, each in made.items() if each is not None}
-    return Cycle(body, products, codes) if len(codes) == len(made) else None
+    codes = _compiled(body.comm.tompi4py(), sizes)
+    return None if codes is None else Cycle(body, products, codes)
+
+
+def _compiled(comm: MPI.Comm, sizes: list[int]) -> Codes | None:
+    """For levels with so many dofs of a node, from the coarsest on; None without a compiler (collective)."""
+    asked = {(size,): rows.code(comm, size) for size in sorted(set(sizes[1:]))}
+    asked |= {(fine, coarse): between.code(comm, fine, coarse) for coarse, fine in sorted(set(pairwise(sizes)))}
+    made = {key: each for key, each in asked.items() if each is not None}
+    return made if len(made) == len(asked) else None

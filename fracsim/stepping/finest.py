@@ -13,12 +13,14 @@ of a stiffness where neighbours move apart, which is next to the stiffness itsel
 
 from __future__ import annotations
 
+from ctypes import CDLL
+
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
 from .levels import Blocks, Copy
-from .rows import Code, Vector
+from .rows import Vector
 from .smoother import Level
 
 Values = npt.NDArray[np.float64]
@@ -27,7 +29,7 @@ Values = npt.NDArray[np.float64]
 class Finest(Level):
     """The level of the tangent."""
 
-    def __init__(self, copy: Copy, own: Blocks, made: Code) -> None:
+    def __init__(self, copy: Copy, own: Blocks, made: CDLL) -> None:
         """As any level."""
         super().__init__(copy, own, made)
         nodes, size = copy.nodes, copy.size

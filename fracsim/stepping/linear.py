@@ -47,8 +47,8 @@ DEFAULTS: Options = {
 # preconditioner is made anew anyhow, every dead cell goes.
 SHRINK_BELOW = 0.9
 
-# Inertia of a cell, as a share of its stiffness, above which corrections are those of a tangent in single precision: it
-# holds what hangs by a node or an edge a thousand times more stiffly than rounding does.
+# Inertia of a cell, as a share of its stiffness, above which corrections are those of a tangent in single precision:
+# rounding takes 6e-8 of a stiffness where neighbours move apart (finest), less than inertia does in what hangs by a node
 ROUNDED = 1e-6
 
 

@@ -4,9 +4,9 @@ It is kept from tangent to tangent: making multigrid's coarse spaces costs more 
 is made anew where CG takes a third more iterations than when it was fresh, or the tangent has given up entries of dead
 cells (mechanics.tangent), and refreshed (new coarse operators and smoothers on the same coarse spaces) after edges
 broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh. Where its cycle is
-quick (cycle) a set-up costs a hundred iterations and more, and it is made anew once what CG has taken longer adds up to
-SET_UP; where no edge has broken since its coarse spaces were made these are good still, and a refresh, a third of a
-set-up, is enough for REFRESHED of it.
+quick (cycle) a set-up costs a hundred iterations and more, or sixty thorough ones, and it is made anew once what CG has
+taken longer adds up to SET_UP; where no edge has broken since its coarse spaces were made these are good still, and a
+refresh, a third of a set-up, is enough for REFRESHED of it.
 
 Where a body comes apart, cells hang from it by a node or an edge and turn there against nothing but their inertia.
 Smoothed aggregation with Jacobi's smoother needs three times the iterations then, and a set-up that a few broken edges
@@ -72,10 +72,12 @@ MANY = 0.02  # edges that broke, for each node, after which it is refreshed
 REFRESH_ITS = 10  # iterations that a refresh costs
 # more than it would take when fresh, after which one whose cycle is quick is made anew, or, of a body that nothing has
 # broken in, refreshed
-SET_UP, REFRESHED = 60, 20
-# solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): the second one is of the
-# tangent that the first has led to, and takes twice as many whichever of the two it was made for
-FRESH = 2
+SET_UP, REFRESHED = 100, 40
+THOROUGHLY = 0.6  # of them, where more is done in each iteration
+# solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): those of a step, as one
+# tangent of it may take three times the iterations of another, whichever it was made for. By two solves alone a jelly
+# that flies about seemed slow in each step, and was set up for
+FRESH = 5
 
 
 class Due(IntEnum):
@@ -253,9 +255,10 @@ class Preconditioner:
         if self._cycle is not None:
             if its > fresh > 0:
                 self._extra += int(self._ksp.its) * (1 - fresh / its)
-            if self._extra > SET_UP:
+            enough = THOROUGHLY if self._cycle.thorough else 1.0
+            if self._extra > enough * SET_UP:
                 self.due = Due.REBUILD
-            elif not self._torn and self._extra > self._refreshed_at + REFRESHED:
+            elif not self._torn and self._extra > self._refreshed_at + enough * REFRESHED:
                 self.due = max(self.due, Due.REFRESH)
             return
         if self._broke:

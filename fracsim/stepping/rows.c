@@ -1,5 +1,5 @@
-/* Rows of blocks in single precision (stepping.rows).    R, C: rows and columns of a block, whose numbers come column by
-   column, eight more behind the last block; LANES: 2, 4 or 8, at least R. starts: of rows; columns: of blocks.
+/* Rows of square blocks in single precision (stepping.rows).    R: rows of a block, whose numbers come column by column,
+   eight more behind the last block; LANES: 2, 4 or 8, at least R. starts: of rows; columns: of blocks.
    B: one symmetric block of R x R a row, eight more numbers behind the last one. */
 
 #include <math.h>
@@ -11,15 +11,15 @@ typedef double wide __attribute__((vector_size(8 * LANES)));
 /* R numbers of A x, and whatever comes behind them; a sum of its own for each column, or each would wait for the last. */
 static inline lanes product(int64_t from, int64_t to, const int32_t* columns, const float* blocks, const float* x)
 {
-  lanes sums[C] = {0}, sum = {0};
+  lanes sums[R] = {0}, sum = {0};
   for (int64_t at = from; at < to; ++at)
   {
-    const float *A = blocks + R * C * at, *in = x + C * (int64_t)columns[at];
+    const float *A = blocks + R * R * at, *in = x + R * (int64_t)columns[at];
 #pragma GCC unroll 6
-    for (int s = 0; s < C; ++s) sums[s] += *(const lanes*)(A + R * s) * in[s];
+    for (int s = 0; s < R; ++s) sums[s] += *(const lanes*)(A + R * s) * in[s];
   }
 #pragma GCC unroll 6
-  for (int s = 0; s < C; ++s) sum += sums[s];
+  for (int s = 0; s < R; ++s) sum += sums[s];
   return sum;
 }
 
@@ -82,22 +82,6 @@ void add(int64_t rows, const int64_t* starts, const int32_t* columns, const floa
   }
 }
 
-/* y += A^T x */
-void add_transposed(int64_t rows, const int64_t* starts, const int32_t* columns, const float* blocks, const float* x,
-    float* y)
-{
-  for (int64_t row = 0; row < rows; ++row, x += R)
-    for (int64_t at = starts[row]; at < starts[row + 1]; ++at)
-    {
-      const float* A = blocks + R * C * at;
-      float* to = y + C * (int64_t)columns[at];
-#pragma GCC unroll 6
-      for (int s = 0; s < C; ++s)
-#pragma GCC unroll 6
-        for (int r = 0; r < R; ++r) to[s] += A[R * s + r] * x[r];
-    }
-}
-
 /* to = left A right, left and right diagonal; A in double precision, the numbers of its blocks row by row. */
 void scale(int64_t rows, const int64_t* starts, const int32_t* columns, const double* blocks, const double* left,
     const double* right, float* to)
@@ -105,12 +89,12 @@ void scale(int64_t rows, const int64_t* starts, const int32_t* columns, const do
   for (int64_t row = 0; row < rows; ++row)
     for (int64_t at = starts[row]; at < starts[row + 1]; ++at)
     {
-      const double *A = blocks + R * C * at, *l = left + R * row, *r = right + C * (int64_t)columns[at];
-      float* B = to + R * C * at;
+      const double *A = blocks + R * R * at, *l = left + R * row, *r = right + R * (int64_t)columns[at];
+      float* B = to + R * R * at;
 #pragma GCC unroll 6
-      for (int s = 0; s < C; ++s)
+      for (int s = 0; s < R; ++s)
 #pragma GCC unroll 6
-        for (int t = 0; t < R; ++t) B[R * s + t] = (float)(l[t] * A[C * t + s] * r[s]);
+        for (int t = 0; t < R; ++t) B[R * s + t] = (float)(l[t] * A[R * t + s] * r[s]);
     }
 }
 
@@ -189,22 +173,22 @@ static inline wide widened(const float* from)
 void multiply(int64_t rows, const int64_t* starts, const int32_t* columns, const float* blocks, const float* lost,
     const double* left, const double* z, const double* x, double* restrict y)
 {
-  for (int64_t row = 0; row < rows; ++row, lost += R * C, left += R, x += R, y += R)
+  for (int64_t row = 0; row < rows; ++row, lost += R * R, left += R, x += R, y += R)
   {
-    wide sums[C] = {0}, sum = {0};
+    wide sums[R] = {0}, sum = {0};
     for (int64_t at = starts[row]; at < starts[row + 1]; ++at)
     {
-      const float* A = blocks + R * C * at;
-      const double* in = z + C * (int64_t)columns[at];
+      const float* A = blocks + R * R * at;
+      const double* in = z + R * (int64_t)columns[at];
 #pragma GCC unroll 6
-      for (int s = 0; s < C; ++s) sums[s] += widened(A + R * s) * in[s];
+      for (int s = 0; s < R; ++s) sums[s] += widened(A + R * s) * in[s];
     }
 #pragma GCC unroll 6
-    for (int s = 0; s < C; ++s) sum += sums[s];
+    for (int s = 0; s < R; ++s) sum += sums[s];
     for (int r = 0; r < R; ++r)
     {
       double given = left[r] * sum[r];
-      for (int s = 0; s < C; ++s) given += lost[R * s + r] * x[s];
+      for (int s = 0; s < R; ++s) given += lost[R * s + r] * x[s];
       y[r] = given;
     }
   }

@@ -1,9 +1,8 @@
-"""Rows of blocks in single precision, and vectors for products with them."""
+"""Rows of square blocks in single precision, and vectors for products with them."""
 
 from __future__ import annotations
 
 from ctypes import CDLL, c_float, c_int64
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,6 @@ Values = npt.NDArray[np.float64]
 
 SOURCE = Path(__file__).with_suffix(".c")
 BEHIND = 8  # numbers behind the last block, which are read and made nothing of
-
-
-@dataclass(frozen=True)
-class Code:
-    """What is compiled for a size of blocks.
-
-    Attributes:
-        size: numbers of a block.
-    """
-
-    functions: CDLL
-    size: int
 
 
 class Vector:
@@ -66,10 +53,10 @@ class Rows:
         blocks: (blocks, numbers of one) column by column.
     """
 
-    def __init__(self, made: Code, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
-        """`starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
-        self._code, numbers = made.functions, np.zeros(int(starts[-1]) * made.size + BEHIND, np.float32)
-        self.blocks: Single = numbers[:-BEHIND].reshape(-1, made.size)
+    def __init__(self, made: CDLL, size: int, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
+        """`made`: `code` for blocks of size x size; `starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
+        self._code, numbers = made, np.zeros(int(starts[-1]) * size**2 + BEHIND, np.float32)
+        self.blocks: Single = numbers[:-BEHIND].reshape(-1, size**2)
         self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
         self._all = *self._pattern, at(numbers)
 
@@ -99,10 +86,6 @@ class Rows:
         """y += A x."""
         self._code.add(*self._all, x.place, y.place)
 
-    def add_transposed(self, x: Vector, y: Vector) -> None:
-        """y += A^T x, ghosts of y included."""
-        self._code.add_transposed(*self._all, x.place, y.place)
-
 
 class Diagonal:
     """Blocks of this rank's rows on the diagonal, B, symmetric.
@@ -111,10 +94,10 @@ class Diagonal:
         blocks: (rows, size, size).    place: where they begin.
     """
 
-    def __init__(self, made: Code, rows: int, size: int) -> None:
-        """`made`: for blocks of size x size."""
+    def __init__(self, made: CDLL, size: int, rows: int) -> None:
+        """`made`: `code` for blocks of size x size."""
         numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
-        self._code, self._rows, self.place = made.functions, c_int64(rows), at(numbers)
+        self._code, self._rows, self.place = made, c_int64(rows), at(numbers)
         self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
 
     def invert(self, D: Single) -> None:
@@ -126,9 +109,7 @@ class Diagonal:
         self._code.begin(self._rows, self.place, c_float(take), b.place, d.place, x.place)
 
 
-def code(comm: MPI.Comm, rows: int, columns: int) -> Code | None:
-    """For blocks of that size; None without a compiler (collective)."""
-    lanes = next(n for n in (2, 4, 8) if n >= rows)
-    sizes = [f"-DR={rows}", f"-DC={columns}", f"-DLANES={lanes}"]
-    functions = built_together(comm, "rows", SOURCE.read_text(), [*FASTER, *sizes])
-    return None if functions is None else Code(functions, rows * columns)
+def code(comm: MPI.Comm, size: int) -> CDLL | None:
+    """For blocks of size x size; None without a compiler (collective)."""
+    lanes = next(n for n in (2, 4, 8) if n >= size)
+    return built_together(comm, "rows", SOURCE.read_text(), [*FASTER, f"-DR={size}", f"-DLANES={lanes}"])

@@ -9,6 +9,7 @@ iterations.
 
 from __future__ import annotations
 
+from ctypes import CDLL
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from ..mesh.ranks import total
 from .levels import Blocks, Copy
-from .rows import Code, Diagonal, Rows, Vector
+from .rows import Diagonal, Rows, Vector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,15 +56,15 @@ class Level:
         beside: what is added to the blocks of A.    effort: what is done with it.
     """
 
-    def __init__(self, copy: Copy, own: Blocks, made: Code) -> None:
+    def __init__(self, copy: Copy, own: Blocks, made: CDLL) -> None:
         """`own`: where the blocks of A are, which it has yet to `take`."""
         nodes, size = copy.nodes, copy.size
         large = np.abs(copy.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
         self._comm, self._owned, self._size = nodes.comm, nodes.size_local * size, size
         self.beside: list[Tied] = []
-        self._rows = Rows(made, own.starts, own.columns)
-        self._inverse = Diagonal(made, nodes.size_local, size)
+        self._rows = Rows(made, size, own.starts, own.columns)
+        self._inverse = Diagonal(made, size, nodes.size_local)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
         self._so_far = Vector(nodes, size) if copy.own else None
         self.effort = USUAL
