@@ -48,7 +48,7 @@ DEFAULTS: Options = {
 SHRINK_BELOW = 0.9
 
 # Inertia of a cell, as a share of its stiffness, above which corrections are those of a tangent in single precision:
-# rounding takes 6e-8 of a stiffness where neighbours move apart (finest), less than inertia does in what hangs by a node
+# rounding takes 6e-8 of a stiffness where neighbours move apart (finest), less than what hangs by a node has
 ROUNDED = 1e-6
 
 
