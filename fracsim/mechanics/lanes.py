@@ -32,7 +32,7 @@ from ..mesh.dolfinx_calls import (
     identity_rows,
     integrals,
     nodes_of_cells,
-)  # fmt: skip
+)
 
 Values = npt.NDArray[np.float64]
 

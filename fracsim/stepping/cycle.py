@@ -181,7 +181,7 @@ def in_single(body: PETSc.PC, products: Products) -> Cycle | None:
 
 def _compiled(comm: MPI.Comm, sizes: list[int]) -> Codes | None:
     """For levels with so many dofs of a node, from the coarsest on; None without a compiler (collective)."""
-    asked = {(size,): rows.code(comm, size) for size in sorted(set(sizes[1:]))}
+    asked: dict[tuple[int, ...], CDLL | None] = {(size,): rows.code(comm, size) for size in sorted(set(sizes[1:]))}
     asked |= {(fine, coarse): between.code(comm, fine, coarse) for coarse, fine in sorted(set(pairwise(sizes)))}
     made = {key: each for key, each in asked.items() if each is not None}
     return made if len(made) == len(asked) else None
