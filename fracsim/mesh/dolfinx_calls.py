@@ -15,7 +15,7 @@ after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is g
 any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
             keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
-Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, fields_of, constants_of,
+Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, form_fields, constants_of,
 identity_rows, assemble_into, apply_lifting, expanded_csr, create_matrix. What FFCx writes is read by mechanics.lanes.
 `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
