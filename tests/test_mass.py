@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 from fracsim.forms.energies import lame
 from support.reference import gradients, stiffness
 from support.scenes import make_scene, march
+from support.torn import weaken
 
 Values = npt.NDArray[np.float64]
 DENSITY = 3.0
@@ -40,6 +41,35 @@ def test_consistent_mass_is_the_integral(dim: int) -> None:
     np.testing.assert_allclose(inertia.lumped.reshape(a.shape)[:, 0], M.sum(axis=1), atol=1e-14)
     free = np.random.default_rng(3).uniform(size=a.size) < 2  # nothing is held
     np.testing.assert_allclose(inertia.solve((M @ a).reshape(-1), free), a.reshape(-1), atol=1e-10)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_tangent_in_blocks_has_it(dim: int) -> None:
+    """K + c_a M of cells a third of which carry nothing, and were left out before there were blocks: dense, of free
+    dofs; prescribed ones stand alone. Twice, as what M adds is kept."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 0.4, "pattern": "unstructured"},
+        material=MATERIAL,
+        fracture={"strength": 1e9},
+        time={"scheme": "newmark", "step": 0.1, "end": 1.0, "mass": "consistent"},
+        boundary=[{"on": "left", "fix": "xyz"[:dim]}],
+    )
+    domain, balance = scene.domain, scene.balance
+    weaken(scene)
+    balance.damage_changed()
+    products, chi = balance.stiffness.in_blocks(), balance.stress.chi
+    assert products is not None and chi is not None
+    for step in (0.1, 0.05):
+        balance.begin(step, step, state.u, state.v, state.a)
+        balance.stiffness.assemble(blocks_alone=True)
+        M = np.kron(consistent_mass(domain.nodes, domain.cell_nodes), np.eye(dim))
+        K = stiffness(domain.nodes, domain.cell_nodes, *lame(1.0, 0.0), chi.x.array[: domain.cell_count])
+        expected = K + balance.c_a * M
+        held = balance.motion.owned
+        expected[held] = expected[:, held] = 0.0
+        expected[held, held] = 1.0
+        found = products.matrix.to_dense()
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
 
 
 def test_a_mode_of_the_consistent_mass_vibrates_at_its_frequency() -> None:

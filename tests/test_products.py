@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fracsim.mechanics.inertia import InBlocks
 from fracsim.mechanics.tangent import Assembly
 from test_dead_cells import damaged
 
@@ -17,7 +18,8 @@ def test_products_are_those_of_the_dense_matrix(dim: int) -> None:
     assembly = Assembly(balance.stiffness.form)
     products = assembly.use_blocks()
     assert products is not None and assembly.use_blocks() is products
-    assembly([], None, np.linspace(1.0, 2.0, balance.owned) * 1e4)
+    mass = np.linspace(1.0, 2.0, balance.owned) * 1e4
+    assembly([], None, InBlocks(assembly.on_diagonal, mass.reshape(-1, dim)))
     x, y = assembly.matrix.createVecs()
     x.setRandom()
     products.mult(x, y)

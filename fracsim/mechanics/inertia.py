@@ -3,12 +3,13 @@
 Lumped (vertex quadrature, the default; with quadratic displacement by the diagonal) is a vector: inertia costs one
 product, and a node of debris keeps its own mass.
 Consistent is a sparse matrix with the pattern of the tangent: higher frequencies come out too high instead of too low.
-As a term of the form it would be integrated anew in every tangent.
+As a term of the form it would be integrated anew in every tangent; what it adds to each block of that is kept, a
+multiple of 1.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,22 @@ from .kernels import compile_form
 from .term import Level, Term
 from .vectors import Assembler
 
+if TYPE_CHECKING:
+    from .tangent import Assembly
+
+Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+
+
+class InBlocks(NamedTuple):
+    """What inertia adds to blocks of a tangent, multiples of 1 but for prescribed dofs.
+
+    Attributes:
+        blocks: (n,) which, of owned rows.    values: (n, d) what is added on the diagonal of each, N/m.
+    """
+
+    blocks: Ints | slice
+    values: Values
 
 
 class Mass(Protocol):
@@ -40,6 +56,9 @@ class Mass(Protocol):
 
     def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
         """tangent += factor M, leaving rows and columns of prescribed dofs decoupled."""
+
+    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+        """factor M, to be added to the blocks of a tangent, which is assembled after this (collective)."""
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
@@ -106,6 +125,10 @@ class LumpedMass:
         self._diagonal.array_w[:] = factor * self.lumped
         tangent.setDiagonal(self._diagonal, PETSc.InsertMode.ADD)
 
+    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+        """On the diagonal."""
+        return InBlocks(tangent.on_diagonal, factor * self.lumped.reshape(len(tangent.on_diagonal), -1))
+
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back, where there are any."""
         self._diagonal.destroy()
@@ -119,10 +142,12 @@ class ConsistentMass:
     def __init__(self, assembler: Assembler, density: Expr, bcs: list[fem.DirichletBC]) -> None:
         """`density`: kg/m^3, a UFL coefficient; `bcs`: on the dofs that the balance prescribes."""
         self.lumped, domain = lumped_mass(assembler, density), assembler.domain
+        self._bcs = bcs
+        self._multiples: Values | None = None  # of 1, in the blocks of a tangent
         u, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
-        form = compile_form(density * ufl.inner(u, w) * ufl.dx(domain=domain.mesh))
-        self._whole = assemble_matrix(form)
-        self._free = assemble_matrix(form, bcs, diagonal=0.0)
+        self._form = compile_form(density * ufl.inner(u, w) * ufl.dx(domain=domain.mesh))
+        self._whole = assemble_matrix(self._form)
+        self._free = assemble_matrix(self._form, bcs, diagonal=0.0)
         self._x, self._y = assembler.vector(), assembler.vector()
 
     def times(self, values: Values) -> Values:
@@ -150,6 +175,12 @@ class ConsistentMass:
     def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
         """One pass over the stored entries: both have the same pattern."""
         tangent.axpy(factor, self._free, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+
+    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+        """In all of them, which stay the same: cells that die keep their mass."""
+        if self._multiples is None:
+            self._multiples = tangent.diagonals_of(self._form, self._bcs)
+        return InBlocks(slice(None), factor * self._multiples)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back, where there are any."""

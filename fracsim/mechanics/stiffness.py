@@ -82,10 +82,11 @@ class Stiffness:
         return self._assembly.matrix
 
     def in_blocks(self) -> Products | None:
-        """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms,
-        or a mass that couples nodes, add to single entries, or nothing can be compiled (collective)."""
-        adds = any(map(adds_entries, self._terms))
-        return None if adds or not self._mass.diagonal else self._assembly.use_blocks()
+        """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms
+        add to single entries, or nothing can be compiled (collective)."""
+        if any(map(adds_entries, self._terms)):
+            return None
+        return self._assembly.use_blocks(dead_too=not self._mass.diagonal)
 
     def bring_entries(self) -> None:
         """Bring `matrix` to where its blocks are, with what is beside them (collective)."""
@@ -190,7 +191,8 @@ class Stiffness:
         more = None if small is None else self._positive_moduli(small)
         factor = sum(term.mass_factor for term in self._terms)
         if self._assembly.blocks is not None:
-            self._assembly(self._motion.bcs, more, factor * self._mass.lumped)
+            mass = self._mass.in_blocks(self._assembly, factor) if factor else None
+            self._assembly(self._motion.bcs, more, mass)
         else:
             self._assembly(self._motion.bcs, more)
             if factor:

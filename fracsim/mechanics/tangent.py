@@ -20,13 +20,14 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr
+from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr, pattern_of
 from ..mesh.ranks import total
-from .kernels import OfLarge
+from .kernels import CellForm, OfLarge
 
 if TYPE_CHECKING:
     from ctypes import CDLL
 
+    from .inertia import InBlocks
     from .lanes import MatrixLanes
     from .products import Products
 
@@ -40,20 +41,22 @@ class Assembly:
     Attributes:
         form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
         blocks: products with what is assembled into blocks, where it is; kept as long.
+        on_diagonal: (owned nodes,) those blocks of owned rows that are on the diagonal, where there are blocks.
         is_behind: whether the blocks have been assembled since the matrix.
     """
 
     matrix: PETSc.Mat
 
-    def __init__(self, form: fem.Form) -> None:
+    def __init__(self, form: CellForm) -> None:
         self.form = form
         self.blocks: Products | None = None
         self.is_behind = False
         self._dead: Flags | None = None
         self._make()
 
-    def use_blocks(self) -> Products | None:
-        """Assemble into blocks from here on; products with them, None where there is no compiler (collective)."""
+    def use_blocks(self, *, dead_too: bool = False) -> Products | None:
+        """Assemble into blocks from here on; products with them, None where there is no compiler. `dead_too`: with room
+        for cells that the form has left out (collective)."""
         if self.blocks is None:
             from .products import compiled
 
@@ -61,13 +64,13 @@ class Assembly:
             if (code := compiled(self.form.mesh.comm, size)) is None:
                 return None
             self.matrix.destroy()
-            self._make(code)
+            self._make(code, dead_too)
         return self.blocks
 
-    def _make(self, by_blocks: CDLL | None = None) -> None:
-        """Matrices with the pattern of the cells that the form is integrated over, and a full diagonal; `by_blocks`:
-        what makes products with blocks."""
-        pattern = fem.create_sparsity_pattern(self.form)
+    def _make(self, by_blocks: CDLL | None = None, dead_too: bool = False) -> None:
+        """Matrices with the pattern of the cells that the form is integrated over (`dead_too`: and of those left out),
+        and a full diagonal; `by_blocks`: what makes products with blocks."""
+        pattern = pattern_of(self.form.whole if dead_too else self.form._cpp_object)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
@@ -86,7 +89,7 @@ class Assembly:
 
             self.blocks = Products(self._sum, by_blocks)
             rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-            self._on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
+            self.on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
 
     def fit(self, dead: Flags, share: float) -> bool:
         """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
@@ -103,11 +106,9 @@ class Assembly:
         self._make(self._by_blocks)
         return True
 
-    def __call__(
-        self, bcs: list[fem.DirichletBC], more: fem.Form | None = None, diagonal: Values | None = None
-    ) -> None:
+    def __call__(self, bcs: list[fem.DirichletBC], more: fem.Form | None = None, mass: InBlocks | None = None) -> None:
         """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's.
-        `diagonal`: of owned dofs, is added to blocks, which `bring` makes the matrix of (collective)."""
+        `mass` is added to blocks, which `bring` makes the matrix of (collective)."""
         self._sum.data[:] = 0.0
         for form in (self.form, more) if more is not None else (self.form,):
             self._add(form, bcs)
@@ -116,11 +117,24 @@ class Assembly:
             self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
             self.matrix.assemble()
             return
-        if diagonal is not None:
-            d = self.matrix.getBlockSize()
-            at, axes = self._on_diagonal[:, None], np.arange(d)
-            self._sum.data.reshape(-1, d, d)[at, axes, axes] += diagonal.reshape(-1, d)
+        if mass is not None:
+            self._diagonals[mass.blocks] += mass.values
         self.is_behind = True
+
+    def diagonals_of(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
+        """(blocks of owned rows, d) what a form of the same pattern adds to the diagonal of each; nothing in rows and
+        columns of prescribed dofs. It is summed in the tangent's place, which has to be assembled after it
+        (collective)."""
+        self._sum.data[:] = 0.0
+        fem.assemble_matrix(self._sum, form, bcs, 0.0)  # type: ignore[arg-type]
+        self._sum.scatter_reverse()
+        return self._diagonals.copy()
+
+    @property
+    def _diagonals(self) -> Values:
+        """The same of the sum, as part of it."""
+        d = self.matrix.getBlockSize()
+        return np.einsum("bii->bi", self._sum.data[: d * d * self._own.stop].reshape(-1, d, d))
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
         """Add a form to the sum (collective the first time)."""

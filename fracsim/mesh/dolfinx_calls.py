@@ -16,8 +16,8 @@ any         KeptCell            is a private class of Basix with one property ke
             keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
 
 Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, form_fields, constants_of,
-identity_rows, assemble_into, apply_lifting, expanded_csr, create_matrix. What FFCx writes is read by mechanics.lanes.
-`tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
+identity_rows, assemble_into, apply_lifting, pattern_of, expanded_csr, create_matrix. What FFCx writes is read by
+mechanics.lanes. `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not fit.
 """
 
 from __future__ import annotations
@@ -248,6 +248,11 @@ def assemble_matrix(form: fem.Form, bcs: list[fem.DirichletBC] | None = None, di
     matrix = fem_petsc.assemble_matrix(form, bcs or [], diagonal)
     matrix.assemble()
     return matrix
+
+
+def pattern_of(form: Any) -> SparsityPattern:
+    """A new pattern of a bilinear form of C++, which may be added to."""
+    return dolfinx.cpp.fem.create_sparsity_pattern(form)
 
 
 def expanded_csr(pattern: SparsityPattern) -> la.MatrixCSR:

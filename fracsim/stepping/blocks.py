@@ -1,7 +1,7 @@
 """The tangent in blocks of the d dofs of a node: what products are made with.
 
 A product takes half the time, for an index is read for d^2 values instead of for d, and CG with multigrid makes some
-six an iteration on the finest level. Where nothing but cells and a lumped mass add to the tangent it is assembled in
+six an iteration on the finest level. Where nothing but cells and their mass add to the tangent it is assembled in
 blocks; ties of a few nodes to others (mechanics.tied) stay beside these. Smoothed aggregation cannot set itself up from
 blocks, so that there is a matrix of single entries, too, which is brought to where they are when multigrid is set up.
 Where terms add to single entries the blocks are a copy of them, which costs what two iterations gain. Small bodies have

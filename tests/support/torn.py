@@ -176,10 +176,11 @@ def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
     return np.array(scene.balance._work._cpp_object.domains(IntegralType.cell, 1))
 
 
-def dead_cells() -> Found:
-    """Residual and tangent of the damped block with its dead cells, without, without their entries, and assembled in
-    blocks, and how many cells those are."""
-    scene, state = make_scene(**RUNS["block"])
+def dead_cells(mass: str, *ways: str) -> Found:
+    """Residual and tangent of the damped block with its dead cells, without, and `ways` of it: without their entries,
+    and assembled in blocks, and how many cells those are."""
+    block = RUNS["block"]
+    scene, state = make_scene(**block | {"time": block["time"] | {"mass": mass}})
     domain, balance = scene.domain, scene.balance
     balance.begin(0.05, 0.05, state.u, state.v, state.a)
     balance.displace(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
@@ -187,7 +188,7 @@ def dead_cells() -> Found:
     x, y = balance.vector.duplicate(), balance.vector.duplicate()
     x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
     found: Found = {}
-    for name in ("with", "without", "fitted-without", "blocks-without", "brought-without"):
+    for name in ("with", "without", *(f"{way}-without" for way in ways)):
         if name.startswith("fitted"):
             assert balance.stiffness.shrink(0.7)
         blocks = balance.stiffness.in_blocks() if name.startswith(("blocks", "brought")) else None
@@ -197,7 +198,7 @@ def dead_cells() -> Found:
         found[f"residual-{name}-dead"] = domain.gather_nodes(balance.forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
         balance.damage_changed()
-    return found
+    return {f"{mass}-{key}": values for key, values in found.items()}
 
 
 def some_whole(cells: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
@@ -442,4 +443,5 @@ def compared(folder: Path) -> Found:
         found |= run(name, folder if name in SURFACES else None)
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
-    return found | dead_cells() | hanging() | squeezed() | by_rows() | in_blocks()
+    found |= dead_cells("lumped", "fitted", "blocks", "brought") | dead_cells("consistent", "blocks", "brought")
+    return found | hanging() | squeezed() | by_rows() | in_blocks()
