@@ -76,7 +76,8 @@ def fingerprint(trial: Trial) -> str:
 def program() -> str:
     """Name of the code that a study runs through: the page that is made of it afterwards is not part of it."""
     package = Path(root.__file__).parent
-    modules = [path for path in package.rglob("*.[cp]*") if path.suffix in (".py", ".c") and not {"report", "studies"} & set(path.parts[-3:])]
+    sources = (path for kind in ("*.py", "*.c") for path in package.rglob(kind))
+    modules = [path for path in sources if not {"report", "studies"} & set(path.parts[-3:])]
     for part in (forms, meshes):
         modules += Path(str(part.__file__)).parent.rglob("*.py")
     return _name_of(modules)
