@@ -19,7 +19,7 @@ from .blocks import Blocks, worth_it
 from .factors import FACTORISED, Factors
 from .forcing import Forcing, Sparing
 from .inertia_share import inertia_share
-from .one_solve import Ending, is_linear
+from .one_solve import AT_REST, Ending, is_linear
 from .petsc_options import Options, OptionSet, refusing
 from .preconditioner import MULTIGRID, Due, Preconditioner
 from .rigid_modes import rigid_modes
@@ -288,6 +288,8 @@ class Linear:
         if self._ending is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve() else None
         ending, tangent, preconditioner = self._ending, self.stiffness.matrix, self.preconditioner
+        if not self.balance.scheme.inertia:
+            little *= AT_REST
         if self._asked:
             little = min(little, self._asked * self.balance.vector.norm())
         self._assemble_tangent()
