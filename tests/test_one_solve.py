@@ -73,6 +73,22 @@ def test_it_breaks_as_by_newtons_method(scheme: str, solver: dict[str, Any]) -> 
     assert few <= many
 
 
+def test_a_whole_body_at_rest_is_solved_as_one() -> None:
+    """One solve for five steps of a load that grows in proportion, as by factors; a body that may break, pieces of
+    which may hang by next to nothing, goes by Newton's method."""
+    load = {"time": [0.0, 1.0], "value": [[0.0] * 3, [0.0, 0.0, -10.0]]}
+    tables = BAR | {
+        "boundary": [BAR["boundary"][0], {"on": "right", "traction": load}], "load": {}, "damping": {},
+        "time": {"scheme": "quasi-static", "step": 0.2, "end": 1.0},
+    }  # fmt: skip
+    (scene, state), (_, exact) = make_scene(**tables | {"solver": {}}), make_scene(**tables)
+    solves = [report.solve for report in each_step(scene, state)]
+    assert [each.newton for each in solves] == [1, 0, 0, 0, 0] and solves[0].krylov > 3
+    assert len(list(each_step(exact.scene, exact))) == 5
+    np.testing.assert_allclose(state.u, exact.u, atol=1e-6 * np.abs(exact.u).max())
+    assert not make_scene(**tables | TORN | {"solver": {}})[0].solver.linear.linearly
+
+
 @pytest.mark.parametrize(
     "tables",
     [
