@@ -53,7 +53,8 @@ class Watched:
         study, stress = scene.study, scene.balance.stress
         self._study, self.history, self.meter = study, history, meter
         self.inverted = InvertedCells(stress, scene.fracture)
-        self.gained = EnergyGain(at_rest=study.at_rest, floor=worth_telling(stress))
+        floor = worth_telling(stress)
+        self.gained = EnergyGain(at_rest=study.at_rest, floor=floor, thickness=study.thickness)
         self.meetings, self.overlapping = _of_obstacles(scene)
         self.passing, self.drop = _passing(study), _load_drop(study)
         those = (self.meetings, self.overlapping, self.passing, self.drop)

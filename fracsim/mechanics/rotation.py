@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from ufl.core.expr import Expr
 
 from ..mesh.domain import Domain
@@ -11,11 +12,13 @@ from .kernels import point_expression, point_field
 
 class RotationField:
     """R of F = R U (d x d, an expression of the displacement) as a tensor field with a value at each point where stress
-    is integrated, refreshed at every iterate. One R a cell would do for P1 alone: R is exact where it is that of F."""
+    is integrated: the identity of a body at rest, refreshed at every iterate. One R a cell would do for P1 alone: R is
+    exact where it is that of F."""
 
     def __init__(self, domain: Domain, F: Expr) -> None:
         d = domain.dim
         self.field = point_field(domain, (d, d), "rotation")
+        self.field.x.array.reshape(-1, d, d)[:] = np.eye(d)
         self._gradient = point_expression(domain, F)
         self._d = d
 

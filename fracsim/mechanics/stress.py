@@ -187,8 +187,12 @@ class Stress(Term):
 
     def begin(self, level: Level) -> None:
         """What flow takes off the stress of a step that is to be solved."""
-        if self.material.plastic is not None and level.dt:
-            self.material.plastic.begin(level.share * level.dt)
+        plastic = self.material.plastic
+        if plastic is None or not level.dt:
+            return
+        plastic.begin(level.share * level.dt)
+        if plastic.prediction is not None and plastic.prediction.form is None:
+            self.displaced()  # the rotation is that of F_e, in which another F_p stands now
 
     def displaced(self) -> None:
         """u has moved."""

@@ -28,11 +28,14 @@ class EnergyGain:
     that are not positive, or where all breaks at once) leads to motion that nothing drives.
 
     Attributes:
-        rise: J.    scale: largest energy or work so far, J.    floor: J, below which nothing is told.
+        rise: J.    scale: largest energy or work so far, J.    floor: J, below which nothing is told; all three of a 2D
+            body of 1 m.
     """
 
-    def __init__(self, *, at_rest: bool, floor: float = 0.0) -> None:
-        """`at_rest`: the body starts without energy; else from what its first step ends with."""
+    def __init__(self, *, at_rest: bool, floor: float = 0.0, thickness: float = 1.0) -> None:
+        """`at_rest`: the body starts without energy; else from what its first step ends with. `thickness`: m, of a 2D
+        body."""
+        self._thickness = thickness
         self._least = 0.0 if at_rest else float("inf")
         self.rise, self.scale, self.floor = 0.0, 0.0, floor
 
@@ -58,8 +61,8 @@ class EnergyGain:
             return ""
         other = _OTHERS.get(scheme, 'time.scheme = "backward-euler", or ')
         return (
-            f"the body gained {self.rise:.3g} J of energy from nowhere, {self.rise / self.scale:.0%} of all that was "
-            f"at play: its motion is not to be trusted; try {other}a shorter time.step"
+            f"the body gained {self.rise * self._thickness:.3g} J of energy from nowhere, "
+            f"{self.rise / self.scale:.0%} of all that was at play: its motion is not to be trusted; try {other}a shorter time.step"
         )
 
 

@@ -48,7 +48,7 @@ class Obstacle(Table):
     hollow: Flag = False  # the body is inside: a bowl, a container
     displacement: InTime[Vector] | None = None  # m
     velocity: InTime[Vector] | None = None  # m/s; of a free obstacle at the start
-    mass: Positive | None = None  # kg (2D: per metre of thickness): it moves freely
+    mass: Positive | None = None  # kg (2D: of material.thickness, or of 1 m): it moves freely
     density: Positive | None = None  # kg/m^3, in place of the mass
     # rad/s at the start, if free; of a mesh that is held or driven all along, about `at`
     spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None
