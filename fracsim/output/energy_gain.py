@@ -62,7 +62,8 @@ class EnergyGain:
         other = _OTHERS.get(scheme, 'time.scheme = "backward-euler", or ')
         return (
             f"the body gained {self.rise * self._thickness:.3g} J of energy from nowhere, "
-            f"{self.rise / self.scale:.0%} of all that was at play: its motion is not to be trusted; try {other}a shorter time.step"
+            f"{self.rise / self.scale:.0%} of all that was at play: its motion is not to be trusted; "
+            f"try {other}a shorter time.step"
         )
 
 
