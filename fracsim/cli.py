@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import math
 import os
 import sys
 import traceback
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
-from .process import begin_work, import_dolfinx, kept_out, leave
+from .process import INTERRUPTED, begin_process, begin_run, begin_work, import_dolfinx, is_first_rank, kept_out, leave
 
 # typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
 with kept_out("rich"):
@@ -29,7 +30,7 @@ StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study fi
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
 _NONE: list[str] = []
 _NO_PATHS: list[Path] = []
-INTERRUPTED = 130  # as typer and shells report SIGINT
+_BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM)
 _CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ESTALE)
 
 
@@ -42,11 +43,13 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="begin anew where a run that has not ended left a checkpoint")
     ] = False,
-    wall_limit: Annotated[float | None, typer.Option(min=0, help="seconds until it stops with a checkpoint")] = None,
+    wall_limit: Annotated[float | None, typer.Option(help="seconds until it stops with a checkpoint")] = None,
 ) -> None:
     """Run a study. Works under mpirun."""
     if restart and overwrite:
         raise InputError("--restart goes on with the run in the output folder, --overwrite throws it away: give one")
+    if wall_limit is not None and not 0 <= wall_limit < math.inf:
+        raise InputError(f"--wall-limit {wall_limit:g}: must be a number of seconds, 0 or more: --wall-limit 3600")
     from mpi4py import MPI
 
     from .study.file import find_study
@@ -59,6 +62,7 @@ def run(
     from .run import run_study
 
     begin_work()
+    begin_run()
     how = {"restart": restart, "overwrite": overwrite}
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
@@ -78,7 +82,7 @@ def _dust(summary: dict[str, Any]) -> str:
 @app.command()
 def check(study: StudyPath, set_: Set = _NONE) -> None:
     """Validate everything that can be known without solving; print what the scene will build."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .study.check import check_study
     from .study.file import load_study
@@ -96,7 +100,7 @@ def mesh(
     set_: Set = _NONE,
 ) -> None:
     """Build and save the mesh of a study, print its quality."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .meshes.directions import preferred
     from .meshes.quality import mesh_quality
@@ -141,7 +145,7 @@ def render(
     bare: Annotated[bool, typer.Option("--bare", help="no title, time, scale bar or legend")] = False,
 ) -> None:
     """Draw the split surface of runs off-screen: a picture, a sheet of several, or a film of all frames."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .report.pictures.look import Look, limits_of, size_of
     from .report.pictures.picture import render
@@ -164,7 +168,7 @@ def export(
     look: Annotated[str, typer.Option(help="colours, as of render")] = "",
 ) -> None:
     """Write the split surface of a run for Blender, Houdini and others: closed, in m."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .report.export import export
 
@@ -183,7 +187,7 @@ def report(
     exact: Annotated[float | None, typer.Option(help="what the quantity should be (that of the finest run)")] = None,
 ) -> None:
     """Tables and plots of runs in one HTML file that needs nothing else, and CSVs beside it."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .report.make import make_report
 
@@ -217,7 +221,7 @@ def list_(
     what: Annotated[str | None, typer.Argument(help="materials: those that [material] like may name")] = None,
 ) -> None:
     """Show the studies, builders, energies and schemes that exist, or a table of materials."""
-    if not _is_root():
+    if not is_first_rank():
         return
     from .study.catalogue import catalogue, table_of_materials
 
@@ -249,6 +253,12 @@ def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Stu
 
 def check_folder(folder: Path) -> None:
     """InputError where results cannot be written there; nothing is made yet."""
+    try:
+        os.lstat(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise InputError(f"--out {folder}: {error.strerror}; give another one") from None
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
         raise InputError(f"--out {folder}: {there} is not a folder; give another one")
@@ -256,27 +266,31 @@ def check_folder(folder: Path) -> None:
         raise InputError(f"--out {folder}: no permission to write in {there}; give another one")
 
 
-def _is_root() -> bool:
-    """Rank 0, without starting MPI."""
-    return all(os.environ.get(name, "0") == "0" for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK"))
-
-
 def program() -> NoReturn:
     """Entry point of the console script: main(), in a process of its own."""
     gc.disable()  # what imports make stays; to look through it for garbage takes a tenth of a small run
     try:
-        main()
+        main(begin_process)
     except SystemExit as end:
         leave(end.code)
 
 
-def main() -> NoReturn:
-    """The command line: one message and an exit code for what a user can mend, on any number of ranks."""
+def main(begin: Callable[[], None] | None = None) -> NoReturn:
+    """The command line: one message and an exit code for what a user can mend, on any number of ranks. `begin` comes
+    first."""
     bare = len(sys.argv) == 1  # shows the help, and yet is bad usage
-    if not _is_root() and (bare or "--help" in sys.argv):
+    if not is_first_rank() and (bare or "--help" in sys.argv):
         sys.exit(Exit.DONE)
-    code = _guarded(lambda: app(standalone_mode=False))
-    if not _is_root() and "mpi4py.MPI" not in sys.modules:
+
+    def work() -> object:
+        if begin is not None:
+            begin()
+        code = app(standalone_mode=False)
+        sys.stdout.flush()  # here what cannot be written is told
+        return code
+
+    code = _guarded(work)
+    if not is_first_rank() and "mpi4py.MPI" not in sys.modules:
         sys.exit(Exit.DONE)  # mpirun kills all ranks at the first that fails, and rank 0 may still have to say why
     sys.exit(Exit.BAD_INPUT if bare else code)
 
@@ -284,14 +298,14 @@ def main() -> NoReturn:
 def _guarded(work: Callable[[], object]) -> int:
     try:
         code = work()
-        if code == INTERRUPTED and _is_root():
+        if code == INTERRUPTED and is_first_rank():
             print("fracsim: interrupted before the first step; nothing was written", file=sys.stderr, flush=True)
         return code if isinstance(code, int) else Exit.DONE
     except (SystemExit, Exception) as error:
         code, message = _verdict(error)
         # what ends a run by rule may come late from rank 0, which first writes a summary and draws the last frame
         _end_others(message, code, late=isinstance(error, NotConverged | Stopped))
-    if message and _is_root():
+    if message and is_first_rank():
         print(message, file=sys.stderr, flush=True)
     return code
 
@@ -310,10 +324,16 @@ def _verdict(error: BaseException) -> tuple[int, str]:
         return (error.code or 0, "") if isinstance(error.code, int | None) else (1, str(error.code))
     if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
         where = f" {error.filename}" if error.filename else ""
-        return int(
-            Exit.CANNOT_WRITE
-        ), f"fracsim: cannot write{where}: {error.strerror}; make room or give another --out"
+        words = f"cannot write{where}: {error.strerror}; make room or give another --out"
+        return int(Exit.CANNOT_WRITE), f"fracsim: {FracsimError(words)}"
+    if isinstance(error, OSError) and error.errno in _BAD_PATH and _is_of_user(error.filename):
+        return int(Exit.BAD_INPUT), f"fracsim: {FracsimError(f'{error.filename}: {error.strerror}; give another path')}"
     return 1, "".join(traceback.format_exception(error)).rstrip()
+
+
+def _is_of_user(path: object) -> bool:
+    """Whether a path is none of the program itself."""
+    return bool(path) and not str(path).startswith((sys.prefix, str(Path(__file__).parent)))
 
 
 def _end_others(message: str, code: int, *, late: bool) -> None:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from enum import IntEnum
 
 LONGEST = 1000  # characters of a message
+
+# What ends a run with a checkpoint. SIGHUP: its terminal was closed; SIGXCPU: its limit of processor time is reached.
+STOP_SIGNALS = (
+    signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU,
+)  # fmt: skip
 
 
 class Exit(IntEnum):

@@ -1,18 +1,158 @@
-"""How the process of a command begins and ends: what no run needs is not imported, and nothing is taken apart that goes
-with the process anyway. A tenth of what a small job takes, or less."""
+"""How the process of a command begins and ends.
+
+What no run needs is not imported, and nothing is taken apart that goes with the process anyway: a tenth of what a small
+job takes, or less. Standard streams that are closed, or that nobody reads any more, do not end a command. Signals are
+heeded from the first moment of a run, and a crash ends the process.
+"""
 
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import importlib
+import io
 import os
+import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import ModuleType
-from typing import Any, NoReturn
+from types import FrameType, ModuleType
+from typing import Any, NoReturn, TextIO
+
+from .errors import STOP_SIGNALS, Exit, InputError
+
+INTERRUPTED = 130  # as typer and shells report SIGINT
+_READER_GONE = (errno.EPIPE, errno.EIO)  # EIO: of a terminal that was closed
+_FIRST_RANK_SPEAKS = 0.3  # s that other ranks wait before they end: the launcher ends all ranks with the first
+
+
+# --- its start ---
+
+
+def begin_process() -> None:
+    """Prepare the process of a command line: streams, home folder, signals. Raises InputError."""
+    global _own
+    _own = True
+    runs = sys.argv[1:2] == ["run"]
+    _open_streams(None if runs else _READER_GONE)
+    if runs:
+        for number in STOP_SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # ignored: by nohup
+                signal.signal(number, _end_before_the_run)
+    _check_surroundings()
+
+
+_own = False  # whether this process was started as a command line
+_run_begun = False
+
+
+def _open_streams(dropped: tuple[int, ...] | None) -> None:
+    """Open standard streams that are closed, on nothing: files of the run would take their numbers. `dropped`: numbers
+    of errors after which output is dropped; None: all, for a run is worth more than the words about it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    sys.stdout = _open_stream(sys.stdout, 1, dropped)
+    sys.stderr = _open_stream(sys.stderr, 2, None)
+
+
+def _open_stream(stream: TextIO | None, number: int, dropped: tuple[int, ...] | None) -> TextIO:
+    if stream is None:
+        return open(os.devnull, "w", encoding="utf-8")
+    return _Stream(stream, number, dropped) if isinstance(stream, io.TextIOWrapper) else stream
+
+
+class _Stream(io.TextIOWrapper):
+    """A standard stream whose text is dropped once it cannot be written: a command whose reader has gone goes on."""
+
+    def __init__(self, stream: io.TextIOWrapper, number: int, dropped: tuple[int, ...] | None) -> None:
+        """`number`: of its descriptor; `dropped`: numbers of errors after which text is dropped; None: all."""
+        buffered = stream.line_buffering
+        super().__init__(stream.buffer, stream.encoding, "backslashreplace", line_buffering=buffered)
+        self._number, self._dropped = number, dropped
+
+    def write(self, text: str) -> int:
+        """Write text; returns its length."""
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._drop(error)
+            return len(text)
+
+    def flush(self) -> None:
+        """Hand on what is buffered."""
+        try:
+            super().flush()
+        except OSError as error:
+            self._drop(error)
+
+    def _drop(self, error: OSError) -> None:
+        if self._dropped is not None and error.errno not in self._dropped:
+            raise error
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, self._number)
+        os.close(nothing)
+        super().flush()  # what is still buffered
+
+
+def _check_surroundings() -> None:
+    """Raises InputError where the working folder is gone, or where there is no home folder for compiled kernels."""
+    try:
+        os.getcwd()
+    except OSError:
+        raise InputError("the working folder has been deleted: change to another one, for example with cd ~") from None
+    if not os.environ.get("HOME"):  # MPI refuses to start
+        try:
+            import pwd
+
+            os.environ["HOME"] = pwd.getpwuid(os.getuid()).pw_dir
+        except (ImportError, KeyError):
+            raise InputError(
+                "HOME is not set, and the system knows no home folder of this user: set HOME to a folder that the user "
+                "may write to, for example HOME=$PWD; compiled kernels are kept there"
+            ) from None
+
+
+def _end_before_the_run(number: int, frame: FrameType | None) -> None:
+    """Ends the process: imports are under way, and nothing has been written."""
+    if _run_begun:
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+        return
+    if is_first_rank():
+        why = "interrupted" if number == signal.SIGINT else f"stopped by signal {signal.Signals(number).name}"
+        os.write(2, f"fracsim: {why} before the first step; nothing was written\n".encode())
+    else:
+        time.sleep(_FIRST_RANK_SPEAKS)
+    os._exit(INTERRUPTED if number == signal.SIGINT else Exit.STOPPED)
+
+
+def is_first_rank() -> bool:
+    """Whether this process is rank 0, without starting MPI."""
+    return all(os.environ.get(name, "0") == "0" for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK"))
+
+
+def begin_run() -> None:
+    """The run takes over: it heeds signals itself, and a crash ends the process at once, telling where."""
+    global _run_begun
+    if not _own:
+        return
+    import faulthandler
+
+    from petsc4py import PETSc
+
+    PETSc.Sys.popSignalHandler()  # it calls MPI_Abort, which may hang in a process that has crashed
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
+    faulthandler.enable()
+    _run_begun = True
+
+
+# --- imports ---
 
 
 @contextmanager

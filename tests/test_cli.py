@@ -199,7 +199,7 @@ def test_render_needs_a_run(tmp_path: Path) -> None:
         (["run"], "Missing argument 'STUDY.toml'"),
         (["run", "loaf", "--frob"], "No such option: --frob"),
         (["run", "loaf", "--wall-limit", "soon"], "Invalid value for '--wall-limit'"),
-        (["run", "loaf", "--wall-limit", "-5"], "Invalid value for '--wall-limit'"),
+        (["run", "loaf", "--wall-limit", "-5"], "--wall-limit -5: must be a number of seconds, 0 or more"),
         (["check", "loaf", "more"], "Got unexpected extra argument (more)"),
         (["check", "loaf", "--set"], "Option '--set' requires an argument"),
         (["mesh", "loaf"], "Missing option '-o' / '--out'"),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from cases import BAR, write_study
+from cases import BAR, command, fracsim, write_study
 
 
 def process(code: str) -> subprocess.CompletedProcess[str]:
@@ -54,3 +55,67 @@ leave(3)
     # a thread is waited for by the interpreter, which is gone by the time that it finalises MPI
     assert said == (["said", "thread", "end"] if thread else ["said", "end", "finalised"])
     assert result.stderr == ""
+
+
+def shell(line: str, *arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A line of the shell with `$run` for a run that takes `arguments`."""
+    run = " ".join(map(str, command("run", *arguments)))
+    known = {name: value for name, value in os.environ.items() if name != "HOME" or "HOME" not in environment}
+    return subprocess.run(
+        ["bash", "-c", line.replace("$run", run)], capture_output=True, text=True, timeout=60, check=False,
+        env=known | {name: value for name, value in environment.items() if value},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("streams", ["2>&1 | true", ">&- 2>&- <&-", "> /dev/full 2>&1"])
+def test_a_run_goes_on_where_nobody_reads_what_it_says(tmp_path: Path, streams: str) -> None:
+    """Its reader has gone, its streams are closed, or its log is full: the run comes to its end all the same, and no
+    file of it takes the place of a stream (bash: the exit codes of all commands of a line)."""
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    done = shell(f"$run {streams}; echo ${{PIPESTATUS[0]}}", bar, "-o", out)
+    assert done.stdout.split() == ["0"] and done.stderr == ""
+    rows = (out / "history.csv").read_text().splitlines()
+    assert len(rows) == 4 and all(len(row.split(",")) == len(rows[0].split(",")) for row in rows)
+
+
+def test_a_list_that_nobody_reads_ends_quietly() -> None:
+    words = " ".join(command("list"))
+    done = subprocess.run(
+        ["bash", "-c", f"{words} | true; echo ${{PIPESTATUS[0]}}"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.stdout.split() == ["0"] and done.stderr == ""
+
+
+def test_surroundings_that_are_missing(tmp_path: Path) -> None:
+    """The working folder is gone: exit code 2. No HOME: the system knows the user's home folder."""
+    bar = write_study(tmp_path / "bar.toml", BAR)
+    gone = tmp_path / "gone"
+    done = shell(f"mkdir {gone}; cd {gone}; rmdir {gone}; $run", bar, "-o", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "fracsim: the working folder has been deleted: change to another one, for example with cd ~\n"
+    done = shell("$run", bar, "-o", tmp_path / "out", HOME="")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("limit", ["nan", "inf"])
+def test_a_wall_limit_is_a_number_of_seconds(tmp_path: Path, limit: str) -> None:
+    done = fracsim("run", write_study(tmp_path / "bar.toml", BAR), "-o", tmp_path / "out", "--wall-limit", limit)
+    assert done.returncode == 2 and "must be a number of seconds, 0 or more" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_of_300_letters(tmp_path: Path) -> None:
+    """Of folders and files that are written or read: one sentence, exit code 2."""
+    bar, long = write_study(tmp_path / "bar.toml", BAR), tmp_path / ("a" * 300)
+    for arguments in (
+        ("run", bar, "-o", long),
+        ("sweep", bar, "--set", "time.end=0.01,0.02", "-o", long),
+        ("render", long),
+        ("report", long),
+        ("export", long, "--format", "ply"),
+        ("mesh", bar, "-o", f"{long}.vtu"),
+    ):
+        done = fracsim(*arguments)
+        assert done.returncode == 2, (arguments[0], done.stderr)
+        assert done.stderr.startswith("fracsim: ") and done.stderr.count("\n") == 1 and "too long" in done.stderr
