@@ -207,6 +207,8 @@ def sweep(
     ] = False,
 ) -> None:
     """Run a study once for each combination of values; goes on where it was left."""
+    if list_ and not _is_root():
+        return
     from .report.sweep import run_sweep
     from .study.file import find_study
 

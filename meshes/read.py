@@ -1,4 +1,4 @@
-"""A mesh from file: Gmsh's own format through gmsh, everything else through meshio."""
+"""A mesh from file: Gmsh's own format through gmsh, OBJ by `obj`, everything else through meshio."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 from .contents import Block, Contents
 from .data import Indices, MeshData, MeshError
 from .gmsh_session import session
+from .obj import read_obj
 
 # Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
 TAG_ARRAYS = (
@@ -139,7 +140,9 @@ def _meshio_mesh(path: Path) -> Any:
     said = io.StringIO()
     try:
         with _quiet(said):
-            return meshio.read(path)
+            return read_obj(path) if path.suffix.lower() == ".obj" else meshio.read(path)
+    except MeshError:
+        raise
     except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit
         reason = "" if isinstance(error, SystemExit) else str(error)
         reason = " ".join((reason or said.getvalue()).split()) or type(error).__name__

@@ -16,6 +16,7 @@ import pytest
 from fracsim.meshes import BUILDERS, MeshError
 from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.quality import mesh_quality
+from fracsim.meshes.read import read_contents
 from fracsim.meshes.surfaces.closed import closed_surface, read_surface
 from fracsim.meshes.surfaces.fill import expected_cells, fill_closed, fill_surface
 from fracsim.meshes.timed import within
@@ -89,6 +90,65 @@ def test_quads_are_cut(tmp_path: Path) -> None:
     (tmp_path / "cube.obj").write_text(corners + "".join(f"f {quad}\n" for quad in quads))
     mesh = fill_surface(tmp_path / "cube.obj", h=0.4)
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1.0, rel=1e-6)
+
+
+QUADS = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"]  # of a box, outwards
+
+
+def obj_of_a_box(style: str) -> str:
+    """A box of 0.06 x 0.04 x 0.02 as different programs write it."""
+    corners = [(0.06 * x, 0.04 * y, 0.02 * z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    points = [f"v {x} {y} {z}" for x, y, z in corners]
+    faces = [[int(word) for word in quad.split()] for quad in QUADS]
+    if style == "from the end":
+        return "\n".join([*points, *(f"f {' '.join(str(k - 9) for k in face)}" for face in faces)])
+    if style == "face by face":  # each with points of its own, and others after it
+        return "\n".join("\n".join([*(points[k - 1] for k in face), "g side", "f -4 -3 -2 -1"]) for face in faces)
+    if style == "normals and textures":
+        lines = ["# Blender", "mtllib it.mtl", "o Box", *points, "vn 0 0 1", "vt 0 0", "vt 1 1", "s off", "usemtl none"]
+        return "\n".join([*lines, *("f " + " ".join(f"{k - 9}/-1/-1" for k in face) for face in faces)])
+    if style == "colours":
+        return "\n".join([*(f"{point} 0.8 0.8 0.8" for point in points), *("f " + quad for quad in QUADS)])
+    return "\n".join([*points, *(f"f {a} {b} \\\n  {c} {d} # side" for a, b, c, d in faces)])
+
+
+@pytest.mark.parametrize("style", ["from the end", "face by face", "normals and textures", "colours", "lines go on"])
+def test_obj_of_other_programs(tmp_path: Path, style: str) -> None:
+    """Volume and area of the box; the corners of its faces as VTK's reader has them."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOGeometry import vtkOBJReader
+
+    path = tmp_path / "box.obj"
+    path.write_text(obj_of_a_box(style))
+    surface = read_surface(path)
+    assert surface.volume == pytest.approx(4.8e-5, rel=1e-12) and surface.area == pytest.approx(8.8e-3, rel=1e-12)
+    assert surface.notes == () and len(surface.triangles) == 12
+    if style in ("colours", "lines go on"):  # VTK knows neither
+        return
+    reader = vtkOBJReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    theirs, contents = reader.GetOutput(), read_contents(path)
+    points = vtk_to_numpy(theirs.GetPoints().GetData())
+    for number, face in enumerate(face for block in contents.blocks for face in block.nodes):
+        cell = theirs.GetCell(number)
+        corners = points[[cell.GetPointId(i) for i in range(cell.GetNumberOfPoints())]]
+        np.testing.assert_allclose(contents.points[face], corners, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("v 0 0 0\nv 1 0 0\nf -1 -2 -3", r"box\.obj', line 3: `f -1 -2 -3` does not name points that are there before"),
+        ("v 0 0 0\nv 1 0 0\n\nf 1 0 2", r"box\.obj', line 4: `f 1 0 2` does not name points"),
+        ("v 0 0 0\nv 1 0\n", r"box\.obj', line 2: `v 1 0` does not name three coordinates: v 0 0\.5 1"),
+        ("v 0 0 0\nf 1 2 3\nv 1 0 0\nv 0 1 0\nf 2 3 4", r"box\.obj', line 5: there is no point 4, but 3 in all"),
+    ],
+)
+def test_lines_of_an_obj_that_are_wrong(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "box.obj").write_text(text)
+    with pytest.raises(MeshError, match=message):
+        read_surface(tmp_path / "box.obj")
 
 
 @pytest.mark.parametrize(

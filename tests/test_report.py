@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -175,6 +176,21 @@ def test_what_cannot_be_reported(runs: Path, arguments: tuple[str, ...], words: 
     names = ("nothing", "empty", "strip", "bad.csv", "other.csv", "page.pdf")
     done = fracsim("report", *(runs / name if name in names else name for name in arguments))
     assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_folder_of_a_job_array_is_that_of_a_sweep(runs: Path, tmp_path: Path) -> None:
+    """A job array leaves no sweep.csv: cases go by their names, numbers by value; what is no run is left out."""
+    order = ["h-0.5_step-1e-3", "h-0.5_step-0.01", "h-2_step-0.01", "h-10_step-0.01"]
+    for name in sorted(order):
+        shutil.copytree(runs / "strip", tmp_path / "array" / name)
+    (tmp_path / "array" / "logs").mkdir()
+    assert [run.folder.name for run in find_runs([tmp_path / "array"])] == order
+    swept = {run.folder: run.name for run in find_runs([runs / "sweep"])}
+    (runs / "sweep" / "sweep.csv").rename(tmp_path / "sweep.csv")
+    try:
+        assert {run.folder: run.name for run in find_runs([runs / "sweep"])} == swept
+    finally:
+        (tmp_path / "sweep.csv").rename(runs / "sweep" / "sweep.csv")
 
 
 @pytest.mark.usefixtures("undrawn")

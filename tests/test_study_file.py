@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
+import tomli_w
+from pydantic import BaseModel
 
 from cases import BAR, STRIP, changed, study, write_study
 from fracsim.errors import InputError
 from fracsim.studies import folder
 from fracsim.study import Study
-from fracsim.study.file import load_study, study_text, validate
+from fracsim.study.file import find_study, load_study, study_text, validate
 from fracsim.study.mesh_source import find_builder
 
 Data = dict[str, Any]
@@ -159,3 +162,48 @@ def test_mesh_files_are_looked_for_beside_the_study(tmp_path: Path, monkeypatch:
     assert load_study(Path("../study.toml")).mesh.file == tmp_path / "part.msh"
     # what is given on the command line is looked for where the command is given
     assert load_study(Path("../study.toml"), ["mesh.file=other.msh"]).mesh.file == Path("other.msh").resolve()
+
+
+def paths_of(kind: Any, name: str = "") -> Iterator[str]:
+    """Keys of a table and of those in it that are paths, by the types that the schema gives."""
+    for key, field in kind.model_fields.items():
+        whole, todo = f"{name}.{key}" if name else key, [field.annotation]
+        while todo:
+            if (each := todo.pop()) is Path:
+                yield whole
+            elif isinstance(each, type) and issubclass(each, BaseModel):
+                yield from paths_of(each, whole)
+            todo += get_args(each)
+
+
+def test_every_path_is_looked_for_beside_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All keys of the schema that hold a path; the file that is read is the one beside the study."""
+    keys = sorted(set(paths_of(Study)))
+    assert keys == ["mesh.file", "mesh.outline", "mesh.shell", "mesh.surface", "obstacle.file"]
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for key in keys:
+        table, last = key.split(".")
+        given: dict[str, Any] = {"title": "x", "material": {"young": 1, "poisson": 0, "density": 1}}
+        given |= {"time": {"step": 1, "end": 1}, "mesh": {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 1.0}}
+        if table == "mesh":
+            given["mesh"] = {last: "part"}
+            given["time"]["scheme"] = "rigid" if last == "shell" else "newmark"
+        else:
+            given["obstacle"] = [{"name": "it", "shape": "mesh", "at": [0.0, 0.0, 9.0], last: "part"}]
+        (tmp_path / "study.toml").write_text(tomli_w.dumps(given))
+        loaded = load_study(Path("../study.toml"))
+        found = loaded.mesh if table == "mesh" else loaded.obstacle[0]
+        assert getattr(found, last) == tmp_path / "part", key
+
+
+def test_a_folder_is_not_the_packaged_study_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`run bar-2d -o bar-2d` makes a folder of that name; a file of that name is what was meant."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bar-2d").mkdir()
+    packaged = find_study("bar-2d")
+    assert packaged.is_file() and packaged.name == "bar-2d.toml" and load_study("bar-2d").title.startswith("A 2D bar")
+    (tmp_path / "loaf").write_text("title = 1")
+    assert find_study("loaf") == Path("loaf")
+    for name in ("there/is/none", "nothing"):
+        assert find_study(name) == Path(name)

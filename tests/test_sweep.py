@@ -15,6 +15,7 @@ import pytest
 
 from cases import BAR, command, fracsim, fracsim_here, mpirun, swept_here, write_study
 from fracsim.errors import InputError
+from fracsim.report import sweep
 from fracsim.report.exit_status import last_words
 from fracsim.report.sweep import combinations, name_of, split_list
 
@@ -142,6 +143,34 @@ def test_the_list_has_a_whole_command_a_line(tmp_path: Path) -> None:
     assert words[:2] == ["fracsim", "run"] and words[-1] == str(out / "h-0.25_step-0.015")
     assert fracsim(*words[1:]).returncode == 0
     assert json.loads((out / "h-0.25_step-0.015" / "summary.json").read_text())["steps"] == 2
+
+
+def test_the_list_of_a_sweep_that_is_done_does_nothing(tmp_path: Path) -> None:
+    """Each line by a shell, as a job array does, leaves what is there as it is; lines keep their numbers."""
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out of the way"
+    keys = ("--set", "mesh.h=0.25", "--set", "time.step=0.01,0.015")
+    assert swept_here(bar, *keys, "-o", out).returncode == 0
+    (out / "h-0.25_step-0.015" / "summary.json").unlink()
+    lines = fracsim("sweep", bar, *keys, "-o", out, "--list").stdout.splitlines()
+    assert len(lines) == 2 and lines[1].startswith("fracsim run")
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    assert subprocess.run(lines[0], shell=True, check=True, capture_output=True).stdout == b""
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+@pytest.mark.parametrize("name", ["PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE"])
+def test_the_list_needs_no_clean_environment(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a job of Slurm these are there without mpirun. The first process lists, the others say nothing; one process
+    alone may sweep, and its runs do not see them."""
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    monkeypatch.setenv(name, "0" if name == "PMIX_RANK" else "1")
+    assert "PMI" not in " ".join(sweep._environment()) and "OMPI_COMM" not in " ".join(sweep._environment())
+    sweep._refuse_mpirun()
+    monkeypatch.setenv(name, "1" if name == "PMIX_RANK" else "4")
+    listed = fracsim("sweep", bar, *KEYS, "-o", out, "--list")
+    assert listed.returncode == 0 and len(listed.stdout.splitlines()) == (0 if name == "PMIX_RANK" else 4)
+    with pytest.raises(InputError, match="call it without mpirun"):
+        sweep._refuse_mpirun()
 
 
 def test_a_stopped_sweep_goes_on_from_its_checkpoint(tmp_path: Path) -> None:

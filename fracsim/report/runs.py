@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -79,24 +80,34 @@ def is_run(folder: Path) -> bool:
 
 
 def find_runs(folders: list[Path]) -> list[RunData]:
-    """Runs of the folders given, those of a sweep's folder one by one. InputError for a folder that is neither."""
+    """Runs of the folders given, those of a sweep's folder or of a job array's one by one. InputError for a folder
+    without any."""
     found: list[Path] = []
     for folder in folders:
         inner = [path for path in _cases(folder) if is_run(path)]
         if not inner and not is_run(folder):
-            problem = "there is no such folder" if not folder.is_dir() else "it has no study.toml with a history.csv"
+            missing = "it has no study.toml with a history.csv, and no folder in it has"
+            problem = missing if folder.is_dir() else "there is no such folder"
             raise InputError(f"{folder} is not the output folder of a run, a sweep or of evidence: {problem}")
         found += inner or [folder]
     return [read_run(path, name) for path, name in zip(found, _names(found), strict=True)]
 
 
 def _cases(folder: Path) -> list[Path]:
-    """Folders of a sweep, in its order; none where there was no sweep."""
+    """Folders of a sweep, in its order; where a job array ran it there is no table, and folders go by their names."""
     table = folder / "sweep.csv"
-    if not table.is_file():
+    if table.is_file():
+        with table.open(newline="", encoding="utf-8") as file:
+            return [folder / row["case"] for row in csv.DictReader(file) if row.get("case")]
+    if is_run(folder) or not folder.is_dir():
         return []
-    with table.open(newline="", encoding="utf-8") as file:
-        return [folder / row["case"] for row in csv.DictReader(file) if row.get("case")]
+    return sorted((path for path in folder.iterdir() if path.is_dir()), key=_by_number)
+
+
+def _by_number(path: Path) -> list[tuple[float, str]]:
+    """A name by its parts, numbers by their value: h-0.02 before h-0.1, step-1e-3 before step-0.01."""
+    parts = re.split(r"(\d+(?:\.\d*)?(?:e[+-]?\d+)?)", path.name)
+    return [(float(part), "") if part[:1].isdigit() else (0.0, part) for part in parts]
 
 
 def _names(folders: list[Path]) -> list[str]:

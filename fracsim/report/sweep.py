@@ -45,15 +45,15 @@ def run_sweep(
     """Run what has not ended well yet, one run after the other; or print the commands. Raises NotConverged at the end
     where a run failed. `study` is what the user called it, `path` where it is; `overwrite`: runs of another study that
     have not ended may be thrown away."""
-    _refuse_mpirun()
+    if not only_list:
+        _refuse_mpirun()
     cases = combinations(sets, out)
     studies = [_validated(path, case) for case in cases]
     for case, text in zip(cases, studies, strict=True):
         _check_folder(case, text, path, overwrite)
     if only_list:
         for case, text in zip(cases, studies, strict=True):
-            how = "restart" if _state(case, text) == "begun" else "overwrite" if overwrite else ""
-            print(shlex.join(command(study, case, ranks, how)))
+            print(shlex.join(_listed(study, case, text, ranks, overwrite=overwrite)))
         return
     outcomes = {}
     for number, (case, text) in enumerate(zip(cases, studies, strict=True), 1):
@@ -156,7 +156,10 @@ def _check_folder(case: Case, study: str, path: Path, overwrite: bool) -> None:
 
 
 def _refuse_mpirun() -> None:
-    if any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK")):
+    """InputError where this process is one of several; one alone may have the variables of a launcher, as in a shell
+    that srun has started."""
+    sizes = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", *(["SLURM_STEP_NUM_TASKS"] if "PMIX_RANK" in os.environ else [])]
+    if any(os.environ.get(name, "1") != "1" for name in sizes) or os.environ.get("PMIX_RANK", "0") != "0":
         raise InputError("a sweep starts its runs itself: call it without mpirun and say how many ranks with --ranks")
 
 
@@ -170,6 +173,20 @@ def command(study: str, case: Case, ranks: int, how: str = "") -> list[str]:
         work += ["--set", override]
     work += ["-o", str(case.folder), *([f"--{how}"] if how else [])]
     return work if ranks == 1 else ["mpirun", "-n", str(ranks), *work]
+
+
+def _listed(study: str, case: Case, text: str, ranks: int, *, overwrite: bool) -> list[str]:
+    """The line of a case for a job array. A case that is done has one that does nothing: numbers of lines stay."""
+    state = _state(case, text)
+    if state == "done":
+        return ["true", f"{case.folder}: done before"]
+    return command(study, case, ranks, "restart" if state == "begun" else "overwrite" if overwrite else "")
+
+
+def _environment() -> dict[str, str]:
+    """The environment of a run, without the variables by which a launcher tells this process which rank it is."""
+    heads = ("PMI_", "PMIX_", "OMPI_COMM_WORLD_")
+    return {name: value for name, value in os.environ.items() if not name.startswith(heads)}
 
 
 def _state(case: Case, study: str) -> str:
@@ -206,7 +223,7 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
     log, work = case.folder / "log.txt", command(study, case, ranks, "restart" if state == "begun" else "overwrite")
     with log.open("w") as file, _forwarding() as forward:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
-        process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True)
+        process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True, env=_environment())
         forward.append(process)
         code = process.wait()
     if forward[1:]:

@@ -10,24 +10,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from ..errors import InputError
 from ..studies import folder as packaged_studies
-from . import Study
+from . import Mesh, Obstacle, Study
 from .explain import explain
 from .mesh_source import find_builder
 
+_PATHS: dict[type[BaseModel], list[str]] = {
+    kind: [key for key, field in kind.model_fields.items() if field.annotation == Path | None]
+    for kind in (Mesh, Obstacle)
+}
 _TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or so"
 
 
 def find_study(name: str) -> Path:
     """A path as it is, or the file of the packaged study of that name."""
     path = Path(name)
-    if os.path.exists(path):  # unlike Path.exists it does not mind a name that is too long
-        return path
     packaged = packaged_studies() / (name if name.endswith(".toml") else f"{name}.toml")
-    return packaged if os.path.exists(packaged) and path.parent == Path() else path
+    # os.path.isfile, unlike Path.is_file, does not mind a name that is too long; `-o bar-2d` makes a folder bar-2d
+    named = os.path.isfile(path) or path.parent != Path() or not os.path.isfile(packaged)
+    return path if named else packaged
 
 
 def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:
@@ -108,10 +112,11 @@ def _anchor(data: dict[str, Any], folder: Path) -> None:
     """Files of the body and of obstacles are looked for beside the study file (those given with --set: in the working
     folder)."""
     obstacles = data.get("obstacle")
-    tables = [("mesh", data.get("mesh"))]
-    tables += [(f"obstacle.{i}", each) for i, each in enumerate(obstacles if isinstance(obstacles, list) else [])]
-    for name, table in tables:
-        for key in ("file", "surface", "outline"):
+    entries = obstacles if isinstance(obstacles, list) else []
+    tables: list[tuple[str, type[BaseModel], Any]] = [("mesh", Mesh, data.get("mesh"))]
+    tables += [(f"obstacle.{i}", Obstacle, each) for i, each in enumerate(entries)]
+    for name, kind, table in tables:
+        for key in _PATHS[kind]:
             if isinstance(table, dict) and isinstance(table.get(key), str):
                 if not table[key].isprintable():
                     raise InputError(f"{name}.{key} = {table[key]!a}: a path has no control characters")
