@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ import numpy as np
 from .contents import Block, Contents
 from .data import Indices, MeshData, MeshError
 from .gmsh_session import session
+from .meshio_reader import meshio_mesh
 from .obj import read_obj
+from .plain_files import wrong_with
 
 # Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
 TAG_ARRAYS = (
@@ -51,8 +54,8 @@ def read_contents(path: Path) -> Contents:
     Raises:
         MeshError: the file is missing, of unknown kind or damaged.
     """
-    if not path.is_file():
-        raise MeshError(f"Mesh file '{path}' {'is a folder' if path.is_dir() else 'does not exist'}.")
+    if wrong := wrong_with(path):
+        raise MeshError(f"Mesh file '{path}' {wrong}.")
     if path.stat().st_size == 0:
         raise MeshError(f"Mesh file '{path}' is empty.")
     version = _gmsh_version(path)
@@ -62,11 +65,22 @@ def read_contents(path: Path) -> Contents:
 
 
 def _gmsh_version(path: Path) -> int:
-    """Major version of Gmsh's own format; 0 for any other file."""
+    """Major version of Gmsh's own format; 0 for any other file. MeshError for a .msh that is none.
+
+    What does not begin as a mesh, gmsh takes for a script and runs, its shell commands too.
+    """
     if path.suffix.lower() != ".msh":
         return 0
     with path.open("rb") as file:
-        _, found, rest = file.read(65536).partition(b"$MeshFormat")
+        head = file.read(65536)
+    if not head.startswith((b"$MeshFormat", b"$Comments")):
+        if head.lstrip()[:1] == b"(":
+            return 0  # of ANSYS Fluent
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: it is no mesh of Gmsh, for it begins with {head[:16]!a}, not with "
+            "$MeshFormat. Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`."
+        )
+    _, found, rest = head.partition(b"$MeshFormat")
     return int(rest.split(maxsplit=1)[0].split(b".")[0]) if found and rest.split(maxsplit=1)[0][:1].isdigit() else 0
 
 
@@ -80,8 +94,11 @@ GMSH_SHAPES |= {"Quadrilateral": "quad", "Hexahedron": "hexahedron", "Prism": "w
 
 def _read_with_gmsh(path: Path) -> Contents:
     try:
-        with session() as gmsh:
-            gmsh.merge(str(path))
+        # by a name of its own: of part.msh.opt beside part.msh gmsh would run the commands
+        with TemporaryDirectory() as folder, session() as gmsh:
+            linked = Path(folder) / "mesh.msh"
+            linked.symlink_to(path.resolve())
+            gmsh.merge(str(linked))
             return _contents_of_model(gmsh)
     except MeshError as error:
         raise MeshError(f"Mesh file '{path}' could not be read: {error}") from error
@@ -140,7 +157,7 @@ def _meshio_mesh(path: Path) -> Any:
     said = io.StringIO()
     try:
         with _quiet(said):
-            return read_obj(path) if path.suffix.lower() == ".obj" else meshio.read(path)
+            return read_obj(path) if path.suffix.lower() == ".obj" else meshio_mesh(path)
     except MeshError:
         raise
     except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit

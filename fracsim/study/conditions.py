@@ -21,6 +21,7 @@ from ..mesh.places import Group, InBox, OnPlane, Place
 from ..meshes.words import AXES
 from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, Time, TimeTable
 from .breaking import Crack as CrackTable
+from .mesh_source import check_file
 
 Flags = npt.NDArray[np.bool_]
 
@@ -206,8 +207,8 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: fl
 def _check_file(entry: Obstacle, dim: int, key: str) -> None:
     if dim == 2:
         raise InputError(f'{key}.shape = "mesh": a 2D mesh has none; choose "box", "sphere", "capsule" or "plane"')
-    if entry.file is None or not entry.file.is_file():
-        raise InputError(f'{key}.file = "{entry.file}": there is no such file')
+    assert entry.file is not None  # the schema sees to it
+    check_file(entry.file, f"{key}.file")
 
 
 def _loose(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: float) -> Loose:

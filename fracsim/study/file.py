@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from ..errors import InputError
+from ..meshes.plain_files import MISSING, wrong_with
 from ..studies import folder as packaged_studies
 from . import Mesh, Obstacle, Study
 from .explain import explain
@@ -83,10 +84,12 @@ def _builder_parameters(study: Study) -> dict[str, Any]:
 
 
 def _parse(path: Path) -> dict[str, Any]:
+    if (wrong := wrong_with(path)) == MISSING:
+        raise InputError(f"there is no study file {path}; `fracsim list` shows those that come with fracsim")
+    if wrong:
+        raise InputError(f"the study file {path} {wrong}")
     try:
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"there is no study file {path}; `fracsim list` shows those that come with fracsim") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the study file {path}: {error}") from None
     try:

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import is_number
+from ..meshes.plain_files import MISSING, wrong_with
 from . import Mesh
 from .explain import explain, unknown_key
 
@@ -87,13 +88,18 @@ def _check_source(mesh: Mesh) -> None:
         if name not in BESIDE[key]:
             known = ", ".join((key, *BESIDE[key]))
             raise InputError(f"mesh.{name} is not a known key beside mesh.{key}; known here: {known}")
-    if not Path(getattr(mesh, key)).is_file():
-        raise InputError(f'mesh.{key} = "{getattr(mesh, key)}": there is no such file')
+    check_file(getattr(mesh, key), f"mesh.{key}")
     for name, meaning in BESIDE[key].items():
         value: Any = mesh.parameters.get(name)
         whole = name != "seed" or isinstance(value, int)
         if (name in mesh.parameters or name in NEEDED) and not (is_number(value) and value > 0 and whole):
             raise InputError(f"mesh.{name} = {value}: {meaning}")
+
+
+def check_file(path: Path, key: str) -> None:
+    """InputError where a study names what is no plain file; `key`: under which."""
+    if wrong := wrong_with(path):
+        raise InputError(f'{key} = "{path}"{": there is no such file" if wrong == MISSING else f" {wrong}"}')
 
 
 def open_surface(mesh: Mesh) -> ClosedSurface | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
 from ..parameters import affordable, positive
+from ..plain_files import wrong_with
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
 from .points import scatter
@@ -63,6 +64,8 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
     Raises:
         MeshError: the file cannot be read, or a polygon has fewer than three corners.
     """
+    if wrong := wrong_with(path):
+        raise MeshError(f"outline file '{path}' {wrong}.")
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

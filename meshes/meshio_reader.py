@@ -1,0 +1,120 @@
+"""meshio on a file of which all that it names has been looked at: data of XDMF and HDF5, *INCLUDE of Abaqus, the second
+file of TetGen."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from .data import MeshError
+from .plain_files import data_elsewhere, is_hdf5, wrong_beside
+
+# as meshio takes it for the keyword: stars do not count
+_INCLUDE = re.compile(r"^[ \t*]*i\**n\**c\**l\**u\**d\**e[ \t*]*(?:,.*)?$", re.IGNORECASE | re.MULTILINE)
+MOST_INCLUDES = 1000  # files of an Abaqus deck
+
+
+def meshio_mesh(path: Path) -> Any:
+    """meshio's mesh. MeshError where the file names one that may not be read; else whatever meshio raises."""
+    import meshio
+
+    ending = path.suffix.lower()
+    if ending in (".xdmf", ".xmf"):
+        return _xdmf_reader(path).read()
+    if ending == ".inp":
+        _check_includes(path)
+    elif ending in (".ele", ".node"):
+        _check(path, path.stem + {".ele": ".node", ".node": ".ele"}[path.suffix.lower()])
+    elif ending == ".msh" and not _begins_as_gmsh(path):
+        with _Ending(path.open("rb", buffering=0)) as file:
+            return meshio.ansys.read(file)
+    elif is_hdf5(path):
+        _check_hdf5(path, path)
+    return meshio.read(path)
+
+
+def _check(path: Path, name: str) -> None:
+    if wrong := wrong_beside(path, name):
+        raise MeshError(f"Mesh file '{path}' could not be read: it names the file '{name}', which {wrong}.")
+
+
+def _check_hdf5(path: Path, h5: Path) -> None:
+    import h5py
+
+    with h5py.File(h5) as file:
+        if name := data_elsewhere(file):
+            raise MeshError(
+                f"Mesh file '{path}' could not be read: the data of '{name}' in {h5.name} lie in another file; save "
+                "all in one."
+            )
+
+
+def _xdmf_reader(path: Path) -> Any:
+    """A reader of meshio's that looks at what each item names before it opens that."""
+    from meshio.xdmf.main import XdmfReader
+
+    looked_at: set[str] = set()
+
+    class Reader(XdmfReader):  # type: ignore[misc]
+        def _read_data_item(self, item: Any, root: Any = None) -> Any:
+            named = "Reference" not in item.attrib and item.get("Format") in ("HDF", "Binary")
+            if named and (text := (item.text or "").strip()):
+                name = text.rpartition(":")[0] if item.get("Format") == "HDF" else text
+                if name not in looked_at:
+                    _check(path, name)
+                    if item.get("Format") == "HDF":
+                        _check_hdf5(path, path.parent / name)
+                    looked_at.add(name)
+                if item.get("Format") == "Binary":
+                    item.text = os.path.abspath(path.parent / name)  # meshio looks in the working folder
+            return super()._read_data_item(item, root)
+
+    return Reader(str(path))
+
+
+def _check_includes(deck: Path) -> None:
+    """Of an Abaqus deck and of what it includes, found as meshio finds it: in the working folder, then beside it."""
+    todo, seen = [deck], {deck.resolve()}
+    while todo:
+        path = todo.pop()
+        for line in _INCLUDE.findall(path.read_text(errors="replace")):
+            name = line.split("=")[-1].strip()
+            _check(path, name)
+            beside = path.parent / name
+            if os.path.exists(name) and not os.path.samefile(name, beside):
+                raise MeshError(
+                    f"Mesh file '{path}' could not be read: it names the file '{name}', of which there is one in the "
+                    f"working folder as well: call fracsim from the folder {path.parent.absolute()}."
+                )
+            if (whole := beside.resolve()) in seen:
+                raise MeshError(f"Mesh file '{path}' could not be read: it includes '{name}' a second time.")
+            seen.add(whole)
+            todo.append(beside)
+        if len(seen) > MOST_INCLUDES:
+            raise MeshError(f"Mesh file '{deck}' could not be read: it includes more than {MOST_INCLUDES} files.")
+
+
+def _begins_as_gmsh(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(1) == b"$"
+
+
+class _Ending(io.BufferedReader):
+    """A file that ends with an error where it is read beyond its end twice: meshio's reader of Fluent goes on."""
+
+    _ended = False
+
+    def _checked(self, data: bytes) -> bytes:
+        if not data and self._ended:
+            raise EOFError("it ends in the middle of a section")
+        self._ended = not data
+        return data
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._checked(super().read(size))
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        return self._checked(super().readline(size))
