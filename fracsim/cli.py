@@ -207,7 +207,7 @@ def sweep(
     ] = False,
 ) -> None:
     """Run a study once for each combination of values; goes on where it was left."""
-    if list_ and not _is_root():
+    if list_ and not is_first_rank():
         return
     from .report.sweep import run_sweep
     from .study.file import find_study
