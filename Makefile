@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all readers bench table report report-full gallery lint format clean
+.PHONY: demo test test-all readers paraview bench table report report-full gallery lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -24,7 +24,7 @@ test: readers
 	./env pytest $(parallel) -m "not slow and not ranks"
 	./env pytest -m "not slow and ranks" $(on_ranks)
 
-test-all: readers
+test-all: readers paraview
 	./env pytest $(parallel) -m "not ranks"
 	./env pytest -m ranks $(on_ranks)
 
@@ -33,6 +33,19 @@ readers:
 	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>vtk-reader.lock && flock 8 && test -e vtk-reader/ready || { \
 	    echo "fetching a VTK that reads XDMF (once)" && rm -rf vtk-reader && \
 	    pip install --quiet --no-deps --target vtk-reader vtk==9.7.2 && touch vtk-reader/ready; }'
+
+# Debian's ParaView, for the slow tests that open what is written as users do. It cannot be installed beside Debian's VTK,
+# which has modules of the same names; so it is unpacked beside the venvs, once: 900 MB.
+paraview:
+	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>paraview.lock && flock 8 && test -e paraview/ready || { \
+	    command -v apt-get >/dev/null || { echo "make paraview: there is no apt-get here, which fetches Debian'"'"'s" \
+	        "ParaView; slow tests need it: install ParaView, with pvpython in PATH" >&2; exit 1; }; \
+	    echo "fetching ParaView (once)" && rm -rf paraview && mkdir -p paraview/lists/partial paraview/cache/archives/partial && \
+	    cd paraview && set -- -qq -o Dir::State::Lists="$$PWD/lists" -o Dir::Cache="$$PWD/cache" -o APT::Sandbox::User=root && \
+	    apt-get "$$@" update && \
+	    apt-get "$$@" -s --no-install-recommends install paraview python3-paraview >plan && \
+	    sed -n "s/^Inst \([^ ]*\).*/\1/p" plan | xargs apt-get "$$@" download && \
+	    for package in *.deb; do dpkg-deb -x "$$package" . || exit 1; done && rm -rf *.deb lists cache && touch ready; }'
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json

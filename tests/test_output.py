@@ -21,17 +21,22 @@ from mpi4py import MPI
 
 import xdmf_reader
 from cases import BAR, STRIP, command, study, write_study
+from fracsim.output.surface.vtu import write_vtu
+from fracsim.report.pictures.colouring import select
+from fracsim.report.pictures.shots import Shot, find_frames, load
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from fracsim.study.file import load_study
+from support import vtu
+from support.strained import strained, stress
 
 Values = npt.NDArray[Any]
 COLUMNS = [
     "step", "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
     "newton_its", "krylov_its", "wall_step",
 ]  # fmt: skip
-XDMF_TENSOR = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # of the six components in XDMF's order: xx xy xz yy yz zz
+VTK_TENSOR = (0, 3, 5, 3, 1, 4, 5, 4, 2)  # 3 x 3 of the six components in VTK's order: xx yy zz xy yz xz
 
 
 @dataclass
@@ -148,7 +153,8 @@ def _item(element: ElementTree.Element | None, file: h5py.File) -> Values:
     name, _, path = element.text.partition(":")
     assert name == Path(file.filename).name
     data = file[path]
-    assert element.get("Dimensions") == " ".join(map(str, data.shape))
+    shape = (len(data), 1, 6) if data.shape[1:] == (6,) else data.shape  # a tensor is a matrix of one row
+    assert element.get("Dimensions") == " ".join(map(str, shape))
     assert (element.get("NumberType"), element.get("Precision")) == (
         "Int" if data.dtype.kind == "i" else "Float", str(data.dtype.itemsize),
     )  # fmt: skip
@@ -170,7 +176,7 @@ def test_one_grid_a_time_carries_all_fields(output: Output) -> None:
 def test_fields_agree_with_each_other(output: Output) -> None:
     """von Mises from the stress components; displacement of the gripped end from the study."""
     t, fields = frames_by_hand(output.folder)[-1]
-    s = fields["Cell", "stress"][:, XDMF_TENSOR].reshape(-1, 3, 3)
+    s = fields["Cell", "stress"][:, VTK_TENSOR].reshape(-1, 3, 3)
     deviator = s - np.trace(s, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3
     mises = np.sqrt(1.5 * np.einsum("cij,cij->c", deviator, deviator))
     assert np.allclose(mises, fields["Cell", "von_mises"], rtol=1e-9, atol=1e-9 * mises.max())
@@ -181,22 +187,95 @@ def test_fields_agree_with_each_other(output: Output) -> None:
     assert np.isfinite(np.concatenate([values.ravel() for values in fields.values()])).all()
 
 
-def test_vtk_reads_the_same(output: Output, tmp_path: Path) -> None:
-    script, target = xdmf_reader.__file__, tmp_path / "read.npz"
-    arguments = [sys.executable, script, str(output.folder / "fields.xdmf"), str(target)]
+def read_by_vtk(folder: Path, target: Path) -> dict[str, Values]:
+    """What VTK's reader makes of fields.xdmf."""
+    arguments = [sys.executable, xdmf_reader.__file__, str(folder / "fields.xdmf"), str(target)]
     result = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
     if result.returncode == xdmf_reader.NO_READER:
         pytest.fail("Debian's VTK has no XDMF reader: run `make readers` first, as `make test` does")
     assert (result.returncode, result.stderr) == (0, "")
-    read = np.load(target)
+    with np.load(target) as read:
+        return dict(read)
+
+
+def test_stress_has_the_order_that_vtk_takes(tmp_path: Path) -> None:
+    """Principal stresses by VTK's own filter, of six unlike components, from both files; other orders have others."""
+    folder = tmp_path / "out"
+    strained(folder)
+    wanted = np.linalg.eigvalsh(stress())
+    cells = read_by_vtk(folder, tmp_path / "read.npz")["0/principal/stress"]
+    np.testing.assert_allclose(cells, np.broadcast_to(wanted, cells.shape), rtol=1e-6)  # VTK has them in single
+    grid = vtu.grid(folder / "surface" / "surface_000000.vtu")
+    elements = xdmf_reader.principal_values(grid, "stress")
+    np.testing.assert_allclose(elements, np.broadcast_to(wanted, elements.shape), rtol=1e-6)
+
+
+def make_earlier(folder: Path) -> None:
+    """Give tensors the order that files had before: xx xy xz yy yz zz."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+
+    order = [0, 3, 5, 1, 4, 2]
+    with h5py.File(folder / "fields.h5", "r+") as file:
+        for frame in file["frames"].values():
+            frame["stress"][...] = frame["stress"][()][:, order]
+            del frame["stress"].attrs["components"]
+    for path in (folder / "surface").glob("*.vtu"):
+        grid = vtu.grid(path)
+        values = vtk_to_numpy(grid.GetCellData().GetArray("stress"))[:, order]
+        array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
+        array.SetName("stress")
+        for column, name in enumerate(("xx", "xy", "xz", "yy", "yz", "zz")):
+            array.SetComponentName(column, name)
+        grid.GetCellData().AddArray(array)
+        write_vtu(path, grid)
+
+
+def stresses(folder: Path) -> tuple[list[Values], list[Values]]:
+    """Of every frame: of the cells in fields.h5, and of the elements of the surface with the names of the columns."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    with h5py.File(folder / "fields.h5") as file:
+        cells = [file["frames"][name]["stress"][()] for name in sorted(file["frames"])]
+    arrays = [vtu.grid(path).GetCellData().GetArray("stress") for path in sorted((folder / "surface").glob("*.vtu"))]
+    assert all(
+        [array.GetComponentName(k) for k in range(6)] == ["XX", "YY", "ZZ", "XY", "YZ", "XZ"] for array in arrays
+    )
+    return cells, [vtk_to_numpy(array).copy() for array in arrays]
+
+
+def test_a_restart_does_not_mix_orders_of_tensors(tmp_path: Path) -> None:
+    """Files of an earlier version are put in today's order, all of them; pictures of such files are right as well."""
+    data = study(BAR, output={"fields": ["stress"], "surface": True}, time={"end": 0.04})
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    Run(build_scene(MPI.COMM_SELF, data), whole)()
+    run = Run(build_scene(MPI.COMM_SELF, data), parts)
+    run.write_frame()
+    for _ in range(2):
+        run.step()
+        run.write_frame()
+    run.checkpoint()
+    run.history.close()
+    make_earlier(parts)
+    of_surface, of_mesh = load(find_frames(parts)[2]), load(Shot(0.0, parts / "fields.h5", 2))
+    cells, elements = stresses(whole)
+    scale = np.abs(cells[-1]).max()
+    for grid, wanted in ((of_mesh, cells[2]), (of_surface, elements[2])):
+        shown = grid.cell_data[select(grid, "stress:yy")]
+        np.testing.assert_allclose(shown, wanted[:, 1], atol=1e-6 * scale)
+    Run(build_scene(MPI.COMM_SELF, data), parts, restart=True)()
+    for found, reference in zip(stresses(parts), (cells, elements), strict=True):
+        np.testing.assert_allclose(found, reference, atol=1e-6 * scale)  # all five frames
+
+
+def test_vtk_reads_the_same(output: Output, tmp_path: Path) -> None:
+    read = read_by_vtk(output.folder, tmp_path / "read.npz")
     frames = frames_by_hand(output.folder)
     assert np.allclose(read["times"], [t for t, _ in frames])
     for index, (_, fields) in enumerate(frames):
         for (centre, name), values in fields.items():
             if centre == "Mesh":
                 continue
-            full = values[:, XDMF_TENSOR] if name == "stress" else values
-            assert np.array_equal(read[f"{index}/{centre}/{name}"], full), name
+            assert np.array_equal(read[f"{index}/{centre}/{name}"], values), name
         points = fields["Mesh", "Geometry"]
         assert np.array_equal(read[f"{index}/points"], points)
         assert read[f"{index}/cells"] == len(fields["Mesh", "Topology"])

@@ -21,7 +21,7 @@ BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}
 # a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {
-    "shots": {"output.surface.collection"},
+    "shots": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},
     "colouring": {"output.fields_file"},
     "sweep": {"study.check", "study.file", "output.own_files"},
 }

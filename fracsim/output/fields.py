@@ -15,15 +15,14 @@ from ..forms.kinematics import deformation_gradient, embed, green_strain
 from ..mechanics.kernels import CellExpression
 from ..mechanics.stress import Stress
 from ..stepping.state import State
-from .fields_file import Field
+from .fields_file import TENSOR, Field
 
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking
     from ..mesh.pieces import Pieces
 
 Values = npt.NDArray[np.generic]
-# XDMF's order of a symmetric tensor
-_TENSOR6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_ENTRIES = [("xyz".index(row), "xyz".index(column)) for row, column in TENSOR]
 
 
 class Frames:
@@ -93,7 +92,7 @@ def _kinematics(stress: Stress) -> tuple[Energy, Expr, Expr | None]:
 
 def _tensor(stress: Stress) -> Expr:
     tensor = full_cauchy_stress(*_kinematics(stress))
-    return ufl.as_vector([tensor[i, j] for i, j in _TENSOR6])
+    return ufl.as_vector([tensor[i, j] for i, j in _ENTRIES])
 
 
 def _von_mises(stress: Stress) -> Expr:

@@ -18,9 +18,14 @@ from ..meshes.data import MeshData
 from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text, replacing
 
 Values = npt.NDArray[np.float64]
-TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # components of a symmetric tensor, in XDMF's order
-_KINDS = {1: "Scalar", 3: "Vector", 6: "Tensor6"}
+TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # of a symmetric tensor in VTK's order, as ParaView names it
+EARLIER_TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # the order in files without the attribute COMPONENTS
+COMPONENTS = "components"  # attribute of a symmetric tensor in fields.h5: the names of its columns
+# XDMF's own Tensor6 has another order, by which ParaView's older reader fills 9 columns. A Matrix is read as it lies.
+# It has one row: that reader takes the last dimension for the columns of the array in VTK 9.3, the last two in VTK 9.7.
+_KINDS = {1: "Scalar", 3: "Vector", len(TENSOR): "Matrix"}
 _CELLS = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}  # by their nodes
+_NAMES = np.bytes_(" ".join(TENSOR))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
     '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
@@ -63,12 +68,15 @@ class FieldsFile:
         """The XML of the frames that stay; where some go, a file without them takes the place of the old one."""
         times = read_times(self.h5)
         kept = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
-        if len(kept) < len(times):
-            self._drop_others(kept)
+        with hdf5_there(self.h5) as file:
+            earlier = any(_has_earlier_order(data) for name in kept for data in file["frames"][name].values())
+        if earlier or len(kept) < len(times):
+            self._keep(kept)
         with hdf5_there(self.h5) as file:
             return "".join(self._again(name, file["frames"][name]) for name in kept)
 
-    def _drop_others(self, kept: list[str]) -> None:
+    def _keep(self, kept: list[str]) -> None:
+        """A file of these frames alone takes the place of the file, with tensors in the order of TENSOR."""
         size = self.h5.stat().st_size
         with replacing(self.h5) as new, hdf5_there(self.h5) as old, hdf5_file(new, size, begin=True) as file:
             for name in ("points", "cells"):
@@ -76,6 +84,9 @@ class FieldsFile:
             frames = file.create_group("frames")
             for name in kept:
                 old.copy(old["frames"][name], frames, name)
+                for data in filter(_has_earlier_order, frames[name].values()):
+                    data[...] = read_values(data)
+                    data.attrs[COMPONENTS] = _NAMES
 
     def _again(self, name: str, frame: Any) -> str:
         fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
@@ -92,7 +103,10 @@ class FieldsFile:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
-                frame.create_dataset(field.name, data=field.values).attrs["centre"] = field.centre
+                data = frame.create_dataset(field.name, data=field.values)
+                data.attrs["centre"] = field.centre
+                if is_tensor(field.values):
+                    data.attrs[COMPONENTS] = _NAMES
         append(self.xdmf, (self._grid(name, t, fields) + _TAIL).encode(), over=len(_TAIL))
 
     def _grid(self, name: str, t: float, fields: list[Field]) -> str:
@@ -112,6 +126,8 @@ class FieldsFile:
         shape = field.values.shape
         kind = _KINDS[shape[1] if len(shape) > 1 else 1]
         number = "Int" if field.values.dtype.kind == "i" else "Float"
+        if is_tensor(field.values):
+            shape = (shape[0], 1, shape[1])
         item = self._item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
         head = f'<Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">'
         return f"        {head}{item}</Attribute>\n"
@@ -132,6 +148,26 @@ def read_times(h5: Path) -> dict[str, float]:
             return {name: float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])}
     except (OSError, KeyError, RuntimeError) as error:
         raise InputError(f"--restart: cannot read {h5} ({error}); move it away to go on without its frames") from None
+
+
+def is_tensor(values: Any) -> bool:
+    """Whether an array has the rows of a symmetric tensor."""
+    return len(values.shape) == 2 and values.shape[1] == len(TENSOR)
+
+
+def _has_earlier_order(data: Any) -> bool:
+    return is_tensor(data) and COMPONENTS not in data.attrs
+
+
+def read_values(data: Any) -> npt.NDArray[np.generic]:
+    """The values of a data set of fields.h5, tensors in the order of TENSOR whichever version wrote them."""
+    values: npt.NDArray[np.generic] = data[()]
+    return from_earlier(values) if _has_earlier_order(data) else values
+
+
+def from_earlier(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """(n, 6) symmetric tensors in the order of EARLIER_TENSOR -> in that of TENSOR."""
+    return values[:, [EARLIER_TENSOR.index(name) for name in TENSOR]]
 
 
 def padded(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:

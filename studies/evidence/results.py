@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...output.fields_file import read_values
+
 Values = npt.NDArray[Any]
 
 
@@ -32,7 +34,7 @@ def last_frame(run: Path) -> dict[str, Any]:
 
     with h5py.File(run / "fields.h5") as file:
         frame = file["frames"][max(file["frames"])]
-        found = {name: data[()] for name, data in frame.items()}
+        found = {name: read_values(data) for name, data in frame.items()}
         return {"time": float(frame.attrs["time"]), "points": file["points"][()], "cells": file["cells"][()]} | found
 
 

@@ -35,10 +35,11 @@ def frames(folder: Path) -> list[Drawn]:
 
 def points_of(path: Path) -> npt.NDArray[np.float64]:
     """(n, 3) of a file, m."""
-    return vtk_to_numpy(_grid(path).GetPoints().GetData()).astype(float)
+    return vtk_to_numpy(grid(path).GetPoints().GetData()).astype(float)
 
 
-def _grid(path: Path) -> vtkUnstructuredGrid:
+def grid(path: Path) -> vtkUnstructuredGrid:
+    """A file."""
     reader = vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     reader.Update()
@@ -46,13 +47,13 @@ def _grid(path: Path) -> vtkUnstructuredGrid:
 
 
 def _read(t: float, path: Path) -> Drawn:
-    grid = _grid(path)
-    kind, cells = vtk_to_numpy(grid.GetCellTypesArray()), grid.GetCells()
+    drawn = grid(path)
+    kind, cells = vtk_to_numpy(drawn.GetCellTypesArray()), drawn.GetCells()
     start, corner = vtk_to_numpy(cells.GetOffsetsArray()), vtk_to_numpy(cells.GetConnectivityArray())
 
     def of(which: int, width: int) -> npt.NDArray[np.int64]:
         return corner[start[:-1][kind == which][:, None] + np.arange(width)].astype(np.int64)
 
-    points = vtk_to_numpy(grid.GetPoints().GetData()).astype(float)
-    pieces = len(np.unique(vtk_to_numpy(grid.GetCellData().GetArray("piece"))))
+    points = vtk_to_numpy(drawn.GetPoints().GetData()).astype(float)
+    pieces = len(np.unique(vtk_to_numpy(drawn.GetCellData().GetArray("piece"))))
     return Drawn(t, points, of(LINE, 2), of(TRIANGLE, 3), pieces)

@@ -15,7 +15,7 @@ from ..writing import append, replace_text
 from .collection import Entry, collection_text, read_entries
 from .fragments import Fragments
 from .frame import Frame
-from .vtu import grid_of, grid_of_elements, write_vtu
+from .vtu import grid_of, grid_of_elements, update_vtu, write_vtu
 
 Values = npt.NDArray[np.float64]
 
@@ -37,6 +37,8 @@ class SurfaceFiles:
         rows = self._kept_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
         keep = {entry.file for entry in self._entries}
+        for entry in self._entries:
+            update_vtu(folder / entry.file)
         self._write_pvd()
         replace_text(self._csv, _csv_text([self._columns, *rows]))
         for path in (folder / "surface").glob("*.vtu"):

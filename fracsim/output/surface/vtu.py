@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..fields_file import TENSOR, padded
-from .frame import Frame
+from ..fields_file import EARLIER_TENSOR, TENSOR, from_earlier, padded
+from ..writing import replacing
+
+if TYPE_CHECKING:
+    from .frame import Frame
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.integer]
 
 _TRIANGLE, _LINE = 5, 3  # VTK's numbers
+_HEAD = 1 << 16  # bytes, more than the XML before the data takes
 
 
 def write_vtu(path: Path, grid: Any) -> None:
@@ -43,7 +47,7 @@ def _array(values: npt.NDArray[np.generic], name: str = "") -> Any:
     made = numpy_to_vtk(np.ascontiguousarray(padded(values)), deep=True)
     made.SetName(name)
     for i, axes in enumerate(TENSOR if made.GetNumberOfComponents() == len(TENSOR) else ()):
-        made.SetComponentName(i, axes)  # ParaView would take them for xx yy zz xy yz xz
+        made.SetComponentName(i, axes.upper())  # the names that ParaView gives to six columns, for other programs
     return made
 
 
@@ -79,3 +83,34 @@ def grid_of(frame: Frame) -> Any:
         names.InsertNextValue(origin)
     grid.GetFieldData().AddArray(names)
     return grid
+
+
+def reorder_tensors(grid: Any) -> bool:
+    """Put tensors of a grid of an earlier version, whose columns say their order, in that of TENSOR; whether there were
+    some."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    found = False
+    for data in (grid.GetPointData(), grid.GetCellData()):
+        arrays = [data.GetArray(number) for number in range(data.GetNumberOfArrays())]
+        for array in arrays:
+            names = tuple(array.GetComponentName(number) for number in range(array.GetNumberOfComponents()))
+            if names == EARLIER_TENSOR:
+                data.AddArray(_array(from_earlier(vtk_to_numpy(array)), array.GetName()))  # in place of the old one
+                found = True
+    return found
+
+
+def update_vtu(path: Path) -> None:
+    """Write a file of an earlier version again, with tensors in the order of TENSOR. Raises OSError."""
+    with path.open("rb") as file:
+        if f'ComponentName1="{EARLIER_TENSOR[1]}"'.encode() not in file.read(_HEAD):
+            return
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
+
+    reader = vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    if reorder_tensors(reader.GetOutput()):
+        with replacing(path) as new:
+            write_vtu(new, reader.GetOutput())

@@ -11,7 +11,9 @@ import h5py
 import numpy as np
 
 from ...errors import InputError
+from ...output.fields_file import read_values
 from ...output.surface.collection import Entry, read_entries
+from ...output.surface.vtu import reorder_tensors
 
 KINDS = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # of cells, by their nodes
 
@@ -67,14 +69,16 @@ def load(shot: Shot) -> Any:
     import pyvista
 
     if shot.index < 0:
-        return pyvista.read(shot.file)
+        grid = pyvista.read(shot.file)
+        reorder_tensors(grid)
+        return grid
     with h5py.File(shot.file) as file:
         frame = file["frames"][sorted(file["frames"])[shot.index]]
         cells = file["cells"][()]
         kind = pyvista.CellType[KINDS[cells.shape[1]]]
         grid = pyvista.UnstructuredGrid({kind: cells}, file["points"][()] + frame["displacement"][()])
         for name, data in frame.items():
-            (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = data[()]
+            (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = read_values(data)
     return grid
 
 
