@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..mesh.pieces import Pieces
 
 Values = npt.NDArray[np.generic]
-_ENTRIES = [("xyz".index(row), "xyz".index(column)) for row, column in TENSOR]
+_ENTRIES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENSOR]
 
 
 class Frames:
