@@ -151,6 +151,7 @@ def render(
     from .report.pictures.picture import render
 
     begin_work()
+    _tell_of_runs(outs)
     how = Look(
         colour, explode, view, zoom, skin=look, size=size_of(size), limits=limits_of(limits) if limits else None,
         magnify=magnify, floor=floor, title=title, bare=bare, dust=dust,
@@ -172,6 +173,7 @@ def export(
         return
     from .report.export import export
 
+    _tell_of_runs([out])
     made = export(out, kind, target, frame=frame, dust=dust, look=look)
     print(f"saved {made[0]}" + (f" and {len(made) - 1} more" if len(made) > 1 else ""))
 
@@ -192,6 +194,7 @@ def report(
     from .report.make import make_report
 
     begin_work()
+    _tell_of_runs(outs)
     print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
 
 
@@ -236,6 +239,15 @@ def list_(
         print(heading)
         for name, words in entries.items():
             print(f"  {name:18} {words}")
+
+
+def _tell_of_runs(folders: list[Path]) -> None:
+    """A note on folders in which a run goes on: nobody is to take a part of it for the whole."""
+    from .output.lock import holder
+
+    for folder in folders:
+        if words := holder(folder):
+            print(f"fracsim: note: a run goes on in {folder} ({words}); shown is what it has written", file=sys.stderr)
 
 
 def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Study:

@@ -11,6 +11,7 @@ LONGEST = 1000  # characters of a message
 STOP_SIGNALS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU,
 )  # fmt: skip
+SAME_REQUEST = 1.0  # s after such a signal in which another one is no second request: some senders send it twice
 
 
 class Exit(IntEnum):

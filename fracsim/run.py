@@ -6,6 +6,7 @@ import contextlib
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from .output.folder import OutputClock, check_folder, check_readable, make_folde
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
+from .output.lock import FolderLock, claim
 from .output.progress import Progress
 from .output.summary import Meter, say, write_summary
 from .output.writing import written
@@ -30,6 +32,8 @@ from .study.file import completed, study_text
 from .watched import Watched, wants_surface
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .output.crack_front import CrackFront
 
 FRAMES = 50  # of a run whose study says neither every nor interval
@@ -67,14 +71,20 @@ class Run:
         self._text = study_text(scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
         self._meter = Meter(self.comm, scene.stepper, began)
         stress, by_forces = scene.balance.stress, scene.study.output.cut == "forces"
-        with self.interrupt:
-            on_root(self.comm, lambda: _check(folder, scene.study, self._text, restart=restart, overwrite=overwrite))
-            self.state = scene.start()
-            self.breaks = Breaks(stress, scene.fracture, cut_by_forces=by_forces)
-            notes = self._resume() if restart else None
-            if reason := self.interrupt.signalled():
-                raise Stopped(f"stopped by {reason} while the run was set up; nothing was written")
-            self._prepare(notes)
+        self._lock = FolderLock(folder)
+        check = partial(_check, folder, scene.study, self._text, restart=restart, overwrite=overwrite)
+        try:
+            with self.interrupt:
+                on_root(self.comm, lambda: claim(self._lock, check))
+                self.state = scene.start()
+                self.breaks = Breaks(stress, scene.fracture, cut_by_forces=by_forces)
+                notes = self._resume() if restart else None
+                if reason := self.interrupt.signalled():
+                    raise Stopped(f"stopped by {reason} while the run was set up; nothing was written")
+                self._prepare(notes, check)
+        except BaseException:
+            self._lock.release()
+            raise
 
     def _resume(self) -> Notes:
         """Take up the state of the checkpoint, and what it says beside it."""
@@ -87,8 +97,8 @@ class Run:
             self.state = replace(self.state, dt=scene.study.time.longest)
         return notes
 
-    def _prepare(self, notes: Notes | None) -> None:
-        """Open the output, of a run that goes on where there are notes of it."""
+    def _prepare(self, notes: Notes | None, check: Callable[[], None]) -> None:
+        """Open the output, of a run that goes on where there are notes of it; `check`: that it may be opened."""
         study, restart, folder = self.scene.study, notes is not None, self.folder
         step, t = (self.state.step, self.state.t) if restart else (None, None)
         self.front = self._crack_front()
@@ -96,6 +106,7 @@ class Run:
         columns = history_columns(names)
         if step is not None:
             on_root(self.comm, lambda: check_readable(folder, columns, step))
+        on_root(self.comm, lambda: claim(self._lock, check, make=True))
         self.interrupt.writing = True
         on_root(self.comm, lambda: make_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
@@ -173,6 +184,10 @@ class Run:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged, Stopped or CannotWrite, with where to go
         on from (collective)."""
+        with self._lock:
+            return self._run_and_draw()
+
+    def _run_and_draw(self) -> dict[str, Any]:
         self._meter.begin_steps()
         try:
             with self.interrupt:
@@ -293,9 +308,9 @@ def run_study(
     if study.time.scheme == "rigid":
         how = {"restart": restart, "overwrite": overwrite}
         return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
-    with Interrupt(comm, wall_limit) as interrupt:
-        # at once, not after a mesh of minutes
-        on_root(comm, lambda: _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite))
+    with Interrupt(comm, wall_limit) as interrupt, FolderLock(folder) as lock:
+        check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
+        on_root(comm, lambda: claim(lock, check))  # at once, not after a mesh of minutes
         scene = build_scene(comm, study)
         if scene.domain.source is not None:
             say(comm, list(scene.domain.source.notes))
@@ -320,10 +335,12 @@ def _run_rigid(
     from .scene.rigid import build_rigid_scene, help_rigid
 
     def work() -> dict[str, Any]:
-        _check(folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
+        check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
+        claim(lock, check)
         from .rigid_run import RigidRun, notes_of
 
         scene = build_rigid_scene(study, comm)
+        claim(lock, check, make=True)
         notes_of(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
         frames = study.output.interval or study.time.end / FRAMES
@@ -339,7 +356,7 @@ def _run_rigid(
             if comm.size > 1:
                 tell(comm, None)
 
-    with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt:
+    with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt, FolderLock(folder) as lock:
         if comm.rank:
             help_rigid(comm)
         return from_root(comm, first)

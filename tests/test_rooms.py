@@ -23,7 +23,7 @@ WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "m
 OF_REPORT = {
     "shots": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},
     "colouring": {"output.fields_file"},
-    "sweep": {"study.check", "study.file", "output.own_files"},
+    "sweep": {"study.check", "study.file", "output.lock", "output.own_files"},
 }
 
 

@@ -11,14 +11,14 @@ import re
 import shlex
 import signal
 import subprocess
+import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import Exit, InputError, NotConverged, Stopped
+from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped
+from ..output.lock import FolderLock, holder
 from ..output.own_files import check_owner, resumable
 from ..study.check import check_study
 from ..study.file import load_study, study_text
@@ -55,18 +55,26 @@ def run_sweep(
         for case, text in zip(cases, studies, strict=True):
             print(shlex.join(_listed(study, case, text, ranks, overwrite=overwrite)))
         return
-    outcomes = {}
-    for number, (case, text) in enumerate(zip(cases, studies, strict=True), 1):
-        print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
-        outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
-        print(outcome, flush=True)
-        collect(cases, outcomes, out)
-        if outcome.startswith("interrupted"):
-            raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
+    with FolderLock(out) as lock:
+        lock.acquire(make=True)
+        outcomes = _run_all(study, list(zip(cases, studies, strict=True)), out, ranks)
     failed = [f"{name} ({outcome})" for name, outcome in outcomes.items() if not outcome.startswith("done")]
     print(f"settings and figures of all runs: {out / 'sweep.csv'}")
     if failed:
         raise NotConverged(f"{len(failed)} of {len(cases)} runs did not end well: {'; '.join(failed)}")
+
+
+def _run_all(study: str, cases: list[tuple[Case, str]], out: Path, ranks: int) -> dict[str, str]:
+    """Outcomes in words of all cases, each with its study as text, by their names. Raises Stopped."""
+    outcomes: dict[str, str] = {}
+    for number, (case, text) in enumerate(cases, 1):
+        print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
+        outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
+        print(outcome, flush=True)
+        collect([each for each, _ in cases], outcomes, out)
+        if outcome.startswith("interrupted"):
+            raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
+    return outcomes
 
 
 # --- combinations ---------------------------------------------------------------------------------------------------
@@ -214,6 +222,8 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
     state = _state(case, text)
     if state == "done":
         return "done before"
+    if (words := holder(case.folder)) is not None:  # of a job array, or of a sweep that was killed
+        return f"refused: a run is going on there ({words})"
     try:
         case.folder.mkdir(parents=True, exist_ok=True)
         (case.folder / "summary.json").unlink(missing_ok=True)  # of an earlier run: it would be taken for this one's
@@ -221,12 +231,11 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
     # what is there may be overwritten: _check_folder has looked
     log, work = case.folder / "log.txt", command(study, case, ranks, "restart" if state == "begun" else "overwrite")
-    with log.open("w") as file, _forwarding() as forward:
+    with log.open("w") as file, _Forwarding() as forwarding:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
         process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True, env=_environment())
-        forward.append(process)
-        code = process.wait()
-    if forward[1:]:
+        code = forwarding.wait_for(process)
+    if forwarding.asked is not None:
         return "interrupted"
     outcome = OUTCOMES.get(code, f"failed with exit code {code}")
     if code == Exit.DONE:
@@ -234,27 +243,44 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
     return f"{outcome}: {last_words(log).removeprefix(SPEAKER) or 'it said nothing'}"
 
 
-@contextmanager
-def _forwarding() -> Iterator[list[Any]]:
-    """A signal that would end the sweep ends the run first, with a checkpoint; the list then has a second entry.
+class _Forwarding:
+    """Passes on a signal that would end the sweep to the run, which ends first, with a checkpoint.
 
     SIGUSR1 is passed on in place of the others: mpirun passes it on, too, while it kills ranks at a SIGTERM. Who does
-    not want to wait for the checkpoint sends a second signal.
+    not want to wait for the checkpoint sends a second signal (SAME_REQUEST s later, for some senders send it twice).
+
+    Attributes:
+        asked: when the first signal came (s, monotonic); None: none came.
     """
-    running: list[Any] = []
 
-    def handle(number: int, _: Any) -> None:
-        if running and running[0].poll() is None:
-            running[0].send_signal(signal.SIGTERM if running[1:] else signal.SIGUSR1)
-        running.append(number)
+    def __init__(self) -> None:
+        self.asked: float | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._before: dict[int, Any] = {}
 
-    signals = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
-    before = {number: signal.signal(number, handle) for number in signals}
-    try:
-        yield running
-    finally:
-        for number, handler in before.items():
+    def __enter__(self) -> _Forwarding:
+        wanted = [number for number in STOP_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._pass_on) for number in wanted}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def wait_for(self, process: subprocess.Popen[bytes]) -> int:
+        """The exit code of a run, once it has ended."""
+        self._process = process
+        if self.asked is not None:  # before the run was started
+            process.send_signal(signal.SIGUSR1)
+        return process.wait()
+
+    def _pass_on(self, number: int, _: Any) -> None:
+        now, first = time.monotonic(), self.asked is None
+        if self.asked is not None and now < self.asked + SAME_REQUEST:
+            return
+        self.asked = now if self.asked is None else self.asked
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGUSR1 if first else signal.SIGTERM)
 
 
 # --- the table ------------------------------------------------------------------------------------------------------

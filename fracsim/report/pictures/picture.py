@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -115,9 +116,17 @@ def tiled(pictures: Sequence[Pixels]) -> Pixels:
 
 
 def _save(target: Path, pixels: Pixels) -> None:
+    """Write a PNG in one go: a run may draw the same one, and someone may look at it."""
     from PIL import Image
 
-    Image.fromarray(pixels).save(target, optimize=True)
+    part = target.with_name(f"{target.name}.{os.getpid()}")
+    try:
+        with part.open("xb") as file:
+            Image.fromarray(pixels).save(file, "PNG", optimize=True)
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def _film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
