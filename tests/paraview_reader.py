@@ -1,7 +1,8 @@
-"""What ParaView shows of a file: pvpython paraview_reader.py FILE READER TIME TARGET.json
+"""What ParaView shows of a file: pvpython paraview_reader.py FILE READER TIME FILTERS TARGET.json
 
-READER is the name of a reader in paraview.simple, "OpenDataFile" for the one that ParaView takes by itself. The target
-has the times, and of every array its components by the names that ParaView's menus show, with their ranges.
+READER is the name of a reader in paraview.simple, "OpenDataFile" for the one that ParaView takes by itself. FILTERS is
+JSON: a list of filters by their names, and their properties, from the reader on. The target has the times, the blocks,
+the number of cells, and of every array its components by the names that ParaView's menus show, with their ranges.
 """
 
 from __future__ import annotations
@@ -40,8 +41,16 @@ def arrays(source: Any) -> dict[str, dict[str, dict[str, tuple[float, float]]]]:
     return found
 
 
-def main(file: str, reader: str, time: str, target: str) -> None:
-    """Read `file` at one of its times (s; -1: its last)."""
+def blocks(source: Any) -> list[str]:
+    """Names of the blocks of a data set that has some."""
+    if (hierarchy := source.GetDataInformation().GetHierarchy()) is None:
+        return []
+    root = hierarchy.GetRootNode()
+    return [hierarchy.GetNodeName(child) for child in hierarchy.GetChildNodes(root, False)]
+
+
+def main(file: str, reader: str, time: str, filters: str, target: str) -> None:
+    """Read `file` at one of its times (s; -1: its last) and apply `filters`."""
     from paraview import simple
 
     if reader == "OpenDataFile":
@@ -52,9 +61,15 @@ def main(file: str, reader: str, time: str, target: str) -> None:
     source.UpdatePipelineInformation()
     given = source.TimestepValues
     times = [given] if isinstance(given, float) else list(given)  # of one time ParaView makes a number
-    source.UpdatePipeline(times[-1] if float(time) < 0 else float(time))
-    kind = source.GetDataInformation().GetDataSetTypeAsString()
-    Path(target).write_text(json.dumps({"times": times, "kind": kind, "arrays": arrays(source)}))
+    t, last = times[-1] if float(time) < 0 else float(time), source
+    for name, properties in json.loads(filters):
+        last = getattr(simple, name)(Input=last)
+        for key, value in properties.items():
+            setattr(last, key, value)
+    last.UpdatePipeline(t)
+    about = last.GetDataInformation()
+    found = {"times": times, "kind": about.GetDataSetTypeAsString(), "cells": about.GetNumberOfCells()}
+    Path(target).write_text(json.dumps(found | {"blocks": blocks(source), "arrays": arrays(last)}))
 
 
 if __name__ == "__main__":

@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from mpi4py import MPI
 
 from cases import fracsim
-from fracsim.run import Run
+from fracsim.output.fields_file import read_times
+from fracsim.report.pictures.shots import Shot, load
+from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.file import load_study, validate
+from support.demo import readme_damage, run_demo
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text()
@@ -38,6 +42,40 @@ def test_the_study_in_the_readme_runs(tmp_path: Path) -> None:
     named = set(re.findall(r"^\| `([a-z_]+\.[a-z0-9]+|checkpoint/)", TEXT, re.MULTILINE))
     written = {path.name for path in tmp_path.iterdir()}
     assert {"history.csv", "pieces.csv", "surface.pvd", "summary.json", "study.toml"} <= named & written
+
+
+def regions(folder: Path, upper: float) -> tuple[int, int]:
+    """Parts that hang together of the cells of damage up to `upper`, and the most pieces in one of them, by VTK."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkConnectivityFilter, vtkThreshold
+
+    threshold, connectivity = vtkThreshold(), vtkConnectivityFilter()
+    h5 = folder / "fields.h5"
+    threshold.SetInputData(load(Shot(0.0, h5, len(read_times(h5)) - 1)))
+    threshold.SetInputArrayToProcess(0, 0, 0, 1, "damage")  # array 0 of input 0, on cells
+    threshold.SetLowerThreshold(0.0)
+    threshold.SetUpperThreshold(upper)
+    connectivity.SetInputConnection(threshold.GetOutputPort())
+    connectivity.SetExtractionModeToAllRegions()
+    connectivity.ColorRegionsOn()
+    connectivity.Update()
+    data = connectivity.GetOutput().GetPointData()
+    region, piece = (vtk_to_numpy(data.GetArray(name)) for name in ("RegionId", "piece"))
+    return int(region.max()) + 1, max(len(np.unique(piece[region == k])) for k in range(region.max() + 1))
+
+
+@pytest.mark.parametrize("case", ["demo", "bar-2d"])
+def test_the_threshold_in_the_readme_opens_the_crack(case: str, tmp_path: Path) -> None:
+    """By VTK's own filter, in 3D and 2D: no part that is left has two pieces. At 0.5 the demo's crack stays shut."""
+    folder = tmp_path / "out"
+    if case == "demo":
+        run_demo(folder)
+        assert regions(folder, 0.5) == (1, 2)
+    else:
+        over = ["mesh.h=0.02", 'output.fields=["damage", "piece"]', "output.picture=false", "output.interval=0.3"]
+        run_study(MPI.COMM_SELF, load_study("bar-2d", over), folder)
+    count, pieces = regions(folder, readme_damage())
+    assert count >= 2 and pieces == 1
 
 
 def test_the_lines_of_python_in_the_readme_step_as_the_command_does(tmp_path: Path) -> None:
