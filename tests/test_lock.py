@@ -1,4 +1,4 @@
-"""One run at a time writes into an output folder: the second ends with exit code 2, and nothing of the first is lost."""
+"""One run at a time writes into an output folder: a second ends with exit code 2, and nothing of the first is lost."""
 
 from __future__ import annotations
 
