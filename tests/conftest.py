@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings
 
 from fracsim.meshes.data import MeshData
-from fracsim.study import Mesh, check, resultants
+from fracsim.study import Mesh, check
 from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
@@ -59,7 +59,7 @@ def meshes_built_once() -> Iterator[None]:
 @pytest.fixture
 def little_built(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check` measures the loads of small meshes alone: it builds those of up to 60,000 cells."""
-    monkeypatch.setattr(resultants, "MOST_CELLS", 3000)
+    monkeypatch.setattr(check, "MOST_CELLS", 3000)
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -13,6 +16,8 @@ from fracsim.meshes.scattered.outline import Outline
 from fracsim.meshes.scattered.points import APART, scatter
 from fracsim.meshes.sizing import Sizing
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
+from fracsim.study.file import load_study
+from fracsim.study.mesh_source import build_mesh
 
 
 def ring(*corners: tuple[float, float], h: float, first: int = 0) -> Outline:
@@ -119,3 +124,20 @@ def test_graded_meshes_are_as_fine_as_they_are_asked_to_be() -> None:
     for low, high in ((0.0, 0.05), (0.1, 0.15), (0.3, 0.5)):
         there = np.abs(np.linalg.norm(middle - 0.5, axis=1) - (low + high) / 2) < (high - low) / 2
         assert np.median((length / sizing.at(middle))[there]) == pytest.approx(0.96, abs=0.15)
+
+
+def test_the_page_has_what_packaged_studies_have() -> None:
+    """Those in the plane, a round body, a thin wall and a figure; the ranges are those that docs/fracture.md quotes."""
+    text = (Path(__file__).parent.parent / "docs" / "fracture.md").read_text().replace("\n", " ")
+    found = re.search(
+        r"have ([0-9.]+) to ([0-9.]+) in the plane; in space ([0-9.]+) to ([0-9.]+), ([0-9.]+) to ([0-9.]+) in walls "
+        r"of two or three cells, and ([0-9.]+) to ([0-9.]+) on faces. A lattice has ([0-9.]+)", text,
+    )  # fmt: skip
+    assert found is not None
+    plane, space, walls, faces = (tuple(map(float, found.group(k, k + 1))) for k in (1, 3, 5, 7))
+    inside = {"bar-2d": plane, "charpy": plane, "notched-bar": plane, "granite-cylinder": space, "dropped-vase": walls}
+    for name, (low, high) in inside.items():
+        values = preferred(build_mesh(load_study(name).mesh))
+        assert low <= values["directions"] <= high, name
+        assert faces[0] <= values.get("directions_faces", faces[0]) <= faces[1], name
+    assert float(found.group(9)) == pytest.approx(180 / 21, abs=0.05)

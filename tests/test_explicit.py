@@ -9,9 +9,10 @@ import pytest
 from scipy.linalg import eigh
 
 from fracsim.forms.energies import lame
+from fracsim.mechanics.stable_step import SAFETY, stable_step
 from fracsim.scene import Scene
 from fracsim.stepping import edge_frequencies
-from fracsim.stepping.explicit import SAFETY, ExplicitStepper, stable_step
+from fracsim.stepping.explicit import ExplicitStepper
 from fracsim.stepping.frequencies import cell_frequencies, damaged_frequencies
 from fracsim.stepping.state import State
 from support.reference import lumped_mass, modes, stiffness

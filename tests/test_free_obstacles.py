@@ -399,10 +399,9 @@ def test_a_free_obstacle_that_runs_into_another_is_told_of(tmp_path: Path, capsy
 
 def test_check_says_what_is_free() -> None:
     other = {"name": "other", "shape": "sphere", "radius": 0.1, "at": [0.5, 2.0], "density": 7e3, "guide": "y"}
-    lines = check_study(make_study(obstacle=[ball(), other]))
+    mesh = {"builder": "box", "size": [1.0, 0.3], "h": 0.1}
+    lines = check_study(make_study(mesh=mesh, obstacle=[ball(), other]))
     assert not any("pass through" in line for line in lines)
-    quick = {"scheme": "explicit", "step": 1e-3, "end": 1.0}
-    assert any(
-        "pass through each other" in line for line in check_study(make_study(obstacle=[ball(), other], time=quick))
-    )
+    quick = make_study(mesh=mesh, obstacle=[ball(), other], time={"scheme": "explicit", "step": 1e-3, "end": 1.0})
+    assert any("pass through each other" in line for line in check_study(quick))
     assert "obstacles   it (free, 5 kg, sphere), other (free along y, 7000 kg/m^3, sphere)" in lines

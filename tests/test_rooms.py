@@ -19,6 +19,9 @@ LAYERS = ("mesh", "mechanics", "fracture", "stepping", "rigid", "output")  # eac
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}
+WITHOUT_DOLFINX |= {"mesh.small_matrices", "mechanics.stable_step", "rigid.placing"}
+CONTACT = "axes ball box corner cylinder moments obstacle outlines overlap placed plane pose shape shapes solids.inside"
+WITHOUT_DOLFINX |= {f"mechanics.contact.{name}" for name in CONTACT.split()}
 # a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {
     "shots": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},

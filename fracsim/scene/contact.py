@@ -19,13 +19,14 @@ from ..mechanics.contact.barrier import Barrier
 from ..mechanics.contact.law import Law
 from ..mechanics.contact.obstacle import Obstacle
 from ..mechanics.contact.obstacles import Obstacles
-from ..mechanics.contact.shapes import SHAPES, Shape
+from ..mechanics.contact.shapes import Shape
 from ..mechanics.material import MaterialFields
 from ..mechanics.stress import Stress
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..mesh.ranks import from_root
 from ..study import Contact, Study
+from ..study.at_start import shape_of
 from ..study.conditions import Loose, Placing, obstacles
 from ..study.mesh_source import open_solid
 
@@ -200,10 +201,7 @@ def every_obstacle(study: Study) -> list[Obstacle]:
 
 
 def _obstacle(entry: Placing, number: int) -> Obstacle:
-    try:
-        shape = SHAPES[entry.shape](**entry.geometry)
-    except InputError as error:
-        raise InputError(f"obstacle.{number}: {error}") from None
+    shape = shape_of(entry, number)
     if entry.loose is not None:
         return _free_obstacle(entry, entry.loose, shape)
     return Obstacle(entry.name, shape, entry.at, entry.moved, entry.friction)

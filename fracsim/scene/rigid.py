@@ -28,6 +28,7 @@ from ..rigid.hertz import Hertz
 from ..rigid.placing import Place, Poses, motion, placed
 from ..rigid.waiting import lent
 from ..study import Contact, Study
+from ..study.at_start import places_of
 from ..study.check import checked_mesh
 from ..study.conditions import volume_loads
 from .breaking import average_of, strength_of, surface_rules
@@ -76,7 +77,7 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit."""
     single = checked_mesh(study)
     _check_shell(study, single)
-    places = _places(study)
+    places = places_of(study)
     copies, poses, density = _copies(study, single, places), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
@@ -103,18 +104,6 @@ def help_rigid(comm: MPI.Comm) -> None:
         return _copies(*begin)
 
     serve(comm, made)
-
-
-def _places(study: Study) -> list[Place]:
-    """Of all copies of all entries of [[body]]; one body where the mesh has it without any."""
-    if not study.body:
-        return [Place(*np.zeros((4, 3)))]
-    places = []
-    for entry in study.body:
-        grid = np.indices(entry.copies).reshape(3, -1).T * np.array(entry.spacing or [0.0, 0.0, 0.0])
-        rest = [np.array(each) for each in (entry.rotation, entry.velocity, entry.spin)]
-        places += [Place(np.array(entry.position) + shift, *rest) for shift in grid]
-    return places
 
 
 def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from ..mechanics.balance import Balance
 from ..mechanics.damping import Drag, Viscosity
+from ..mechanics.stable_step import SAFETY, stable_step
 from .after_step import Breaking, Flow, PassResult
 from .frequencies import cell_frequencies, damaged_frequencies
 from .state import State
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
-SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on the current shape
 KINK = 3.0  # of the squares of frequencies that terms add: with omega dt above 1 a spring that takes hold gains energy
 REFRESH = 20  # steps between two looks at the shape of the cells
 
@@ -103,12 +103,3 @@ def rayleigh(balance: Balance) -> tuple[float, float]:
     """(a in 1/s, b in s) of Rayleigh damping a M + b K."""
     a = sum(term.a for term in balance.terms if isinstance(term, Drag))
     return a, sum(term.b for term in balance.terms if isinstance(term, Viscosity))
-
-
-def stable_step(highest: float, a: float, b: float) -> float:
-    """2/omega (sqrt(1 + xi^2) - xi) in s of the highest omega in 1/s, xi = (a/omega + b omega)/2 of Rayleigh damping
-    taken half a step late."""
-    if highest == 0:
-        return float("inf")
-    xi = (a / highest + b * highest) / 2
-    return float(2 / highest * (np.sqrt(1 + xi**2) - xi))

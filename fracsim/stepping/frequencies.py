@@ -1,8 +1,4 @@
-"""Bounds on how fast each cell of a body vibrates, from which explicit schemes take their step.
-
-No assembled body is faster than its fastest cell on its own (Irons and Treharne 1971). A P1 simplex has lumped mass
-m = rho V / (d + 1) a node.
-"""
+"""Bounds on how fast each cell of a body vibrates, from which explicit schemes take their step."""
 
 from __future__ import annotations
 
@@ -13,9 +9,9 @@ import basix
 import numpy as np
 import numpy.typing as npt
 
+from ..mechanics.stable_step import frequency_bounds
 from ..mechanics.stress import Stress
 from ..mesh.simplices import CELL, local_edges
-from ..mesh.small_matrices import barycentric_gradients
 
 if TYPE_CHECKING:
     from .edge_frequencies import EdgeFrequencies
@@ -26,22 +22,12 @@ Values = npt.NDArray[np.float64]
 def cell_frequencies(stress: Stress) -> Values:
     """(cells,) upper bounds of omega^2 of each cell on its own, 1/s^2, undamaged and in its current shape.
 
-    A P1 simplex has lumped mass rho V / (d + 1) a node and energy V (mu |sym H|^2 + lambda/2 (tr H)^2), H = grad u.
-    With L = sum_i g_i x g_i a nodal motion with gradient H has sum |u_i|^2 >= H : H L^-1 >= (tr H)^2 / tr L,
-    hence omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L). No assembled body is faster than its fastest cell
-    (Irons and Treharne 1971). `gain` has what takes the place of d + 1 with quadratic displacement.
+    `gain` has what takes the place of d + 1 with quadratic displacement (mechanics.stable_step).
     """
-    domain, d = stress.domain, stress.domain.dim
+    domain, d, material = stress.domain, stress.domain.dim, stress.material
     corners = stress.corners(np.arange(domain.cell_count))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gradients = barycentric_gradients(corners)
-        spread = np.einsum("nai,naj->nij", gradients, gradients)
-    flat = ~np.isfinite(spread).all(axis=(1, 2))
-    spread[flat] = 0.0  # a cell without volume has forces, but no bound; the others set the step
-    largest, trace = np.linalg.eigvalsh(spread)[:, -1], np.trace(spread, axis1=1, axis2=2)
-    material = stress.material
     factor = d + 1 if domain.order == 1 else gain(d)
-    return np.asarray(factor / material.density * (2 * material.mu * largest + material.lmbda * trace))
+    return frequency_bounds(corners, material.mu, material.lmbda, material.density, factor)
 
 
 @cache

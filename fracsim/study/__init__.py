@@ -12,7 +12,10 @@ values          what a key may hold
 file            a study read by path or name, overridden, and written with every default
 explain         what is wrong, in one sentence
 check           `fracsim check`
+at_start        whether the body and obstacles overlap at the start
 lengths         whether strength, energy, mesh and body fit together
+units           questions about figures that look like those of other units
+steps           how many time steps there are, and how long stable ones are
 resultants      areas and resultants of loads
 mesh_source     from [mesh] to arrays
 catalogue       `fracsim list`

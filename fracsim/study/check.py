@@ -7,9 +7,9 @@ answer comes in a second.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from math import factorial
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,16 +20,19 @@ from ..mesh.bodies import bodies_of, not_held
 from ..mesh.names import check_group, check_regions
 from ..mesh.places import Group, Place
 from ..meshes.data import MeshData
-from ..meshes.topology import boundary_facets, signed_measures
+from ..meshes.parameters import MOST_CELLS as CELLS
+from ..meshes.topology import boundary_facets, edges_of, signed_measures
 from ..meshes.words import AXES, format_point
 from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
-from .lengths import fits
+from .lengths import fits, large_strains
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
 from .order import bent, has_round_sides
-from .resultants import resultants
+from .resultants import MOST_CELLS, loaded, resultants
+from .steps import steps_of
 from .tearing import refuse_forks, tearing
 from .turning import MUCH, turned
+from .units import questions
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
@@ -46,17 +49,23 @@ class Anatomy:
     upper: tuple[float, ...]
     cells: int  # about how many
     size: str  # how many cells, in words
-    h: float  # of the finest cells, or of the mean one of a mesh that was read, m
+    h: float  # of a builder's finest cells; the mean edge of a mesh that was read, or of a builder without h, m
     surface: Callable[[], str]  # how many facets, in words; counted when asked
     volume: float | None = None  # m^d, where it is known
     notes: tuple[str, ...] = ()  # what was mended while reading
+    mesh: MeshData | None = None  # where it was read or built
 
 
 def check_study(study: Study) -> list[str]:
     """Lines that tell what the scene will build. InputError where the study cannot run."""
     anatomy = _words_of(study, open_surface(study.mesh)) or anatomy_of(build_mesh(study.mesh))
     _check(study, anatomy)
-    return list(_description(study, anatomy))
+    near = _near(study, anatomy)
+    if anatomy.mesh is None and (near or loaded(study, anatomy.dim)) and anatomy.cells <= MOST_CELLS:
+        anatomy = _built(anatomy, build_mesh(study.mesh))
+    if near and anatomy.mesh is not None:
+        _check_room(study, anatomy.mesh)
+    return list(_description(study, anatomy, near))
 
 
 def checked_mesh(study: Study) -> MeshData:
@@ -65,10 +74,28 @@ def checked_mesh(study: Study) -> MeshData:
     words = _words_of(study, surface)
     if words is not None:
         _check(study, words)
+        _near(study, words)
     mesh = build_mesh(study.mesh, surface)
-    if study.mesh.builder is None:
+    if words is None:
         _check(study, anatomy_of(mesh))
+    if study.obstacle:
+        _check_room(study, mesh)
     return bent(study, mesh, find_builder(study.mesh))
+
+
+def _near(study: Study, anatomy: Anatomy) -> list[str]:
+    """Names of obstacles that may overlap the body. InputError where one is no shape, or overlaps another one."""
+    if not study.obstacle:
+        return []
+    from .at_start import near_obstacles
+
+    return near_obstacles(study, np.array(anatomy.lower), np.array(anatomy.upper))
+
+
+def _check_room(study: Study, mesh: MeshData) -> None:
+    from .at_start import check_room
+
+    check_room(study, mesh)
 
 
 def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
@@ -96,8 +123,22 @@ def anatomy_of(mesh: MeshData) -> Anatomy:
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
     volume = float(signed_measures(mesh.points, mesh.cells).sum())
     groups, regions, facets = tuple(mesh.facet_groups), tuple(mesh.regions), partial(_counted, mesh)
-    h, cells = (factorial(mesh.dim) * volume / len(mesh.cells)) ** (1 / mesh.dim), len(mesh.cells)
-    return Anatomy(mesh.dim, groups, regions, lower, upper, cells, size, h, facets, volume, mesh.notes)
+    h, cells = mean_edge(mesh), len(mesh.cells)
+    return Anatomy(mesh.dim, groups, regions, lower, upper, cells, size, h, facets, volume, mesh.notes, mesh)
+
+
+def _built(anatomy: Anatomy, mesh: MeshData) -> Anatomy:
+    """What a builder says of its mesh, with the mesh; its mean edge where the builder has no size of cells."""
+    return replace(anatomy, mesh=mesh, h=anatomy.h if np.isfinite(anatomy.h) else mean_edge(mesh))
+
+
+SAMPLE = 50_000  # cells of a large mesh that are looked at
+
+
+def mean_edge(mesh: MeshData) -> float:
+    """The mean length of the edges of a mesh, m; of a large one, of the edges of every so many cells."""
+    edges = edges_of(mesh.cells[:: 1 + len(mesh.cells) // SAMPLE])
+    return float(np.linalg.norm(mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]], axis=1).mean())
 
 
 def _finest(builder: Any) -> float:
@@ -159,6 +200,7 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
     dim = anatomy.dim
     if study.time.scheme == "rigid" and dim != 3:
         raise InputError(f'time.scheme = "rigid" is for bodies in space; this mesh has {dim} dimensions')
+    _check_copies(study, anatomy.cells)
     conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)
@@ -176,6 +218,20 @@ def _check_dimensions(study: Study, anatomy: Anatomy) -> None:
         raise InputError('material.plane = "stress" is for 2D meshes; this one has 3 dimensions')
 
 
+MOST_BODIES = 100_000
+
+
+def _check_copies(study: Study, cells: int) -> None:
+    """InputError where [[body]] asks for more bodies, or cells of them, than can be held."""
+    copies = sum(prod(each.copies) for each in study.body)
+    for count, most, what in ((copies, MOST_BODIES, "bodies"), (copies * cells, CELLS, "cells in all")):
+        if count > most:
+            raise InputError(
+                f"body.N.copies: {copies:.3g} copies of a mesh of about {cells:,} cells are {count:.3g} {what}, and at "
+                f"most {most:.0e} can be held; take fewer copies, such as copies = [10, 10, 10], or a larger mesh.h"
+            )
+
+
 def _check_inside(point: list[float], anatomy: Anatomy, key: str) -> None:
     at, lower, upper = of_size(point, anatomy.dim, key), np.array(anatomy.lower), np.array(anatomy.upper)
     slack = 1e-9 * float(np.linalg.norm(upper - lower))
@@ -190,7 +246,7 @@ def _extent(anatomy: Anatomy) -> str:
 NODES = {2: "4 times", 3: "7 to 8 times"}  # of a mesh with linear displacement: its edges have nodes, too
 
 
-def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
+def _description(study: Study, anatomy: Anatomy, near: list[str]) -> Iterator[str]:
     if study.time.scheme == "rigid":
         yield from _rigid_description(study, anatomy)
         return
@@ -203,6 +259,8 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     yield f"size        {_size(anatomy)}"
     for note in anatomy.notes:
         yield f"            note: {note}"
+    for line in questions(study, float(np.max(np.subtract(anatomy.upper, anatomy.lower)))):
+        yield f"            {line}"
     plane = f", plane {study.material.plane}{_thick(study)}" if anatomy.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     like = f"; like {study.material.like}" if study.material.like else ""
@@ -218,7 +276,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         if table is not None and not table.crumbs and not table.joins(study.material.energy):
             yield '            note: crumbs = false holds no node with approach = "edge" and the corotated energy;'
             yield '            energy = "linear" or approach = "chi" keeps them'
-    for line in fits(study, _least_side(anatomy)):
+    for line in (*fits(study, anatomy.h, _least_side(anatomy)), *large_strains(study), *_prefers(study, anatomy)):
         yield f"            {line}"
     yield f"plasticity  {_plasticity(study)}"
     if study.brittle is not None:
@@ -229,7 +287,7 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
-    for line in resultants(study, anatomy.dim, anatomy.cells):
+    for line in resultants(study, anatomy.dim, anatomy.mesh):
         yield f"            {line}"
     if study.obstacle:
         yield f"obstacles   {', '.join(f'{each.name} ({_motion(each)} {each.shape})' for each in study.obstacle)}"
@@ -248,22 +306,15 @@ def _description(study: Study, anatomy: Anatomy) -> Iterator[str]:
         price = _PRICE_OF_CONTACT[study.time.kind.implicit]
         yield f"contact     {of}, friction {study.contact.friction:g}; {price}"
         yield f"            its surface has {anatomy.surface()}, {_MORE}"
-    timing = study.time
-    steps = f"{timing.end / timing.longest:.0f} steps of {timing.longest:g} s"
-    if timing.shortest < timing.longest:
-        steps = f"steps of {timing.shortest:g} to {timing.longest:g} s"
-    halving = "halved where a step fails" if study.time.adapt else "fixed"
-    yield f"time        {study.time.scheme}, {steps}, {halving}"
-    if study.time.breaking_step is not None:
-        yield f"            steps in which edges break are {study.time.breaking_step:g} s at most"
+    yield from steps_of(study, anatomy.dim, anatomy.h, anatomy.mesh)
     if (until := study.time.until) is not None:
         yield f"            ends where the force on {study.watched} has fallen by {until.drop:.0%} from its peak"
     if study.material.energy == "linear" and turned(study, anatomy.dim, _least_side(anatomy)) > MUCH:
         yield '            note: with energy = "linear" pieces that come off and turn swell by 1/cos of their angle;'
         yield '            "corotated" costs little more, and turns them as they are'
-    if _may_ring(study):
-        yield "            note: in steps this long Newmark's method may gain energy at large strains;"
-        yield '            scheme = "generalized-alpha" does not'
+    if near and anatomy.mesh is None:
+        yield f"            whether the body lies in {' or '.join(near)} is not looked at in meshes of more than"
+        yield f"            {MOST_CELLS:,} cells that are not built yet; the run does"
     options = ", ".join(f"{key}={value}" for key, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
@@ -274,6 +325,8 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     source = study.mesh.source
     yield f"mesh        {source}: {anatomy.dim}D, {anatomy.size}"
     yield f"size        {_size(anatomy)}"
+    for line in questions(study, float(np.max(np.subtract(anatomy.upper, anatomy.lower)))):
+        yield f"            {line}"
     copies = sum(int(np.prod(each.copies)) for each in study.body) or 1
     yield f"bodies      {copies} times the mesh; motion on one rank, no fields.xdmf"
     if study.brittle is not None and study.fracture is not None:
@@ -320,16 +373,26 @@ def _thick(study: Study) -> str:
     return "" if study.material.thickness is None else f", {study.material.thickness:g} m thick"
 
 
-RINGS = 2.0  # times that a wave passes an edge in a step, from which on Newmark's method may gain energy
+DIRECTED = 4.0  # times as many edges near the commonest directions as by chance: random points have 1.1 to 3.7
+EDGES = {2: 100, 3: 1000}  # fewer tell nothing
 
 
-def _may_ring(study: Study) -> bool:
-    """Whether steps of Newmark's method are long for the waves in a body of finite strains, whose edges are known: its
-    energy is kept where forces are linear (mechanics.blow)."""
-    h, material = study.mesh.parameters.get("h"), study.material
-    if study.time.scheme != "newmark" or material.energy == "linear" or not isinstance(h, int | float):
-        return False
-    return study.time.longest * float(np.sqrt(material.young / material.density)) > RINGS * h
+def _prefers(study: Study, anatomy: Anatomy) -> Iterator[str]:
+    """How much edges prefer some directions, of a mesh that was read or built, where cracks run along them."""
+    if study.fracture is None or study.brittle is not None or anatomy.mesh is None:
+        return
+    from ..meshes.directions import preferred
+
+    mesh = anatomy.mesh
+    if len(mesh.points) < EDGES[anatomy.dim]:
+        return
+    found = max(preferred(mesh, SAMPLE).values())
+    if found > DIRECTED and study.fracture.energy is None:
+        yield f"note: the mesh has {found:.2g} times as many edges along its commonest directions as one without any,"
+        yield "and cracks run along edges: take random points (builders, surface, outline), or fracture.energy"
+    elif found > DIRECTED:
+        yield f"the mesh has {found:.2g} times as many edges along its commonest directions as one without any; cracks"
+        yield "that take an energy go through cells, and cross edges in any direction"
 
 
 def _least_side(anatomy: Anatomy) -> float:

@@ -12,30 +12,42 @@ from .tearing import plane_modulus
 
 DISC = 6.0  # h that a tip needs around it
 FAR = 3.0  # times that an energy may be off without a word
+BRITTLE = 0.005  # strain at the strength, below which stretches do not matter
 
 
-def fits(study: Study, least: float) -> Iterator[str]:
-    """Notes on what does not fit together; `least`: the body's least side, m."""
+def fits(study: Study, h: float, least: float) -> Iterator[str]:
+    """Notes on what does not fit together; `h`: size of the cells, infinite where it is not known, and `least`: the
+    body's least side, m."""
     table = study.fracture
     if table is None or study.brittle is not None:
         return
-    h = study.mesh.parameters.get("h")
-    h = float(h) if isinstance(h, int | float) and not isinstance(h, bool) else None
     if table.strength > 0.1 * study.material.young and table.strength < float("inf"):
         yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
     if table.energy is None:
         yield from _spent(study, plane_modulus(study, Region()), table.radius or h)
         return
-    if table.law == "griffith" and h is not None and least < 2 * DISC * h:
+    if table.law == "griffith" and least < 2 * DISC * h < float("inf"):
         most = least / 2 / DISC
         yield f"note: tips need {DISC:g} h on every side, the body is {least / h:.3g} h across: h below {most:.2g} m"
 
 
-def _spent(study: Study, stiff: float, cell: float | None) -> Iterator[str]:
+def large_strains(study: Study) -> Iterator[str]:
+    """A note where slow steps pay for large strains that a brittle material does not reach."""
+    material, table, like = study.material, study.fracture, study.material.like
+    strength = table.strength if table is not None else MATERIALS[like].strength if like is not None else None
+    if material.energy == "linear" or study.time.scheme != "quasi-static" or strength is None or study.plasticity:
+        return
+    share = strength / material.young
+    if share < BRITTLE and not any(each.young or each.strength for each in material.regions.values()):
+        yield f"note: strains stay below strength / young = {100 * share:.2g} %, and energy = {material.energy} is one"
+        yield 'of large strains: energy = "linear" gives the same loads in less time, unless thin parts bend far'
+
+
+def _spent(study: Study, stiff: float, cell: float) -> Iterator[str]:
     """What single edges take: the energy of a row of cells at their strength, f_t^2 h / 2 E', whatever G_c is."""
     table, like = study.fracture, study.material.like
     assert table is not None
-    if cell is None or not table.strength < float("inf"):
+    if not (cell < float("inf") and table.strength < float("inf")):
         return
     spent = table.strength**2 * cell / (2 * stiff)
     of = MATERIALS[like].energy if like is not None else None

@@ -14,7 +14,6 @@ from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, facets_where, signed_measures
 from . import Study
 from .conditions import Condition, conditions, volume_loads
-from .mesh_source import build_mesh
 
 Values = npt.NDArray[np.float64]
 
@@ -26,16 +25,15 @@ def loaded(study: Study, dim: int) -> list[Condition]:
     return [each for each in conditions(study, dim) if not each.moves]
 
 
-def resultants(study: Study, dim: int, cells: int) -> Iterator[str]:
-    """A line for each load, where one acts on facets: the mesh is built for them. InputError where one selects none;
-    `cells`: about how many the mesh has."""
+def resultants(study: Study, dim: int, mesh: MeshData | None) -> Iterator[str]:
+    """A line for each load, where one acts on facets. InputError where one selects none; `mesh`: None where it has too
+    many cells to be built for that."""
     loads = loaded(study, dim)
     if not loads:
         return
-    if cells > MOST_CELLS:
+    if mesh is None:
         yield f"areas and resultants are not worked out of meshes of more than {MOST_CELLS:,} cells; coarsen mesh.h"
         return
-    mesh = build_mesh(study.mesh)
     thick = study.thickness if dim == 2 else 1.0
     for load in loads:
         each, total = facet_areas(mesh, load)

@@ -27,6 +27,20 @@ def depth(one: Closed, other: Closed, *, cut: bool) -> float | None:
     return max(found) if found else None
 
 
+def crosses(one: Closed, other: Closed) -> bool:
+    """Whether a triangle of one surface cuts or touches one of the other. Without ipctk: not known, False."""
+    try:
+        import ipctk
+    except ImportError:
+        return False
+    points = np.concatenate([one[0], other[0]])
+    triangles = np.concatenate([one[1], other[1] + len(one[0])]).astype(np.int32)
+    mesh = ipctk.CollisionMesh.build_from_full_mesh(points, ipctk.edges(triangles), triangles)
+    side = np.repeat(np.array([0, 1], np.int32), [len(one[0]), len(other[0])])
+    mesh.can_collide = ipctk.make_vertex_patches_filter(side[np.unique(triangles)])
+    return bool(ipctk.has_intersections(mesh, mesh.vertices(points), ipctk.LBVH()))
+
+
 def _depth_in(surface: Closed, other: Closed, *, cut: bool) -> float | None:
     x, corners = surface[0][_asked(surface, cut=cut)], other[0][other[1]]
     x = x[((x > corners.min(axis=(0, 1))) & (x < corners.max(axis=(0, 1)))).all(axis=1)]
