@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from ctypes import c_int
+import ctypes
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from ctypes import Structure, c_int, c_int64
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fracsim.errors import InputError
-from fracsim.mesh import compiled
+from fracsim.mesh import compiled, library_cache
+from support.damaged import DAMAGES, damage
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where libraries go, and nothing is there yet."""
     made = tmp_path / "cache"
-    monkeypatch.setattr(compiled, "get_options", lambda: {"cache_dir": made})
+    monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": made})
     compiled.library.cache_clear()
     return made
 
@@ -32,7 +40,7 @@ def test_a_file_is_compiled_once_and_anew_where_it_changes(folder: Path, tmp_pat
     source.write_text("int twice(int n) { return n + n + 1; }\n")
     compiled.library.cache_clear()
     assert compiled.library(source).twice(c_int(4)) == 9
-    assert sorted(path.suffix for path in folder.iterdir()) == [".so", ".so"]
+    assert sorted(path.suffix for path in folder.iterdir()) == [".lock", ".sha256", ".sha256", ".so", ".so"]
 
 
 @pytest.mark.parametrize("text, compiler, said", [("int twice(", "", "error"), ("", "no-compiler", "No such file")])
@@ -45,4 +53,213 @@ def test_what_cannot_be_compiled_says_why(
     source.write_text(text)
     with pytest.raises(InputError, match=f"twice.c.*{said}.*install a C compiler"):
         compiled.library(source)
-    assert not list(folder.iterdir())
+    assert [path.name for path in folder.iterdir()] == ["fracsim.lock"]
+
+
+TWICE = "int twice(int n)\n{\n    return 2 * n;\n}\n"
+
+
+@pytest.fixture
+def twice(folder: Path, tmp_path: Path) -> Path:
+    """A C file that has been compiled."""
+    source = tmp_path / "twice.c"
+    source.write_text(TWICE)
+    assert compiled.library(source).twice(21) == 42
+    compiled.library.cache_clear()
+    return source
+
+
+@pytest.fixture
+def copied(folder: Path, twice: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """A library of that file in another folder, which is used from then on: dlopen gives one of the same path that the
+    process has already, whatever the file is now."""
+
+    def copy(name: str) -> Path:
+        other = folder.with_name(name.replace(" ", "-"))
+        shutil.copytree(folder, other)
+        monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": other})
+        compiled.library.cache_clear()
+        return next(other.glob("*.so"))
+
+    return copy
+
+
+@pytest.mark.parametrize("seal", [True, False])
+def test_a_damaged_library_is_compiled_once_more(
+    copied: Callable[[str], Path], twice: Path, capfd: pytest.CaptureFixture[str], seal: bool
+) -> None:
+    """The note names the file; without a digest beside it what is cut is known by its end."""
+    for kind in DAMAGES if seal else [kind for kind in DAMAGES if kind != "flipped"]:
+        library = copied(kind)
+        damage(library, kind)
+        if not seal:
+            library.with_suffix(".sha256").unlink()
+        assert compiled.library(twice).twice(21) == 42, kind
+        assert f"{library} was damaged; it is compiled once more" in capfd.readouterr().err, kind
+        assert library_cache.is_whole(library)
+
+
+@pytest.mark.parametrize("seal", [True, False])
+def test_a_whole_library_is_loaded_without_a_word(
+    copied: Callable[[str], Path], twice: Path, capfd: pytest.CaptureFixture[str], seal: bool
+) -> None:
+    """Also of a cache from before, without a digest, which it then has."""
+    library = copied("whole")
+    if not seal:
+        library.with_suffix(".sha256").unlink()
+    before = library.stat().st_ino
+    assert compiled.library(twice).twice(21) == 42
+    assert library.stat().st_ino == before
+    assert library.with_suffix(".sha256").exists()
+    assert not capfd.readouterr().err
+
+
+def test_a_library_of_another_machine_is_compiled_once_more(
+    copied: Callable[[str], Path], twice: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Whole by its digest, and yet nothing that this machine loads."""
+    library = copied("other")
+    content = bytearray(library.read_bytes())
+    content[0x12] = 0xB7  # e_machine: AArch64
+    library.unlink()
+    library.write_bytes(content)
+    library_cache.put_seal(library)
+    assert compiled.library(twice).twice(21) == 42
+    assert f"{library} cannot be loaded; it is compiled once more" in capfd.readouterr().err
+
+
+def test_what_others_may_write_is_refused(folder: Path, twice: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library, the folder, and what belongs to someone else."""
+    (library,) = folder.glob("*.so")
+    library.chmod(0o775)
+    with pytest.raises(InputError, match=f"{library} may be written by others .mode 775.*chmod -R go-w {folder}"):
+        compiled.library(twice)
+    library.chmod(0o755)
+    folder.chmod(0o777)
+    library_cache._usable.cache_clear()
+    with pytest.raises(InputError, match=f"{folder} may be written by others .mode 777"):
+        compiled.library(twice)
+    folder.chmod(0o755)
+    if os.getuid() == 0:
+        os.chown(library, 12345, -1)
+    else:
+        monkeypatch.setattr(library_cache.os, "getuid", lambda: 12345)
+    with pytest.raises(InputError, match=r"belongs to user .*XDG_CACHE_HOME"):
+        compiled.library(twice)
+
+
+def test_a_cache_that_cannot_be_written_is_somewhere_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """In a private folder for temporary files, which a note names; where that is not private either, a message."""
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": tmp_path / "file" / "fenics"})
+    monkeypatch.setattr(library_cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    library_cache._usable.cache_clear()
+    other = tmp_path / f"fracsim-{os.getuid()}"
+    assert library_cache.library_folder() == other
+    assert f"kept in {other}: {tmp_path / 'file' / 'fenics'} cannot be written" in capfd.readouterr().err
+    other.chmod(0o777)
+    library_cache._usable.cache_clear()
+    with pytest.raises(InputError, match=f"{other} may be written by others"):
+        library_cache.library_folder()
+    library_cache._usable.cache_clear()
+
+
+def _compiler(at: Path, lines: str) -> str:
+    """A compiler that does something before."""
+    at.write_text(f'#!/bin/sh\n{lines}\nexec cc "$@"\n')
+    at.chmod(0o755)
+    return str(at)
+
+
+def test_a_compiler_without_a_flag_compiles(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clang has no -fvect-cost-model."""
+    refuses = 'case "$*" in *-fvect-cost-model*) echo "error: unknown argument: -fvect-cost-model" >&2; exit 1;; esac'
+    monkeypatch.setenv("CC", _compiler(tmp_path / "clang", refuses))
+    source = tmp_path / "twice.c"
+    source.write_text(TWICE)
+    assert compiled.library(source).twice(21) == 42
+
+
+def test_processes_that_ask_at_once_compile_once(tmp_path: Path) -> None:
+    """Three of them, while the compiler takes its time: it is started once."""
+    log, source = tmp_path / "log", tmp_path / "twice.c"
+    source.write_text(TWICE)
+    compiler = _compiler(tmp_path / "slow", f"echo started >>{log}\nsleep 1")
+    load = "from fracsim.mesh.compiled import library; from pathlib import Path"
+    code = f"{load}; exit(library(Path({str(source)!r})).twice(21))"
+    environment = os.environ | {"CC": compiler, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    asking = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(3)]
+    assert [each.wait(60) for each in asking] == [42] * 3
+    assert log.read_text().split() == ["started"]
+
+
+# --- arguments ------------------------------------------------------------------------------------------------------
+
+SUM = """#include <stdint.h>
+typedef struct {
+    const double *weights;
+} Weights;
+
+double sum(const Weights *w, int64_t n, const double *restrict values, uint8_t *done)
+{
+    double total = 0;
+    for (int64_t i = 0; i < n; i++) total += w->weights[i] * values[i];
+    *done = 1;
+    return total;
+}
+"""
+
+
+class _Weights(Structure):
+    _fields_ = (("weights", compiled.Float64),)
+
+
+def test_arrays_are_checked(folder: Path, tmp_path: Path) -> None:
+    """Contiguous ones of the right numbers are taken, also what may not be written to and what is empty; no other."""
+    source = tmp_path / "sum.c"
+    source.write_text(SUM)
+    function, done = compiled.library(source).sum, np.zeros(1, bool)
+    values, weights = np.arange(4.0), np.full(4, 2.0)
+    values.flags.writeable = False
+    given = ctypes.byref(_Weights(compiled.address(weights)))
+    assert function(given, c_int64(4), compiled.at(values), compiled.at(done)) == 12.0
+    assert done[0]
+    assert function(given, 0, compiled.at(np.empty(0)), compiled.at(done)) == 0.0
+    for wrong in (np.arange(8.0)[::2], np.zeros((4, 4)).T[1:], np.zeros(4, complex), np.arange(4.0).astype(">f8")):
+        for hand_over in (compiled.at, compiled.address):
+            with pytest.raises(ValueError, match="cannot be handed to C"):
+                hand_over(wrong)
+    for wrong in (np.arange(4), np.zeros(4, np.float32)):
+        with pytest.raises(ctypes.ArgumentError, match="argument 3"):
+            function(given, c_int64(4), compiled.at(wrong), compiled.at(done))
+        with pytest.raises(TypeError):
+            _Weights(compiled.address(wrong))
+
+
+def test_prepared_arguments_are_checked_once(folder: Path, tmp_path: Path) -> None:
+    """Before the first call, which checks none."""
+    source = tmp_path / "sum.c"
+    source.write_text(SUM)
+    code, done, weights = compiled.library(source), np.zeros(1, bool), np.full(4, 2.0)
+    given = ctypes.byref(_Weights(compiled.address(weights))), c_int64(4)
+    prepared = compiled.prepared(code, "sum", *given, compiled.at(weights))
+    assert prepared(*given, compiled.at(weights), compiled.at(done)) == 16.0
+    with pytest.raises(TypeError):
+        compiled.prepared(code, "sum", *given, compiled.at(np.arange(4)))
+
+
+def test_every_function_in_c_is_declared() -> None:
+    """What a library of the package gives to others is known with its arguments: none is called unchecked."""
+    package = Path(compiled.__file__).parents[1]
+    sources = sorted(package.rglob("*.c"))
+    assert len(sources) > 10
+    for source in sources:
+        text = source.read_text()
+        named = {name for _, name, _ in compiled._FUNCTION.findall(text)}
+        opened = {
+            line.split("(")[0].split()[-1].lstrip("*") for line in text.splitlines()
+            if "(" in line and line[:1].isalpha() and not line.startswith(("static", "typedef", "INLINE"))
+        }  # fmt: skip
+        assert named == opened, source

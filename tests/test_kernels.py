@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,19 @@ import basix.ufl
 import pytest
 import ufl
 from dolfinx import fem, mesh
-from dolfinx.jit import get_options
 from mpi4py import MPI
 
+from fracsim.errors import InputError
 from fracsim.mechanics import kernels
 from fracsim.mesh.dolfinx_calls import coordinate_element
+from support.damaged import DAMAGES, damage
 
 
 def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A C file without its library, as a killed process leaves it, older than anyone waits."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     options: dict[str, Any] = {"cache_dir": tmp_path / "fenics"}
-    monkeypatch.setattr(kernels, "get_options", lambda: get_options(options))
+    monkeypatch.setattr(kernels, "library_folder", lambda: tmp_path / "fenics")
     monkeypatch.setattr(kernels, "jit_options", lambda: options | {"timeout": 1})
     square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
     form = fem.Constant(square, 3.14159) * ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx
@@ -37,7 +39,7 @@ def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch,
 
 def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A young C file belongs to a process that compiles."""
-    monkeypatch.setattr(kernels, "get_options", lambda: {"cache_dir": tmp_path})
+    monkeypatch.setattr(kernels, "library_folder", lambda: tmp_path)
     (tmp_path / "libffcx_forms_0.c").touch()
     assert not kernels._clear_abandoned()
     assert (tmp_path / "libffcx_forms_0.c").exists()
@@ -79,3 +81,73 @@ def test_an_expression_is_known_again(monkeypatch: pytest.MonkeyPatch, tmp_path:
         values = kernels.CellExpression(MPI.COMM_SELF, square, slope, 2)()
         assert sorted(values.ravel()) == pytest.approx([2 / 3, 2 / 3, 4 / 3, 4 / 3])  # 2 x of two thirds of the square
     assert len(list(tmp_path.glob("*.c"))) == 1
+
+
+@pytest.fixture
+def cubic(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Where a form has been compiled, and what compiles it in another folder: int x^3 over a unit square."""
+
+    def compile_in(folder: Path) -> float:
+        options = {"cache_dir": folder, "cffi_extra_compile_args": ["-O0"], "timeout": 3}
+        monkeypatch.setattr(kernels, "jit_options", lambda: options)
+        monkeypatch.setattr(kernels, "library_folder", lambda: folder)
+        square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
+        return float(fem.assemble_scalar(kernels.compile_form(ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx)))
+
+    assert compile_in(tmp_path / "whole") == pytest.approx(0.25)
+    return tmp_path / "whole", compile_in
+
+
+def test_a_damaged_kernel_is_compiled_once_more(cubic: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    """Cut at any length, empty, other bytes, gone, its C file cut: the right number, and a note that names it."""
+    whole, compile_in = cubic
+    for number, kind in enumerate([*DAMAGES, "gone", "source", "without seal"]):
+        folder = whole.with_name(f"damaged-{number}")
+        shutil.copytree(whole, folder)
+        (library,) = folder.glob("*.so")
+        if kind == "gone":
+            library.unlink()
+        elif kind == "source":
+            damage(next(folder.glob("*.c")), "half")
+        else:
+            damage(library, "half" if kind == "without seal" else kind)
+        if kind == "without seal":  # as caches from before have it
+            next(folder.glob("*.sha256")).unlink()
+        assert compile_in(folder) == pytest.approx(0.25), kind
+        assert library.name.split(".")[0] in capfd.readouterr().err, kind
+        assert next(folder.glob("*.so")).read_bytes()[:4] == b"\x7fELF"
+
+
+def test_a_whole_kernel_is_loaded_without_a_word(cubic: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    """Also of a cache from before, without a digest, which it then has."""
+    whole, compile_in = cubic
+    for seals in (True, False):
+        folder = whole.with_name(f"copy-{seals}")
+        shutil.copytree(whole, folder)
+        if not seals:
+            next(folder.glob("*.sha256")).unlink()
+        written = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.so")}
+        assert compile_in(folder) == pytest.approx(0.25)
+        assert {path.name: path.stat().st_mtime_ns for path in folder.glob("*.so")} == written
+        assert len(list(folder.glob("*.sha256"))) == 1
+        assert not capfd.readouterr().err
+
+
+def test_a_kernel_that_others_may_write_is_refused(cubic: Any) -> None:
+    """What to do stands in the message."""
+    whole, compile_in = cubic
+    for suffix in (".so", ".c"):
+        folder = whole.with_name(f"open{suffix}")
+        shutil.copytree(whole, folder)
+        (path,) = folder.glob(f"*{suffix}")
+        path.chmod(0o666)
+        with pytest.raises(InputError, match=r"may be written by others .mode 666.*chmod -R go-w"):
+            compile_in(folder)
+
+
+def test_without_a_compiler_there_is_a_message(cubic: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And none of setuptools' errors."""
+    whole, compile_in = cubic
+    monkeypatch.setenv("CC", "no-compiler")
+    with pytest.raises(InputError, match="install a C compiler, or name yours in CC"):
+        compile_in(whole.with_name("empty"))

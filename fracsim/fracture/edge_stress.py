@@ -15,7 +15,7 @@ it is needed first, they take a tenth of the time of arrays.
 
 from __future__ import annotations
 
-from ctypes import CDLL, Structure, byref, c_int64, c_void_p
+from ctypes import CDLL, Structure, byref, c_int64
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.compiled import address, at, library
+from ..mesh.compiled import Float64, Int32, Uint8, address, at, library
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
@@ -59,13 +59,13 @@ def greatest_pull(components: Values, dim: int) -> Values:
 class _Given(Structure):
     """As edge_stress.c has it."""
 
-    _fields_ = (("count", c_int64), *((name, c_void_p) for name in ("nodes", "rest", "moved")))
+    _fields_ = (("count", c_int64), ("nodes", Int32), ("rest", Float64), ("moved", Float64))
 
 
 class _Damage(Structure):
     """The same."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("edges", "integrity", "pattern", "damaged", "split"))
+    _fields_ = (("edges", Int32), ("integrity", Float64), *((name, Uint8) for name in ("pattern", "damaged", "split")))
 
 
 class Damage(Protocol):
@@ -133,7 +133,7 @@ def _rows(values: Values) -> tuple[c_int64, Any]:
     """How far rows are apart that may be the first columns of a table, and where they begin."""
     if values.strides[1] != values.itemsize:
         values = np.ascontiguousarray(values)
-    return c_int64(values.strides[0] // values.itemsize), at(values)
+    return c_int64(values.strides[0] // values.itemsize), at(values[0] if len(values) else values)
 
 
 def _damage(of: Damage) -> Any:
@@ -144,6 +144,4 @@ def _damage(of: Damage) -> Any:
 
 @cache
 def _code() -> CDLL:
-    code = library(SOURCE, as_arrays=True)
-    code.lower.restype = c_int64
-    return code
+    return library(SOURCE, as_arrays=True)

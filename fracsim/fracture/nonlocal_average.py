@@ -11,7 +11,7 @@ and fewer have come apart since the last one: only rows near these are looked at
 from __future__ import annotations
 
 from collections.abc import Callable
-from ctypes import CDLL, Structure, byref, c_double, c_int64, c_void_p
+from ctypes import CDLL, Structure, byref, c_double, c_int64
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.compiled import address, at, library
+from ..mesh.compiled import Float64, Int32, address, at, library
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
 from ..mesh.ranks import largest
@@ -95,14 +95,12 @@ class NonlocalAverage:
 class _Given(Structure):
     """As nonlocal_average.c has it."""
 
-    _fields_ = (("start", c_void_p), ("place", c_void_p), ("weight", c_void_p))
+    _fields_ = (("start", Int32), ("place", Int32), ("weight", Float64))
 
 
 @cache
 def _code() -> CDLL:
-    code = library(SOURCE, as_arrays=True)
-    code.reaching.restype = c_int64
-    return code
+    return library(SOURCE, as_arrays=True)
 
 
 class _Rows:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.compiled import address, at, library
+from ..mesh.compiled import Float64, Int32, address, at, library
 from ..mesh.dolfinx_calls import constants_in, form_fields, kernel_of, nodes_of_cells
 from .kernels import CellForm
 
@@ -26,7 +26,7 @@ SOURCE = Path(__file__).with_suffix(".c")
 class _Field(Structure):
     """As few_cells.c has it."""
 
-    _fields_ = (("nodes", c_int64), ("size", c_int64), ("dofs", c_void_p), ("values", c_void_p))
+    _fields_ = (("nodes", c_int64), ("size", c_int64), ("dofs", Int32), ("values", Float64))
 
 
 class _Form(Structure):
@@ -35,7 +35,8 @@ class _Form(Structure):
     _fields_ = (
         ("kernel", c_void_p),
         *((name, c_int64) for name in ("nodes", "size", "corners", "fields", "width")),
-        *((name, c_void_p) for name in ("dofs", "points", "x", "constants")),
+        *((name, Int32) for name in ("dofs", "points")),
+        *((name, Float64) for name in ("x", "constants")),
     )
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
-from dolfinx.jit import get_options
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
@@ -22,9 +21,11 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_post_traversal
 from ufl.variable import Label
 
+from ..errors import CannotWrite, InputError
 from ..mesh.compiled import machine_flags
 from ..mesh.dolfinx_calls import bind_to_cells, evaluate, keep_kernels, only_cells, source_of
 from ..mesh.domain import Domain
+from ..mesh.library_cache import library_folder, no_room, not_for_others
 from ..mesh.ranks import raise_together
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
 
 @cache
-def jit_options() -> dict[str, list[str] | int]:
+def jit_options() -> dict[str, list[str] | int | Path]:
     """Of FFCx, which caches kernels by source and flags."""
-    return {"cffi_extra_compile_args": machine_flags(), "timeout": PATIENCE}
+    return {"cffi_extra_compile_args": machine_flags(), "timeout": PATIENCE, "cache_dir": library_folder()}
 
 
 PATIENCE = 60  # s that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine
@@ -152,14 +153,25 @@ def compile_together[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel
 
 def _attempt[Kernel](compile_kernel: Callable[[], Kernel]) -> tuple[Kernel | None, Exception | None]:
     try:
-        return compile_kernel(), None
+        with not_for_others():
+            return compile_kernel(), None
     except Exception as error:  # the compiler's, the linker's, the file system's
-        return None, error
+        return None, _explained(error)
+
+
+def _explained(error: Exception) -> Exception:
+    """What a user can mend of a compiler's failure, which comes as an error of setuptools', cffi's or DOLFINx's."""
+    kind, folder = type(error).__module__.split(".")[0], library_folder()
+    if kind not in ("cffi", "distutils", "setuptools") and "Compile" not in str(error) and "Link" not in str(error):
+        return error
+    if no_room(folder):
+        return CannotWrite(f"no room to compile kernels in {folder}; make room, or name another XDG_CACHE_HOME")
+    return InputError(f"a kernel cannot be compiled in {folder}: {error}; install a C compiler, or name yours in CC")
 
 
 def _clear_abandoned() -> bool:
     """Remove kernels that have been compiling for longer than anyone waits; whether there were any."""
-    folder = Path(get_options()["cache_dir"])
+    folder = library_folder()
     abandoned = [
         path for path in folder.glob("libffcx_*.c")
         if not path.with_suffix(".c.cached").exists() and time.time() - path.stat().st_mtime > PATIENCE - 1

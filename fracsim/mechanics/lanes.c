@@ -127,7 +127,7 @@ static inline void insert(const double* A, const int32_t* nodes, const int32_t* 
 
 /* Add the blocks of cells, rows of which are as far apart as their node's stride; returns 0, or the number, from 1 on,
    of a cell that has no place. */
-int64_t add(const Form* form, const int32_t* places, const int32_t* strides, const uint8_t* held, double* sum)
+int64_t add_blocks(const Form* form, const int32_t* places, const int32_t* strides, const uint8_t* held, double* sum)
 {
   real constants[form->size + 1], numbers[form->width + 1], A[SIZE];
   for (int i = 0; i < form->size; ++i) constants[i] = zero + form->c[i];

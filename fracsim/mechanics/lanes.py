@@ -22,7 +22,7 @@ from dolfinx import fem, la
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
-from ..mesh.compiled import address, at, built_together
+from ..mesh.compiled import Float64, Int32, address, at, built_together
 from ..mesh.dolfinx_calls import (
     FormField,
     cells_of,
@@ -54,7 +54,8 @@ class _Form(Structure):
 
     _fields_ = (
         *((name, c_int64) for name in ("count", "width", "size")),
-        *((name, c_void_p) for name in ("cells", "dofs", "corners", "x", "c")),
+        *((name, Int32) for name in ("cells", "dofs", "corners")),
+        *((name, Float64) for name in ("x", "c")),
         ("fields", c_void_p),
     )  # fmt: skip
 
@@ -62,7 +63,7 @@ class _Form(Structure):
 class _Field(Structure):
     """The same."""
 
-    _fields_ = (("dofs", c_void_p), ("values", c_void_p))
+    _fields_ = (("dofs", Int32), ("values", Float64))
 
 
 class _Fields:
@@ -99,7 +100,7 @@ class Lanes:
         cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
         form = _Form(len(cells), self._fields.width, len(c), *map(address, arrays), self._fields.place)
-        return int(function(byref(form), *map(at, given)))
+        return int(function(byref(form), *map(at, given)) or 0)
 
 
 class ScalarLanes(Lanes):
@@ -125,7 +126,6 @@ class MatrixLanes(Lanes):
 
     def __init__(self, form: fem.Form, code: CDLL, matrix: la.MatrixCSR) -> None:
         super().__init__(form, code)
-        code.add.restype = c_int64
         dofmap = form.function_spaces[0].dofmap
         self._bs = dofmap.index_map_bs
         self._held = np.zeros(dofmap.index_map.size_local + dofmap.index_map.num_ghosts, np.uint8)
@@ -144,7 +144,7 @@ class MatrixLanes(Lanes):
         for bc in bcs:
             dofs = bc.dof_indices()[0]
             np.bitwise_or.at(self._held, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
-        if missing := self._call(self._code.add, self._places, self._strides, self._held, matrix.data):
+        if missing := self._call(self._code.add_blocks, self._places, self._strides, self._held, matrix.data):
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")
         identity_rows(matrix, self._form, bcs)
 

@@ -11,6 +11,7 @@ incidence       the cells at an edge, the edges at a node
 parting         pieces as edges break, looked for around those
 pieces, bodies  connected components under intact edges; of the mesh as it was built
 overlap         nodes of one piece in cells of another
+compiled, library_cache  functions in C and the types of their arguments; the folder of compiled libraries
 dolfinx_calls   calls of DOLFINx that a newer version touches
 split           geometry of the split surface
 """

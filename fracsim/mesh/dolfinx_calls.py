@@ -13,7 +13,8 @@ Run with 0.9 alone; the rest is from the sources, release notes and pull request
 after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is gone (4403).
 
 any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
-            keep_kernels        takes the place of a function of FFCx; without it kernels are found alike, later.
+            keep_kernels        takes the place of two functions of FFCx; without it kernels are found alike, later, and
+                                damaged ones are not noticed.
 
 Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, form_fields, constants_of,
 identity_rows, assemble_into, apply_lifting, pattern_of, expanded_csr, create_matrix. What FFCx writes is read by
@@ -44,6 +45,8 @@ from ffcx.codegeneration import jit
 from mpi4py import MPI
 from petsc4py import PETSc
 from ufl.algorithms import extract_coefficients
+
+from .library_cache import kernel_file, load_whole, put_seal
 
 Ints = npt.NDArray[np.int32]
 
@@ -97,20 +100,26 @@ def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
 
 
 def keep_kernels() -> None:
-    """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files."""
-    look_up = jit.get_cached_module
+    """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files. It
+    loads whole ones alone: others are compiled once more."""
+    look_up, load = jit.get_cached_module, jit._load_objects
     kept: dict[tuple[str, tuple[str, ...], str], tuple[Any, Any]] = {}
 
     def looked_up_once(name: str, objects: Sequence[str], folder: Any, timeout: int) -> tuple[Any, Any]:
         key = name, tuple(objects), str(folder)
         if key in kept:
             return kept[key]
-        found: tuple[Any, Any] = look_up(name, objects, folder, timeout)
+        found = load_whole(lambda: look_up(name, objects, folder, timeout), Path(folder), name)
         if found[0] is not None:  # None: it is compiled now
             kept[key] = found
         return found
 
-    jit.get_cached_module = looked_up_once
+    def load_compiled(folder: Any, name: str, objects: Sequence[str]) -> tuple[Any, Any]:
+        if (library := kernel_file(Path(folder), name)) is not None:
+            put_seal(library, Path(folder) / f"{name}.c")
+        return load(folder, name, objects)
+
+    jit.get_cached_module, jit._load_objects = looked_up_once, load_compiled
 
 
 def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:

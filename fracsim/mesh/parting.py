@@ -9,7 +9,7 @@ that has broken is in that part of its cluster, and past all that has come off i
 
 from __future__ import annotations
 
-from ctypes import Structure, byref, c_int64, c_void_p
+from ctypes import Structure, byref, c_int64
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from .compiled import at, library
+from .compiled import Int32, Int64, Uint8, address, at, library
 from .domain import Domain
 from .edges import EdgeGraph
 from .pieces import Pieces, find_pieces, followed
@@ -33,20 +33,24 @@ SOURCE = Path(__file__).with_suffix(".c")
 class _Given(Structure):
     """As parting.c has it."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("nodes", "broken", "edges", "end", "shared"))
+    _fields_ = (("nodes", Int32), ("broken", Uint8), ("edges", Int64), ("end", Int64), ("shared", Uint8))
 
 
 class _Room(Structure):
     """For what is reached of so many nodes, as parting.c has it, and its arrays."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("nodes", "place", "part", "cluster", "goes_on", "of_part"))
+    _fields_ = (
+        *((name, Int64) for name in ("nodes", "place", "part", "cluster")),
+        ("goes_on", Uint8),
+        ("of_part", Int64),
+    )
 
     def __init__(self, nodes: int) -> None:
         self.reached, self.parts, self._clusters, self.of_parts = (np.empty(nodes, np.int64) for _ in range(4))
         self.open = np.empty(nodes, bool)
         self._place = np.full(nodes, -1)
         arrays = self.reached, self._place, self.parts, self._clusters, self.open, self.of_parts
-        super().__init__(*(each.ctypes.data for each in arrays))
+        super().__init__(*map(address, arrays))
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,8 @@ class Parting:
         self._room = _Room(len(self._shared))
         edges = graph.edges_at
         self._kept = graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared
-        self._given = _Given(*(each.ctypes.data for each in self._kept))
+        self._given = _Given(*map(address, self._kept))
         self._code = library(SOURCE).reached
-        self._code.restype = c_int64
         self._look_everywhere()
 
     def look(self) -> Pieces:

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.compiled import address, at, library
+from ..mesh.compiled import Float64, Int64, address, at, library
 from .contacts import Contacts
 from .waiting import Helper
 
@@ -49,8 +49,8 @@ Values = npt.NDArray[np.float64]
 class _Crowd(ctypes.Structure):
     """As crowd.c has it."""
 
-    _fields_ = (("count", c_int64), ("bodies", c_int64), ("contact", c_void_p),
-                ("things", c_void_p), ("mass", c_void_p), ("inertia", c_void_p))  # fmt: skip
+    _fields_ = (("count", c_int64), ("bodies", c_int64), ("contact", Float64),
+                ("things", Int64), ("mass", Float64), ("inertia", Float64))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,7 @@ class Crowd:
 
 def _loops() -> ctypes.CDLL:
     """The functions of crowd.c, one of which tells where something is."""
-    loops = library(SOURCE)
-    loops.begun.restype = c_void_p
-    return loops
+    return library(SOURCE)
 
 
 def projected(p: Values, mu: Values) -> Values:

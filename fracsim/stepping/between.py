@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mesh.compiled import FASTER, at, built_together
+from ..mesh.compiled import FASTER, at, built_together, prepared
 from .levels import Blocks
 from .rows import Vector
 
@@ -27,18 +27,19 @@ class Between:
 
     def __init__(self, made: CDLL, P: Blocks, left: Values, right: Values) -> None:
         """`made`: `code` for blocks of that size."""
-        self._code, numbers = made, np.empty(P.values.size, np.float32)
+        numbers = np.empty(P.values.size, np.float32)
         pattern = c_int64(len(P.starts) - 1), at(P.starts), at(P.columns)
         made.scale(*pattern, at(P.values), at(left), at(right), at(numbers))
         self._all = *pattern, at(numbers)
+        self._add, self._add_transposed = (prepared(made, name, *self._all) for name in ("add", "add_transposed"))
 
     def add(self, x: Vector, y: Vector) -> None:
         """y += P x, of x with its ghosts."""
-        self._code.add(*self._all, x.place, y.place)
+        self._add(*self._all, x.place, y.place)
 
     def add_transposed(self, x: Vector, y: Vector) -> None:
         """y += P^T x, ghosts of y included."""
-        self._code.add_transposed(*self._all, x.place, y.place)
+        self._add_transposed(*self._all, x.place, y.place)
 
 
 def code(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:

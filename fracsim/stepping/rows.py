@@ -12,7 +12,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 
-from ..mesh.compiled import FASTER, at, built_together
+from ..mesh.compiled import FASTER, at, built_together, prepared
 
 Single = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
@@ -59,6 +59,9 @@ class Rows:
         self.blocks: Single = numbers[:-BEHIND].reshape(-1, size**2)
         self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
         self._all = *self._pattern, at(numbers)
+        self._residual, self._smooth, self._add = (
+            prepared(made, name, *self._all) for name in ("residual", "smooth", "add")
+        )  # fmt: skip
 
     def take(self, blocks: Values, left: Values, right: Values) -> None:
         """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
@@ -74,17 +77,17 @@ class Rows:
 
     def residual(self, b: Vector, x: Vector, left: Vector) -> None:
         """left = b - A x."""
-        self._code.residual(*self._all, b.place, x.place, left.place)
+        self._residual(*self._all, b.place, x.place, left.place)
 
     def smooth(self, by: Diagonal, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
         """d = keep d + take B (b - A x), to = x + d."""
-        self._code.smooth(
+        self._smooth(
             *self._all, by.place, c_float(keep), c_float(take), b.place, x.place, d.place, to.place
         )  # fmt: skip
 
     def add(self, x: Vector, y: Vector) -> None:
         """y += A x."""
-        self._code.add(*self._all, x.place, y.place)
+        self._add(*self._all, x.place, y.place)
 
 
 class Diagonal:
