@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
-from .process import INTERRUPTED, begin_process, begin_run, begin_work, import_dolfinx, is_first_rank, kept_out, leave
+from .process import (
+    INTERRUPTED,
+    begin_process,
+    begin_run,
+    begin_work,
+    import_dolfinx,
+    import_outside,
+    is_first_rank,
+    kept_out,
+    leave,
+)
 
 # typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
 with kept_out("rich"):
@@ -50,6 +60,7 @@ def run(
         raise InputError("--restart goes on with the run in the output folder, --overwrite throws it away: give one")
     if wall_limit is not None and not 0 <= wall_limit < math.inf:
         raise InputError(f"--wall-limit {wall_limit:g}: must be a number of seconds, 0 or more: --wall-limit 3600")
+    import_outside("mpi4py.MPI")
     from mpi4py import MPI
 
     from .study.file import find_study
@@ -147,6 +158,7 @@ def render(
     """Draw the split surface of runs off-screen: a picture, a sheet of several, or a film of all frames."""
     if not is_first_rank():
         return
+    import_outside("pyvista")
     from .report.pictures.look import Look, limits_of, size_of
     from .report.pictures.picture import render
 
@@ -171,6 +183,7 @@ def export(
     """Write the split surface of a run for Blender, Houdini and others: closed, in m."""
     if not is_first_rank():
         return
+    import_outside("pyvista")
     from .report.export import export
 
     _tell_of_runs([out])
@@ -191,6 +204,7 @@ def report(
     """Tables and plots of runs in one HTML file that needs nothing else, and CSVs beside it."""
     if not is_first_rank():
         return
+    import_outside("matplotlib")
     from .report.make import make_report
 
     begin_work()

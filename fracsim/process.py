@@ -168,8 +168,34 @@ def kept_out(name: str, stand_in: ModuleType | None = None) -> Iterator[None]:
             del sys.modules[name]
 
 
+@contextmanager
+def outside_working_folder() -> Iterator[None]:
+    """While it lasts, the process is in the root folder of the system, so that libraries read no settings of the
+    working folder as they start.
+
+    PETSc (.petscrc), petsc4py (petsc.cfg) and UCX (ucx.conf, with Open MPI) load libraries that such a file names, or
+    write files; DOLFINx, FFCx (*_options.json) and matplotlib (matplotlibrc) take paths from there. What is set in the
+    environment or the home folder holds. Not for several threads.
+    """
+    before = os.open(".", os.O_PATH | os.O_DIRECTORY)
+    try:
+        os.chdir("/")
+        yield
+    finally:
+        os.fchdir(before)
+        os.close(before)
+
+
+def import_outside(*names: str) -> None:
+    """Import modules that read settings of the working folder, without these."""
+    if not all(name in sys.modules for name in names):
+        with outside_working_folder():
+            for name in names:
+                importlib.import_module(name)
+
+
 def import_dolfinx() -> None:
-    """DOLFINx without dolfinx.utils, which is there for those who ask for it.
+    """DOLFINx without dolfinx.utils, which is there for those who ask for it. InputError: its settings are no JSON.
 
     It is for callers of PETSc from Numba, and parses C declarations as it is imported: a parser, a lexer and their
     regular expressions, 0.04 s.
@@ -177,9 +203,24 @@ def import_dolfinx() -> None:
     if "dolfinx" in sys.modules:
         return
     name = "dolfinx.utils"
-    with kept_out(name, ModuleType(name)):
+    with outside_working_folder(), kept_out(name, ModuleType(name)):
         dolfinx = importlib.import_module("dolfinx")
+        _read_settings("dolfinx", "jit")
+        _read_settings("ffcx", "options")
     del dolfinx.utils
+
+
+def _read_settings(library: str, module: str) -> None:
+    """Read the settings for compiling, which the library then keeps. InputError where the user's file is no JSON."""
+    try:
+        importlib.import_module(f"{library}.{module}").get_options()
+    except (OSError, ValueError, TypeError) as error:
+        folder = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
+        path = os.path.join(folder, library, "dolfinx_jit_options.json" if module == "jit" else "ffcx_options.json")
+        raise InputError(
+            f"the settings of {library} in {path} cannot be read: {error}; mend the file, which is a table in JSON, or "
+            "delete it"
+        ) from None
 
 
 def begin_work() -> None:

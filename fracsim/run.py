@@ -25,6 +25,7 @@ from .output.lock import FolderLock, claim
 from .output.progress import Progress
 from .output.summary import Meter, say, write_summary
 from .output.writing import written
+from .process import import_outside
 from .scene import Scene, build_scene
 from .stepping.stepper import StepReport
 from .study import Study
@@ -378,9 +379,10 @@ def _check(
 
 def _draw(folder: Path) -> None:
     """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
-    from .report.pictures.picture import render
-
     try:
+        import_outside("pyvista")
+        from .report.pictures.picture import render
+
         render(folder)
     except (ImportError, OSError, RuntimeError) as error:
         print(f"fracsim: no picture drawn: {error}", file=sys.stderr)

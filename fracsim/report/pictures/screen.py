@@ -18,7 +18,9 @@ def display() -> Iterator[None]:
         return
     read, write = os.pipe()
     command = [xvfb, "-displayfd", str(write), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    quiet = subprocess.DEVNULL
+    # not in the working folder, where it looks for keyboards
+    server = subprocess.Popen(command, pass_fds=[write], stdout=quiet, stderr=quiet, cwd="/")
     os.close(write)
     try:
         with os.fdopen(read) as pipe:
