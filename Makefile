@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all readers paraview bench table report report-full gallery lint format clean
+.PHONY: demo test test-all attack readers paraview bench table report report-full gallery lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -27,6 +27,13 @@ test: readers
 test-all: readers paraview
 	./env pytest $(parallel) -m "not ranks"
 	./env pytest -m ranks $(on_ranks)
+
+# Kills, full disks, damaged and changed files, links, signals, two runs in one folder (tests/attack); an hour on two cores.
+# `make attack quick=1`, `make attack kills=10 meshes=50`, `make attack seed=1 only=studies:17` (one again).
+attacks := kills signals disks pairs links checkpoints meshes studies
+attack:
+	./env env PYTHONPATH=tests python3 -m attack $(foreach each,$(attacks) seed only,$(if $($(each)),--$(each) $($(each)))) \
+	    $(if $(quick),--quick) -o out/attack
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:
