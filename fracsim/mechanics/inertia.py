@@ -54,8 +54,9 @@ class Mass(Protocol):
     def solve(self, force: Values, free: npt.NDArray[np.bool_]) -> Values:
         """(owned dofs,) a with M a = force (N) on free dofs and a = 0 on the others, m/s^2 (collective)."""
 
-    def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
-        """tangent += factor M, leaving rows and columns of prescribed dofs decoupled."""
+    def add_to(self, tangent: PETSc.Mat, factor: float, *, more_entries: bool = False) -> None:
+        """tangent += factor M, leaving rows and columns of prescribed dofs decoupled; `more_entries`: whether the
+        tangent may have entries where M has none."""
 
     def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
         """factor M, to be added to the blocks of a tangent, which is assembled after this (collective)."""
@@ -120,7 +121,7 @@ class LumpedMass:
         """(owned dofs,) a = force / m on free dofs, 0 elsewhere, m/s^2."""
         return np.where(free, force / self.lumped, 0.0)
 
-    def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
+    def add_to(self, tangent: PETSc.Mat, factor: float, *, more_entries: bool = False) -> None:
         """Add to the diagonal; on prescribed dofs it only scales a row that stands alone."""
         self._diagonal.array_w[:] = factor * self.lumped
         tangent.setDiagonal(self._diagonal, PETSc.InsertMode.ADD)
@@ -172,9 +173,11 @@ class ConsistentMass:
         matrix.destroy()
         return self._y.array_r.copy()
 
-    def add_to(self, tangent: PETSc.Mat, factor: float) -> None:
-        """One pass over the stored entries: both have the same pattern."""
-        tangent.axpy(factor, self._free, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    def add_to(self, tangent: PETSc.Mat, factor: float, *, more_entries: bool = False) -> None:
+        """One pass over the stored entries where both matrices have the same pattern, else row by row."""
+        structure = PETSc.Mat.Structure
+        same = structure.SUBSET_NONZERO_PATTERN if more_entries else structure.SAME_NONZERO_PATTERN
+        tangent.axpy(factor, self._free, same)
 
     def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
         """In all of them, which stay the same: cells that die keep their mass."""

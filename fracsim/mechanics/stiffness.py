@@ -47,7 +47,8 @@ class Stiffness:
 
     Attributes:
         form: of what K is the assembly of.    c_v: rate of the scheme that it is assembled with, 1/s.
-        pattern_changed: whether terms have coupled dofs that were not coupled before; whoever acts on it resets it.
+        pattern: how often the matrix has become another one, or has got entries at more places, since the start. PETSc
+            does not notice new entries: whatever was made for an earlier pattern has to be made anew by its owner.
         low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
         springs: the rest of what it lacks.
         couples: whether terms coupled dofs of different cells in the last tangent otherwise than by constants.
@@ -60,7 +61,7 @@ class Stiffness:
         self.domain, self.c_v = stress.domain, 0.0
         self._u, self._terms, self._stress, self._motion, self._mass = u, terms, stress, motion, mass
         self._owned = u.x.index_map.size_local * u.x.block_size
-        self.pattern_changed, self.couples = False, False
+        self.pattern, self.couples = 0, False
         self.low_rank: list[tuple[Values, Values]] = []
         self.springs: list[Stiff] = []
         self._coupled = False  # whether a coupling has ever been added
@@ -133,7 +134,9 @@ class Stiffness:
         """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a
         new matrix (collective)."""
         dead = self._stress.stressless
-        return dead is not None and self._mass.diagonal and self._assembly.fit(dead, share)
+        changed = dead is not None and self._mass.diagonal and self._assembly.fit(dead, share)
+        self.pattern += changed
+        return changed
 
     # --- a solve ---
 
@@ -196,7 +199,7 @@ class Stiffness:
         else:
             self._assembly(self._motion.bcs, more)
             if factor:
-                self._mass.add_to(self.matrix, factor)
+                self._mass.add_to(self.matrix, factor, more_entries=self._coupled)
         self._body_at = (small, self._displacement.copy()) if self._alone else None
 
     @property
@@ -265,7 +268,7 @@ class Stiffness:
         K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         part.destroy()
         self._coupled, self._mixed = True, self._mixed or not constant
-        self.pattern_changed |= bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+        self.pattern += bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
 
     @cached_property
     def _prescribed_rows(self) -> npt.NDArray[np.int32]:

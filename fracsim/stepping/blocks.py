@@ -10,6 +10,7 @@ no use for it: their matrices stay in the cache, and each product is called from
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from petsc4py import PETSc
@@ -30,22 +31,22 @@ class Blocks:
         single: what is multiplied with instead, in single precision.
     """
 
-    def __init__(self, tangent: PETSc.Mat, assembled: Products | None) -> None:
-        self.tangent = tangent
+    def __init__(self, tangent: PETSc.Mat, assembled: Products | None, pattern: Callable[[], int]) -> None:
+        """`pattern`: Stiffness.pattern."""
+        self.tangent, self._pattern = tangent, pattern
         self.assembled = assembled
         self.single: Finest | None = None
         self._copy: PETSc.Mat | None = None
-        self._entries, self._state = 0.0, -1
+        self._copied, self._state = -1, -1  # pattern and state of the tangent
 
     def follow(self) -> None:
         """Be the tangent as it is now (collective)."""
         if self.assembled is not None or self._state == (state := self.tangent.stateGet()):
             return
-        entries = self.tangent.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
-        if self._copy is not None and entries != self._entries:  # it has entries at more places
+        if self._copied != (pattern := self._pattern()):
             self.forget()
         self._copy = self.tangent.convert(PETSc.Mat.Type.BAIJ, self._copy or PETSc.Mat())
-        self._entries, self._state = entries, state
+        self._copied, self._state = pattern, state
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""

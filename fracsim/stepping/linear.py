@@ -90,7 +90,7 @@ class Linear:
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
             large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
-            bring=self._bring, inertia=lambda: inertia_share(balance),
+            bring=self._bring, pattern=lambda: self.stiffness.pattern, inertia=lambda: inertia_share(balance),
             nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
@@ -133,7 +133,7 @@ class Linear:
             self._blocks = self._products = None
         if self._by_blocks and worth_it(self.stiffness.matrix):
             blocks = self.stiffness.in_blocks()
-            self._blocks = Blocks(self.stiffness.matrix, blocks)
+            self._blocks = Blocks(self.stiffness.matrix, blocks, lambda: self.stiffness.pattern)
             self._products = self._blocks.matrix()
 
     def shrink(self) -> bool:
@@ -144,7 +144,6 @@ class Linear:
         if preconditioner.due == Due.NOTHING or not self.stiffness.shrink(1.0 if everything else SHRINK_BELOW):
             return False
         self._take_tangent()
-        preconditioner.due = Due.REBUILD
         return True
 
     # --- K at the present u ---
@@ -184,8 +183,6 @@ class Linear:
             self._blocks.follow()
         if (self.stiffness.low_rank or self.stiffness.springs) and self.ksp.getType() == "preonly":
             self.ksp.setType("gmres")  # factors are of the rest
-        if self.stiffness.pattern_changed:
-            self.preconditioner.due, self.stiffness.pattern_changed = Due.REBUILD, False
         self._know_rigid_motions()
         self.preconditioner.refresh(self.stiffness.matrix, self._products)
         self._hold()
@@ -222,11 +219,9 @@ class Linear:
 
         return in_single(body, assembled)
 
-    def _bring(self) -> bool:
+    def _bring(self) -> None:
         self.stiffness.bring_entries()
         self._know_rigid_motions()
-        changed, self.stiffness.pattern_changed = self.stiffness.pattern_changed, False
-        return changed
 
     @contextmanager
     def set_up_anew(self) -> Iterator[None]:

@@ -74,6 +74,8 @@ REFRESH_ITS = 10  # iterations that a refresh costs
 # broken in, refreshed
 SET_UP, REFRESHED = 100, 40
 THOROUGHLY = 0.6  # of them, where more is done in each iteration
+PATTERN = "pattern"  # attribute of a PC: Stiffness.pattern when it was set up
+
 # solves of which the slowest tells what it takes when fresh, where its cycle is quick (cycle): those of a step, as one
 # tangent of it may take three times the iterations of another, whichever it was made for. By two solves alone a jelly
 # that flies about seemed slow in each step, and was set up for
@@ -108,17 +110,18 @@ class Preconditioner:
         large: bool,
         loosen: Callable[[PETSc.PC], LooseParts | None],
         hasten: Callable[[PETSc.PC], Cycle | None],
-        bring: Callable[[], bool],
+        bring: Callable[[], None],
+        pattern: Callable[[], int],
         inertia: Callable[[], float],
         nodes: int,
     ) -> None:
         """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
         that sees to loose parts out of `pc`, None: there are none; `hasten`: what does the same in less time, None
         where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the entries of
-        the tangent to what they are, and tells whether they are at other places; `inertia`: of a cell, as a share of
-        its stiffness (all collective); `nodes`: of the body."""
+        the tangent to what they are; `pattern`: Stiffness.pattern; `inertia`: of a cell, as a share of its stiffness
+        (all collective); `nodes`: of the body."""
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
-        self.serving, self._loosen, self._bring = self.pc, loosen, bring
+        self.serving, self._loosen, self._bring, self._pattern = self.pc, loosen, bring, pattern
         self._inertia, self._nodes = inertia, nodes
         self._loose: LooseParts | None = None
         self._hasten = hasten
@@ -152,10 +155,11 @@ class Preconditioner:
         self._count()
         self._see_to_pieces()
         ksp = self._ksp
-        if self.due == Due.NOTHING:
+        if self.due == Due.NOTHING and not self._is_of_another_pattern():
             self._follow(tangent)
             return
-        if anew := self._bring() or self.due == Due.REBUILD:
+        self._bring()
+        if anew := self.due == Due.REBUILD or self._is_of_another_pattern():
             self.pc.reset()
             self._fresh_its = self._solves = 0
             self._torn = False
@@ -165,6 +169,7 @@ class Preconditioner:
         self.pc.setUseAmat(products is not None)
         ksp.setOperators(products or tangent, tangent)
         ksp.setUp()
+        self.pc.setAttr(PATTERN, self._pattern())
         self._cycle = self._hasten(self.pc)
         if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
             self._smooth_by_nodes()
@@ -172,6 +177,11 @@ class Preconditioner:
         self._refreshed_at = self._extra = 0.0 if anew or self._cycle is None else self._extra
         self._looks_for_parts = self._broken
         self._follow(tangent)
+
+    def _is_of_another_pattern(self) -> bool:
+        """Whether `pc` was set up for an earlier pattern of the tangent: factors would be written past the end of their
+        arrays."""
+        return self.pc.getAttr(PATTERN) not in (None, self._pattern())
 
     def _smooth_by_nodes(self) -> None:
         """On the finest level alone."""
