@@ -147,6 +147,8 @@ def begin_run() -> None:
     from petsc4py import PETSc
 
     PETSc.Sys.popSignalHandler()  # it calls MPI_Abort, which may hang in a process that has crashed
+    for number in (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV):
+        signal.signal(number, signal.SIG_DFL)  # Open MPI's own handler waits for ever where the heap is damaged
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
     faulthandler.enable()
     _run_begun = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -119,3 +120,18 @@ def test_names_of_300_letters(tmp_path: Path) -> None:
         done = fracsim(*arguments)
         assert done.returncode == 2, (arguments[0], done.stderr)
         assert done.stderr.startswith("fracsim: ") and done.stderr.count("\n") == 1 and "too long" in done.stderr
+
+
+@pytest.mark.parametrize("number", (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV))
+def test_a_crash_ends_the_process(number: signal.Signals) -> None:
+    """By the signal itself, with where Python was: no handler of PETSc or MPI runs, which may wait for ever."""
+    done = process(f"""
+import os
+from fracsim import process
+process._own = True
+process.begin_run()
+os.kill(os.getpid(), {int(number)})
+""")
+    assert done.returncode == -number
+    assert "Fatal Python error" in done.stderr
+    assert "Process received signal" not in done.stderr and "PETSC ERROR" not in done.stderr
