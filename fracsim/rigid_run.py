@@ -11,7 +11,17 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped
-from .output.checkpoint import Notes, checkpoint_path, read_arrays, read_notes, write_arrays
+from .output.checkpoint_file import (
+    LARGEST,
+    Notes,
+    Stored,
+    check_mesh,
+    checkpoint_path,
+    read_stored,
+    refusal,
+    require,
+    write_arrays,
+)
 from .output.folder import OutputClock, make_folder, versions
 from .output.history import History, history_columns, read_rows
 from .output.interrupt import Interrupt
@@ -26,6 +36,7 @@ if TYPE_CHECKING:
 
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")
+_SOMETIMES = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
 
 
 class RigidRun:
@@ -43,6 +54,7 @@ class RigidRun:
         self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
         self._start = scene.first.bodies.kinetic
+        self._saved_at: float | None = None  # s, of the last checkpoint
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
@@ -70,11 +82,15 @@ class RigidRun:
 
     def _resume(self) -> dict[str, npt.NDArray[Any]]:
         """Be where the checkpoint is."""
-        arrays, clock = read_arrays(self.folder, self.scene.mesh, CLOCK)
+        stored, stepper = read_stored(self.folder), self.scene.stepper
+        check_mesh(stored, self.scene.mesh)
+        arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
+        _check_stored(stored, stepper.saved(self.state), len(self.scene.obstacles))
         self._start = float(clock["start"])
-        self.state = self.scene.stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
-        self._earlier = read_notes(self.folder).monitors
-        self.blows, self.loads = self._earlier["blows"], self._earlier["loads"]
+        self.state = stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
+        if len(self.state.bodies) != len(stepper.names) or len(arrays["broken_at"]) != len(stepper.copies.damage()[1]):
+            raise refusal(stored.path, "its bodies are not those that its broken edges leave")
+        self.blows, self.loads, self._saved_at = earlier["blows"], earlier["loads"], self.state.t
         return arrays
 
     # --- a step, a frame, a checkpoint ---
@@ -107,13 +123,14 @@ class RigidRun:
         self._clock.wrote(state)  # type: ignore[arg-type]
 
     def checkpoint(self) -> Path:
-        """Write one; returns its path. Raises CannotWrite."""
+        """Write one of now: all states that a step ends with are finite; returns its path. Raises CannotWrite."""
         state, path = self.state, checkpoint_path(self.folder)
         arrays = self.scene.stepper.saved(state) | {"broken_at": self.frames.broken_at}
         arrays["worked"] = np.array([*self.history.worked.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         notes = Notes(self.text, {"blows": self.blows, "loads": self.loads})
         written(ALONE, path, lambda: write_arrays(path, arrays, clock, self.scene.mesh, notes))
+        self._saved_at = state.t
         return path
 
     # --- to the end ---
@@ -136,13 +153,16 @@ class RigidRun:
         return self._finish("done")
 
     def _saved(self, *, failed: bool) -> str:
-        """Write a checkpoint on the way out, and say where; none where an analysis `failed`: its blow would be lost."""
-        try:
-            if not failed:
-                return f"Checkpoint: {self.checkpoint()}; go on with --restart"
-        except NotConverged:
-            pass
-        return "No checkpoint was written: the blow that could not be analysed would be lost"
+        """Write a checkpoint on the way out, and say where; none where a step `failed`: a blow in it would be lost."""
+        if not failed:
+            return f"Checkpoint: {self.checkpoint()}; go on with --restart"
+        last = (
+            ""
+            if self._saved_at is None
+            else f". The last good checkpoint: {checkpoint_path(self.folder)} at t = "
+            f"{self._saved_at:g} s; go on with --restart"
+        )
+        return f"No checkpoint was written: a blow in the step that failed would be lost{last}"
 
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint
@@ -177,3 +197,34 @@ class RigidRun:
 def notes_of(scene: RigidScene) -> None:
     """Tell what was mended of the mesh while it was read."""
     say(ALONE, list(scene.mesh.notes))
+
+
+def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles: int) -> None:
+    """InputError where a checkpoint lacks something that a run goes on from, or has it in another shape, or not finite.
+
+    `fresh`: what the run would write at its start; `obstacles`: how many there are.
+    """
+    arrays, path = stored.arrays, stored.path
+    wanted = fresh | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
+    require(arrays, set(wanted), {*wanted, *_SOMETIMES}, path)
+    require(stored.clock, set(CLOCK), set(CLOCK), path)
+    require(stored.notes.monitors, {"blows", "loads"}, {"blows", "loads"}, path)
+    bodies = len(arrays["body.mass"])
+    for name, values in arrays.items():
+        first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})
+        if values.ndim == 0:
+            raise refusal(path, f"{name} is one number")
+        right = (*first.get(name, values.shape[:1]), *wanted.get(name, values).shape[1:])
+        if values.shape != right:
+            raise refusal(path, f"{name} has the shape {values.shape}, of this study it is {right}")
+        if name in ("overlap.depth", "broken_at"):  # without end; never
+            values = np.where(values == np.inf, 0.0, values)
+        elif name == "cut":  # in the middle
+            values = np.nan_to_num(values)
+        if not float(np.max(np.abs(values), initial=0.0)) < LARGEST:
+            raise refusal(path, f"{name} is not finite")
+    for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
+        if len({len(arrays.get(name, ())) for name in group}) > 1:
+            raise refusal(path, f"{' and '.join(group)} do not belong together")
+    if len(arrays.get("broken", ())) != np.count_nonzero(np.isfinite(arrays["broken_at"])):
+        raise refusal(path, "broken and broken_at do not belong together")

@@ -16,7 +16,8 @@ from mpi4py import MPI
 from .errors import CannotWrite, NotConverged, Stopped
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
-from .output.checkpoint import Notes, checkpoint_path, read_checkpoint, read_notes, write_checkpoint
+from .output.checkpoint import read_checkpoint, write_checkpoint
+from .output.checkpoint_file import Notes, checkpoint_path, read_notes
 from .output.folder import OutputClock, check_folder, check_readable, make_folder, versions
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
@@ -71,6 +72,7 @@ class Run:
         self.interrupt = interrupt or Interrupt(self.comm, wall_limit)
         self._text = study_text(scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
         self._meter = Meter(self.comm, scene.stepper, began)
+        self._forgets = False  # a checkpoint was written: the next step depends on what is in it alone
         stress, by_forces = scene.balance.stress, scene.study.output.cut == "forces"
         self._lock = FolderLock(folder)
         check = partial(_check, folder, scene.study, self._text, restart=restart, overwrite=overwrite)
@@ -115,6 +117,8 @@ class Run:
         self.watched = Watched(self.scene, self.history, self._meter)
         if notes is not None:
             self.watched.restore(notes.monitors)
+            if self.front is not None:
+                self.front.restore(notes.monitors)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
@@ -144,6 +148,9 @@ class Run:
 
     def step(self) -> StepReport:
         """Take a step and write its row of history.csv, but no frame. Raises NotConverged, CannotWrite (collective)."""
+        if self._forgets:
+            self.scene.stepper.forget()
+            self._forgets = False
         self.state, report = self.scene.stepper.advance(self.state)
         if report.broken:
             self.note_breaks()
@@ -170,13 +177,15 @@ class Run:
         self._meter.output += time.perf_counter() - began
 
     def checkpoint(self) -> Path:
-        """Write a checkpoint of now; returns its path. Raises CannotWrite (collective)."""
+        """Write a checkpoint of now, which the run goes on from as one that resumes does; returns its path. Raises
+        CannotWrite, and NotConverged where the state is not finite (collective)."""
         began = time.perf_counter()
-        notes, domain, breaks = Notes(self._text, self.watched.saved()), self.scene.domain, self.breaks
-        balance = self.scene.balance
+        domain, balance, breaks = self.scene.domain, self.scene.balance, self.breaks
+        front = self.front.monitors() if self.front is not None else {}
+        notes = Notes(self._text, self.watched.saved() | front)
         breaks.remember()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
-        self._saved_at = self.state.t
+        self._saved_at, self._forgets = self.state.t, True
         self._meter.output += time.perf_counter() - began
         return path
 
@@ -255,11 +264,10 @@ class Run:
 
     def _saved(self) -> str:
         """Write a checkpoint on the way out and say where; one of a body that went astray would spoil the last good."""
-        state = self.state
-        finite = bool(np.isfinite(state.u).all() and np.isfinite(state.v).all())
-        if not self.comm.allreduce(finite, op=MPI.LAND):
-            return "No checkpoint was written: the state is not finite"
-        return f"Checkpoint: {self.checkpoint()}; go on with --restart"
+        try:
+            return f"Checkpoint: {self.checkpoint()}; go on with --restart"
+        except NotConverged as error:
+            return f"No checkpoint was written: {error}. {self._last_saved()}"
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
@@ -270,6 +278,10 @@ class Run:
                 return self._saved()
         except CannotWrite:
             pass
+        return self._last_saved()
+
+    def _last_saved(self) -> str:
+        """Where the last good checkpoint is."""
         if self._saved_at is None:
             return "There is no checkpoint"
         path = checkpoint_path(self.folder)

@@ -83,7 +83,17 @@ class Balance:
         self._work = CellForm(self._sum_of_works(w, dx))
         self._work_at_supports = CellForm(self._sum_of_works(w, cells_measure(domain, self._cells_at_supports())))
         if self.scheme.implicit:
-            self.stiffness = Stiffness(self.u, self.terms, self.stress, self.motion, self.mass)
+            self.stiffness = self._new_tangent()
+
+    def _new_tangent(self) -> Stiffness:
+        return Stiffness(self.u, self.terms, self.stress, self.motion, self.mass)
+
+    def _renew_tangent(self) -> None:
+        """With the damage of now (collective)."""
+        self.stiffness.destroy()
+        self.stiffness = self._new_tangent()
+        self.stiffness.c_v = self.level.c_v
+        self.stiffness.damage_changed()
 
     def _sum_of_works(self, w: Expr, dx: ufl.Measure) -> Form:
         return sum_of_forms([term.work(w, dx) for term in self.terms])
@@ -343,6 +353,14 @@ class Balance:
                    if name.startswith(f"{term.name}.")}  # fmt: skip
             if own:
                 term.restore(own)
+
+    def forget(self) -> None:
+        """Forget what a checkpoint does not hold: the tangent is another one, whose matrix the solver has to take
+        (collective)."""
+        for term in self.terms:
+            term.forget()
+        if self.scheme.implicit:
+            self._renew_tangent()
 
     def driven(self) -> tuple[float, float]:
         """Work from outside that no nodal force shows, and what of it is lost, this rank's share, J (collective)."""

@@ -251,6 +251,9 @@ class Term:
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave on rank 0, with u and the damage of then; the same arrays on all ranks."""
 
+    def forget(self) -> None:
+        """Forget where it has looked, and what a search starts from: what a checkpoint does not hold (collective)."""
+
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
 

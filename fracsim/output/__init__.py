@@ -6,7 +6,7 @@ frame_files      a frame in all files that have frames
 fields           what a frame of fields.xdmf holds
 fields_file      fields.xdmf and fields.h5
 surface          surface.pvd and pieces.csv: the split surface in time
-checkpoint       state.h5, on any number of ranks
+checkpoint       state.h5, on any number of ranks; checkpoint_file: with its digest, and what is refused
 summary          summary.json
 energy_gain      energy from nowhere
 inverted_cells   cells turned inside out

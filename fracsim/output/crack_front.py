@@ -36,6 +36,14 @@ class CrackFront:
         """(1 + d,) as of the last look; nan where there has been no tip yet."""
         return self._figures
 
+    def monitors(self) -> dict[str, list[float]]:
+        """What a restart goes on from: the last tip, which stays once a crack has run through."""
+        return {"tip": [float(each) for each in self._figures[1:]]}
+
+    def restore(self, monitors: dict[str, list[float]]) -> None:
+        """Go on from `monitors`."""
+        self._figures[1:] = monitors["tip"]
+
     def look(self) -> None:
         """Edges have broken (collective)."""
         changed = np.flatnonzero(self._graph.pattern != self._pattern)

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError
 from ..stepping.state import State
-from .checkpoint import checkpoint_path, read_notes
+from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import read_times
 from .history import read_rows
 from .own_files import STUDY, check_not_resumable, check_owner, clear

@@ -12,6 +12,8 @@ from ..mesh.split.moments import Moments
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
+LARGEST = 1e150  # a number whose square overflows is as good as infinite
+
 
 @dataclass(frozen=True)
 class Bodies:
@@ -82,6 +84,11 @@ class Bodies:
         if not len(others):
             return self
         return Bodies(*(np.concatenate(both) for both in zip(vars(self).values(), vars(others).values(), strict=True)))
+
+    @property
+    def finite(self) -> bool:
+        """Whether all numbers are finite, and so are their squares."""
+        return all(float(np.max(np.abs(values), initial=0.0)) < LARGEST for values in vars(self).values())
 
     # --- sums ---
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..errors import NotConverged
 from ..mechanics.contact.obstacle import Obstacle
 from .analyses import Analyses, Strike
 from .blows import Blows, Strain
@@ -158,12 +159,13 @@ class RigidStepper:
     # --- a step ---
 
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
-        """The state a step later. Raises NotConverged where an analysis fails.
+        """The state a step later. Raises NotConverged where an analysis fails, or the motion is not finite.
 
         Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
         """
         began = clock = time.perf_counter()
         iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
+        _check_finite(bodies, state.t)
         self._broke.clear()
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.names)
@@ -179,6 +181,7 @@ class RigidStepper:
         self.blows.keep(touches, bodies, self.names)
         if dented := [number for number, each in self.copies.shapes.items() if each is not shapes.get(number)]:
             moved = self._reshaped(moved, dented)
+        _check_finite(moved, state.t + self._rules.step)
         pushed, worked = self._given_by(touches, state.t)
         fallen = moved.mass * ((moved.place - bodies.place) @ self._rules.gravity)
         work = state.work + float(fallen.sum()) + float(worked.sum())
@@ -293,3 +296,9 @@ class RigidStepper:
             np.concatenate([self._density * volume, free, stands]),
             np.concatenate([np.cbrt(volume) / 2, others.extent]),
         )
+
+
+def _check_finite(bodies: Bodies, t: float) -> None:
+    """NotConverged where bodies are, or move, at time t (s) as no numbers can say."""
+    if not bodies.finite:
+        raise NotConverged(f"the motion of the bodies is not finite at t = {t:g} s; look at velocities and time.step")

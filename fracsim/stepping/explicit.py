@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..mechanics.stable_step import SAFETY, stable_step
 from .after_step import Breaking, Flow, PassResult
 from .frequencies import cell_frequencies, damaged_frequencies
 from .state import State
-from .stepper import BalanceStepper, SolveResult, StepSizes
+from .stepper import BalanceStepper, SolveResult, StepReport, StepSizes
 from .stress_release import released_state
 
 if TYPE_CHECKING:
@@ -34,16 +35,13 @@ class ExplicitStepper(BalanceStepper):
 
     def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking) -> None:
         super().__init__(balance, sizes, flow, breaking)
-        self._frequencies: Values | None = None
         self._by_edges: EdgeFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
         self._a, self._b = rayleigh(balance)
 
     def _size(self, state: State) -> float:
         """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
-        stress = self.balance.stress
-        if self._frequencies is None or state.step % REFRESH == 0:
-            self._frequencies = cell_frequencies(stress)
-        squares = damaged_frequencies(stress, self._frequencies, self._of_edges())
+        assert state.frequencies is not None
+        squares = damaged_frequencies(self.balance.stress, state.frequencies, self._of_edges())
         fastest = self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)
         added = sum(term.frequency() for term in self.balance.terms)
         highest = float(np.sqrt(max(fastest + added, KINK * added)))
@@ -64,7 +62,7 @@ class ExplicitStepper(BalanceStepper):
     def settle(self, state: State) -> State:
         """As any stepper; the body's damage may have been changed from outside before, as by a restart."""
         self._by_edges = None
-        return super().settle(state)
+        return replace(super().settle(state), frequencies=cell_frequencies(self.balance.stress))
 
     def _recalled(self) -> None:
         super()._recalled()
@@ -92,6 +90,15 @@ class ExplicitStepper(BalanceStepper):
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         self.balance.arrive()
         return self._arrival
+
+    def _booked(
+        self, end: State, dt: float, solve: SolveResult, began: float, broken: int, elastic: float, work: float,
+        lost: float,
+    ) -> tuple[State, StepReport]:  # fmt: skip
+        """With the frequencies of the cells in the shape that they have at the end, every `REFRESH` steps."""
+        if end.step % REFRESH == 0:
+            end = replace(end, frequencies=cell_frequencies(self.balance.stress))
+        return super()._booked(end, dt, solve, began, broken, elastic, work, lost)
 
     def _released(self, end: State, solved: Values, result: PassResult) -> State:
         """Edges broke: from here on other cells set the step, too."""

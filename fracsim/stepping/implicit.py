@@ -31,9 +31,19 @@ class ImplicitStepper(BalanceStepper):
 
     def _recalled(self) -> None:
         super()._recalled()
+        self._tell_solver()
+
+    def _tell_solver(self) -> None:
+        """Tell the solver of the damage that there is, whenever that came about."""
         pattern = self.breaking.pattern
         torn = pattern is not None and total(self.comm, np.count_nonzero(pattern))[0] > 0
         self.solver.damage_changed(None if torn else 0)
+
+    def forget(self) -> None:
+        """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
+        self.balance.forget()
+        self.solver.renew()
+        self._tell_solver()
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
         return self._solve(state, dt, self._guess(state, dt))

@@ -37,7 +37,12 @@ class Solver:
 
     def __init__(self, balance: Balance, given: Options) -> None:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
-        self.balance = balance
+        self.balance, self._given = balance, given
+        self._failures_before = 0  # linear solves that failed before `renew`
+        self._make()
+
+    def _make(self) -> None:
+        balance, given = self.balance, self._given
         self._newton = newton = Newton(balance, given)
         self._downhill: Downhill | None = newton.first_down
         self._led_astray = 0  # solves running whose first exact tangents have misled
@@ -60,7 +65,7 @@ class Solver:
     @property
     def linear_failures(self) -> int:
         """Linear solves that failed outright and were taken as no correction."""
-        return self.linear.failures
+        return self._failures_before + self.linear.failures
 
     def solve(self, guess: Values) -> SolveResult:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice)."""
@@ -88,6 +93,12 @@ class Solver:
     def damage_changed(self, broke: int | None = None) -> None:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows)."""
         self._newton.damage_changed(broke)
+
+    def renew(self) -> None:
+        """Take the tangent that the balance has now, and keep nothing of earlier solves but counts (collective)."""
+        self._failures_before = self.linear_failures
+        self.destroy()
+        self._make()
 
     # --- what is tried ---
 

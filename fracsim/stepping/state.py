@@ -23,7 +23,10 @@ class State:
         forces: loads and reactions where the last step balanced them, N.    drag: damping forces there, N.
         memory: what parts of the body remember of their past, by name (damage, flow, terms): see stepping.memory.
         out_of_balance: (owned dofs,) residual that the last step ended with, N; None: none but the solver's tolerance.
-        before: (displacement a step ago, size of that step), from which a load path is extrapolated; None: unknown.
+        before: (displacement a step ago, size of that step), from which a quasi-static load path is extrapolated; None:
+            unknown, or not needed.
+        frequencies: (cells,) bounds of omega^2 of undamaged cells, 1/s^2, from which explicit steps take their size;
+            None: the scheme has no such limit.
     """
 
     u: Values
@@ -41,3 +44,4 @@ class State:
     memory: dict[str, object] = field(default_factory=dict)
     out_of_balance: Values | None = None
     before: tuple[Values, float] | None = None
+    frequencies: Values | None = None

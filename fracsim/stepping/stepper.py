@@ -16,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ..errors import NotConverged
 from ..mechanics.balance import Balance
@@ -76,6 +77,10 @@ class TooLong(Exception):
     """Edges break in a step that is longer than such a step may be (on all ranks)."""
 
 
+class NotFinite(Exception):
+    """The state at the end of a step is not finite (on all ranks)."""
+
+
 @dataclass
 class Trouble:
     """What went wrong on the way without ending the run: counts over its steps.
@@ -112,6 +117,9 @@ class Stepper(Protocol):
 
     def resume(self, state: State) -> State:
         """The state of a checkpoint, with a body whose damage and flow were read from it (collective)."""
+
+    def forget(self) -> None:
+        """Forget what a checkpoint does not hold, as a run that resumes from the checkpoint has done (collective)."""
 
     def advance(self, state: State) -> tuple[State, StepReport]:
         """Take one step, as large as state.dt allows (collective). Raises NotConverged at the smallest step."""
@@ -159,7 +167,10 @@ class BalanceStepper:
         balance.displace(state.u)
         self._recalled()
         balance.restore(state.memory.get("saved", {}))
-        return replace(self.remember(state), elastic=balance.stress.stored())
+        return self.remember(state)
+
+    def forget(self) -> None:
+        """Forget what a checkpoint does not hold; here: nothing that a step depends on."""
 
     def remember(self, state: State) -> State:
         """The state with the damage and the flow that the body has now, whoever brought them about."""
@@ -184,6 +195,11 @@ class BalanceStepper:
                 self.trouble.steps_retaken += 1
                 state = replace(state, dt=max(dt / 2, self.sizes.breaking), easy=0)
                 self._recall(state)
+            except NotFinite:
+                self.trouble.steps_failed += 1
+                self._recall(state)
+                self._begin(state, dt)  # what flowed and what terms did in the step is undone, too
+                state = self._easier(state, dt, SolveResult(False, 0, 0, "What the step ends with is not finite"))
 
     def _broken_in(self, dt: float) -> PassResult:
         """A pass of a step of dt s. Raises TooLong where edges break in it and it is longer than it may be then."""
@@ -257,9 +273,7 @@ class BalanceStepper:
         u, v, a = self._arrive(state, dt)
         work, viscous = work_done(balance, state, u, v, *acted, lumped=lumped)
         forces, drag = acted
-        end = replace(
-            state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag, before=(state.u, dt)
-        )
+        end = replace(state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag)
         flowed = self._let_flow()
         end, result = self._break(end, solved, dt)
         lost = viscous + (result.released + released + flowed)
@@ -276,6 +290,7 @@ class BalanceStepper:
     ) -> tuple[State, StepReport]:  # fmt: skip
         """The end of the step with its energies; those given are of this rank, J."""
         balance = self.balance
+        self._check_finite(end, work + lost + elastic)
         elastic += sum(term.stored() for term in balance.terms if term is not balance.stress)
         worked, rubbed = balance.driven()
         stiffened = balance.stiffen()
@@ -286,6 +301,12 @@ class BalanceStepper:
             end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, memory=self._memory()
         )
         return self._grown(end, broken), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
+
+    def _check_finite(self, end: State, energies: float) -> None:
+        """Raise NotFinite where the end of a step is not finite, or squares of it are not (collective)."""
+        squares = sum(float(np.vdot(each, each)) for each in (end.u, end.v, end.a, end.forces))
+        if not self.comm.allreduce(math.isfinite(squares + energies), op=MPI.LAND):
+            raise NotFinite
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""

@@ -136,10 +136,10 @@ class Surface:
             self.pairs = self._pairs_of(np.delete(self.made.elements, elements, axis=0))
         self._out = elements
 
-    def stiffen(self, factor: float) -> None:
-        """The barrier is stiffer by that factor from here on."""
-        self._how["stiffness"] *= factor
-        self.pairs.stiffen(factor)
+    def stiffen(self, stiffness: float) -> None:
+        """The barrier has this stiffness, Pa, from here on."""
+        self._how["stiffness"] = stiffness
+        self.pairs.stiffen(stiffness)
 
     def memory(self) -> Memory:
         """Shares of arms, elements that are left out, and when room is looked for again."""

@@ -161,28 +161,42 @@ class ExplicitObstacles(Obstacles):
         super().recall(points)
 
     def saved(self) -> dict[str, Values]:
-        """With rows of springs: obstacle, identity, stretch, stiffness; and sums of forces, on rank 0 (collective)."""
+        """With rows of springs: obstacle, rank, share of the surface, identity, stretch, stiffness; and sums of forces
+        on each rank, on rank 0 (collective). Ranks that share a point have a spring there each."""
         rows = [
-            np.column_stack([np.full(len(each.points), k), self.skin.identity(each.points), each.slip,
-                             each.stiffness])
+            np.column_stack([np.full(len(each.points), k), np.full(len(each.points), self.comm.rank),
+                             self.skin.area[each.points], self.skin.identity(each.points), each.slip, each.stiffness])
             for k, each in enumerate(self._past.springs)
         ]  # fmt: skip
         gathered = self.comm.gather((np.concatenate(rows), np.array(self._past.pushed)))
         if gathered is None:
             return super().saved()
         springs, pushed = zip(*gathered, strict=True)
-        return super().saved() | {"springs": np.concatenate(springs), "pushed": np.sum(pushed, axis=0)}
+        return super().saved() | {"springs": np.concatenate(springs), "pushed": np.array(pushed)}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         super().restore(saved)
-        rows, d = saved["springs"], self._domain.dim
-        springs = []
-        for number in range(len(self.obstacles)):
-            _, known, slip, k = np.split(rows[rows[:, 0] == number], [1, -1 - d, -1], axis=1)
-            springs.append(self._again(Springs(np.arange(len(known)), slip, k[:, 0]), known))
-        whole = saved["pushed"] if self.comm.rank == 0 else np.zeros_like(saved["pushed"])
-        self._past = Past(springs, list(whole))
+        rows, pushed = saved["springs"], saved["pushed"]
+        springs = [self._springs_of(rows[rows[:, 0] == number, 1:]) for number in range(len(self.obstacles))]
+        if len(pushed) == self.comm.size:
+            own = pushed[self.comm.rank]
+        else:  # by other ranks: the sum is what counts
+            own = pushed.sum(axis=0) if self.comm.rank == 0 else np.zeros_like(pushed[0])
+        self._past = Past(springs, list(own))
+
+    def _springs_of(self, rows: Values) -> Springs:
+        """Springs of the points of this rank, from rows of all ranks as `saved` has them. Where several had a spring at
+        the same point that of this rank counts, or of the lowest, for the share that this rank has now."""
+        rank, area, known, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
+        at = found_again(known, self.skin.identity(np.arange(len(self.skin.area))))
+        order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, at))
+        order = order[at[order] >= 0]
+        points, first = np.unique(at[order], return_index=True)
+        which = order[first]
+        had = area[which, 0]
+        share = np.where(had > 0, self.skin.area[points] / np.where(had > 0, had, 1.0), 1.0)
+        return Springs(points, slip[which], share * k[which, 0])
 
 
 def _no_tangent() -> tuple[Values, Values]:

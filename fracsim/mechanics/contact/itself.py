@@ -50,7 +50,7 @@ class SelfContact(Term):
         self.law, self._domain, self._u = law, domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = Coupling(domain)
-        self._stiff = STIFF * law.stiffness * domain.mean_edge ** (domain.dim - 2)
+        self._wall = STIFF * domain.mean_edge ** (domain.dim - 2)  # m^(d-2), times a stiffness in Pa
         mesh = _refined(domain) if self._is_refined(law) else domain.source
         self._skeleton = None if mesh is None else Skeleton(mesh)
         self._gather = gathering(domain, law)
@@ -138,8 +138,7 @@ class SelfContact(Term):
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        if "stiffness" in saved:
-            self._stiffer(float(saved["stiffness"][0]) / self.law.stiffness)
+        self._stiffen_to(float(saved["stiffness"][0]))
         if self._surface is not None:
             pause, waits = (int(each) for each in saved.get("pause", (1, 1)))
             self._surface.recall((saved["share"], saved["left_out"].astype(np.int64), (pause, waits)))
@@ -215,7 +214,7 @@ class SelfContact(Term):
             H = self._surface.pairs.hessian(x, exact=exact)
             if self._rubbing is not None:
                 H = (H + self._rubbing.hessian(x, exact=exact)).tocsr()
-            return self._surface.stiffness(self._level.blow.factor * H, self._stiff)
+            return self._surface.stiffness(self._level.blow.factor * H, self._wall * self.law.stiffness)
 
         K, stiff = on_root(self.comm, found) or (None, None)
         if not self.comm.bcast(K is not None and K.nnz):
@@ -258,14 +257,15 @@ class SelfContact(Term):
 
         factor, gained = from_root(self.comm, found)
         if factor > 1:
-            self._stiffer(factor)
+            self._stiffen_to(factor * self.law.stiffness)
         return gained if self.comm.rank == 0 else 0.0
 
-    def _stiffer(self, factor: float) -> None:
-        self.law = replace(self.law, stiffness=factor * self.law.stiffness)
-        self._stiff *= factor
+    def _stiffen_to(self, stiffness: float) -> None:
+        if stiffness == self.law.stiffness:
+            return
+        self.law = replace(self.law, stiffness=stiffness)
         if self._surface is not None:
-            self._surface.stiffen(factor)
+            self._surface.stiffen(stiffness)
 
     def drag(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""
@@ -301,6 +301,12 @@ class SelfContact(Term):
         x, way = self._start, self._gathered(self._level.at_end(u) - level.u)
         share = from_root(self.comm, lambda: self._free(x, way))
         return u if share == 1 else np.asarray(level.u + share * (u - level.u))
+
+    def forget(self) -> None:
+        """Forget which pairs were near (not collective)."""
+        self._moved = True
+        if self._surface is not None:
+            self._surface.pairs.forget()
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

@@ -5,6 +5,7 @@ Two kinds of pairs: points against elements, and in 3D edges against edges, each
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -53,9 +54,13 @@ class Near:
 
     def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[Kind], distance: float, margin: float) -> None:
         self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is known of any place."""
         self._candidates: list[ipctk.Candidates] = []
         self._found: list[tuple[Kind, ipctk.NormalCollisions]] = []
-        self._from = self._way = self._found_at = np.full(mesh.rest_positions.shape, np.nan)
+        self._from = self._way = self._found_at = np.full(self._mesh.rest_positions.shape, np.nan)
 
     def touching(self, x: Values) -> list[tuple[Kind, ipctk.NormalCollisions]]:
         """The pairs of each kind on which its barrier acts; those of the last x are kept."""
@@ -65,9 +70,9 @@ class Near:
             self._found_at = x.copy()
         return self._found
 
-    def stiffen(self, factor: float) -> None:
-        """Barriers are stiffer by that factor from here on; what touches stays."""
-        self._kinds = [replace(kind, stiffness=factor * kind.stiffness) for kind in self._kinds]
+    def stiffen(self, stiffness: Sequence[float]) -> None:
+        """Barriers have this stiffness of each kind, Pa, from here on; what touches stays."""
+        self._kinds = [replace(kind, stiffness=k) for kind, k in zip(self._kinds, stiffness, strict=True)]
         self._found = [(kind, pairs) for kind, (_, pairs) in zip(self._kinds, self._found, strict=False)]
 
     def candidates(self, x: Values) -> list[ipctk.Candidates]:

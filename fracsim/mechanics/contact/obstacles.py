@@ -222,6 +222,11 @@ class Obstacles(Touching, Term):
         if "cut" in saved:
             self.skin.restore_cut(saved["cut"])
 
+    def forget(self) -> None:
+        """Forget where facets were searched (not collective)."""
+        self.skin.forget()
+        self._touches = None
+
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self.skin.destroy()

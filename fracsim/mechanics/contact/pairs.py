@@ -53,9 +53,10 @@ class Pairs:
         faces = (corners,) if solid else ()
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest, ipctk.edges(corners) if solid else corners, *faces)
         # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
-        kinds = [((1 + solid) * stiffness, 1.0, "fv_candidates" if solid else "ev_candidates")]
-        kinds += [(stiffness, EDGES, "ee_candidates")] if solid else []
-        made = [Kind(share * distance, k, name) for k, share, name in kinds]
+        kinds = [(1.0 + solid, 1.0, "fv_candidates" if solid else "ev_candidates")]
+        kinds += [(1.0, EDGES, "ee_candidates")] if solid else []
+        self._times = [times for times, _, _ in kinds]
+        made = [Kind(share * distance, times * stiffness, name) for times, share, name in kinds]
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
@@ -80,9 +81,13 @@ class Pairs:
         found = sum(kind.barrier.hessian(pairs, self._mesh, on, how) for kind, pairs in self._near.touching(on))
         return csr_matrix(self._mesh.to_full_dof(found))
 
-    def stiffen(self, factor: float) -> None:
-        """The barrier is stiffer by that factor from here on."""
-        self._near.stiffen(factor)
+    def stiffen(self, stiffness: float) -> None:
+        """The barrier has this stiffness, Pa, from here on."""
+        self._near.stiffen([times * stiffness for times in self._times])
+
+    def forget(self) -> None:
+        """Forget which elements were near."""
+        self._near.forget()
 
     def least_gap(self, x: Values) -> float:
         """The least distance between elements on which the barrier acts, m; infinite where there is none."""

@@ -274,6 +274,10 @@ class Skin:
         """Be again what `saved_cut` gave."""
         self._cut = self._known_again(rows)
 
+    def forget(self) -> None:
+        """Forget the facets that were near, and where they were nearest: searches start from there."""
+        self._every = self._kept = None
+
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self.follow.destroy()

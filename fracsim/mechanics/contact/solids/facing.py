@@ -73,7 +73,8 @@ class Facing(Pairs):
     def __init__(self, rest: Values, elements: Ints, solid: Standing, *, distance: float, stiffness: float) -> None:
         """`rest` (n, 3) m and `elements` (k, 3) of the body; as for Pairs."""
         self.solid, self.count, self._of_body, self._reach = solid, len(rest), len(elements), distance
-        points, triangles = np.concatenate([rest, solid.here]), np.concatenate([elements, solid.triangles + len(rest)])
+        points = np.concatenate([rest, solid.points])  # in its own frame: the measures of its elements stay as they are
+        triangles = np.concatenate([elements, solid.triangles + len(rest)])
         super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=solid.friction)
         side = np.repeat(np.array([0, 1], np.int32), [len(rest), len(solid.points)])
         included = np.unique(triangles)
@@ -183,10 +184,15 @@ class Facings:
                 H = H + each.hessian(each.with_solid(x), exact=exact)[:size, :size]
         return csr_matrix(H)
 
-    def stiffen(self, factor: float) -> None:
-        """Barriers are stiffer by that factor from here on."""
+    def stiffen(self, stiffness: float) -> None:
+        """Barriers have this stiffness, Pa, from here on."""
         for each in self.each:
-            each.stiffen(factor)
+            each.stiffen(stiffness)
+
+    def forget(self) -> None:
+        """Forget which elements were near."""
+        for each in self.each:
+            each.forget()
 
     def least_gap(self, x: Values) -> float:
         """The least distance within the barrier, m; infinite where there is none."""
