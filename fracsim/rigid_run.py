@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,7 @@ class RigidRun:
         self._saved_at: float | None = None  # s, of the last checkpoint
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
+        self._saved_at = t  # s, of the last checkpoint
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
         names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.others.columns()
         if step is not None:
@@ -138,6 +140,15 @@ class RigidRun:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged, Stopped, CannotWrite."""
         try:
+            return self._run()
+        except CannotWrite as error:
+            raise CannotWrite(f"{error}. {self._rescued()}") from None
+        finally:
+            self.history.close()
+
+    def _run(self) -> dict[str, Any]:
+        """The loop, and a checkpoint where it does not end well."""
+        try:
             if self.state.step == 0:
                 self.write_frame()
             self._loop()
@@ -146,10 +157,6 @@ class RigidRun:
             saved = self._saved(failed=failed)
             self._finish("not converged" if failed else "stopped")
             raise type(error)(f"{error}. {saved}") from None
-        except CannotWrite as error:
-            raise CannotWrite(f"{error}. The run ended at t = {self.state.t:g} s") from None
-        finally:
-            self.history.close()
         return self._finish("done")
 
     def _saved(self, *, failed: bool) -> str:
@@ -163,6 +170,20 @@ class RigidRun:
             f"{self._saved_at:g} s; go on with --restart"
         )
         return f"No checkpoint was written: a blow in the step that failed would be lost{last}"
+
+    def _rescued(self) -> str:
+        """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
+        with contextlib.suppress(CannotWrite):
+            self._finish("could not write")
+        try:
+            if self.history.step == self.state.step:  # a step without its row would leave a gap
+                return self._saved(failed=False)
+        except CannotWrite:
+            pass
+        if self._saved_at is None:
+            return "There is no checkpoint"
+        path = checkpoint_path(self.folder)
+        return f"The last good checkpoint: {path} at t = {self._saved_at:g} s; go on with --restart"
 
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint
@@ -183,7 +204,7 @@ class RigidRun:
         summary = {
             "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
-            "split_cells": scene.stepper.copies.split_cells, "pieces": scene.stepper.count,
+            "split_cells": scene.stepper.copies.split_cells, "pieces": scene.stepper.count, **self._dust(),
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
             "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.copies.passes,
             "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
@@ -192,6 +213,12 @@ class RigidRun:
         }  # fmt: skip
         write_summary(ALONE, self.folder, summary)
         return summary
+
+    def _dust(self) -> dict[str, float]:
+        """How many pieces are single nodes, and their mass, kg."""
+        nodes = np.bincount(self.scene.stepper.shapes.piece_of_node, minlength=self.scene.stepper.count)
+        single = np.flatnonzero(nodes == 1)
+        return {"dust": len(single), "dust_mass": float(self.state.bodies.mass[single].sum())}
 
 
 def notes_of(scene: RigidScene) -> None:

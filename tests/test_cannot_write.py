@@ -156,3 +156,49 @@ def test_a_folder_that_is_gone(tmp_path: Path) -> None:
     ):
         Run(scene, out)()
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("stays", "every"), [(False, None), (True, 1e-9), (True, None)])
+def test_a_full_disk_in_a_rigid_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stays: bool, every: float | None
+) -> None:
+    """The message names a checkpoint of now, or the last good one, or says that there is none; runs go on from it."""
+    pytest.importorskip("mujoco", reason="an environment made without a network")
+    from fracsim.output import rigid_frames, writing
+    from fracsim.run import run_study
+    from test_rigid_study import study as falling
+
+    table, out = falling(output={"every": 10, "picture": False, "checkpoint": every}), tmp_path / "out"
+    write, calls, full_now = rigid_frames.SurfaceFiles.write, iter(range(100)), []
+
+    def full(self: Any, *arguments: Any) -> None:
+        if next(calls) == 2:
+            full_now.append(True)
+            raise OSError(28, "No space left on device")
+        write(self, *arguments)
+
+    def on_disk(comm: Any, path: Path, work: Any) -> Any:
+        def tried() -> Any:
+            if full_now and stays:
+                raise OSError(28, "No space left on device")
+            return work()
+
+        return writing.written(comm, path, tried)
+
+    monkeypatch.setattr(rigid_frames.SurfaceFiles, "write", full)
+    monkeypatch.setattr("fracsim.rigid_run.written", on_disk)
+    with pytest.raises(CannotWrite) as error:
+        run_study(MPI.COMM_SELF, table, out)
+    path = out / "checkpoint" / "state.h5"
+    wanted = f"Checkpoint: {path}; go on with --restart" if not stays else (
+        f"The last good checkpoint: {path} at t = 0.038 s; go on with --restart" if every else "There is no checkpoint"
+    )  # fmt: skip
+    assert str(error.value).endswith(f"surface.pvd: No space left on device. {wanted}")
+    if stays:
+        full_now.clear()
+    else:
+        assert json.loads((out / "summary.json").read_text())["outcome"] == "could not write"
+    if path.exists():
+        summary = run_study(MPI.COMM_SELF, table, out, restart=True)
+        whole = run_study(MPI.COMM_SELF, table, tmp_path / "whole")
+        assert (summary["steps"], summary["broken_edges"]) == (whole["steps"], whole["broken_edges"])

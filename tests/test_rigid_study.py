@@ -362,3 +362,17 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one() -> None:
     assert np.array_equal(pattern, others) and np.allclose(cut, cuts, atol=1e-6, equal_nan=True)
     assert (alone.passes, alone.iterations) == (first.passes, first.iterations)
     assert np.allclose(alone.saved()["starts"], first.saved()["starts"])
+
+
+@pytest.mark.parametrize("shape", ["curved", "planar"])
+def test_the_summary_tells_of_single_nodes(tmp_path: Path, shape: str) -> None:
+    """`dust` and its mass are those of the last frame of pieces.csv: a single node broken off by curved surfaces."""
+    weak = {"fracture": {"strength": 1e4}, "brittle": {"surfaces": 60, "spacing": 0.01, "shape": shape}}
+    summary = run_study(MPI.COMM_SELF, study(**weak, time={"scheme": "rigid", "step": 2e-3, "end": 0.02}), tmp_path)
+    with (tmp_path / "pieces.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    last = [row for row in rows if row["time"] == rows[-1]["time"]]
+    single = [float(row["mass"]) for row in last if row["nodes"] == "1"]
+    assert summary["dust"] == len(single) == (1 if shape == "curved" else 0)
+    assert summary["dust_mass"] == pytest.approx(sum(single), rel=1e-9) and summary["pieces"] == len(last) > 1
+    assert json.loads((tmp_path / "summary.json").read_text())["dust"] == len(single)
