@@ -24,6 +24,7 @@ from typing import Any, NoReturn, TextIO
 
 from .errors import STOP_SIGNALS, Exit, InputError
 
+DOLFINX = "0.9"
 INTERRUPTED = 130  # as typer and shells report SIGINT
 _READER_GONE = (errno.EPIPE, errno.EIO)  # EIO: of a terminal that was closed
 _FIRST_RANK_SPEAKS = 0.3  # s that other ranks wait before they end: the launcher ends all ranks with the first
@@ -207,6 +208,7 @@ def import_dolfinx() -> None:
     name = "dolfinx.utils"
     with outside_working_folder(), kept_out(name, ModuleType(name)):
         dolfinx = importlib.import_module("dolfinx")
+        _check_dolfinx(str(dolfinx.__version__))
         _read_settings("dolfinx", "jit")
         _read_settings("ffcx", "options")
     del dolfinx.utils
@@ -223,6 +225,16 @@ def _read_settings(library: str, module: str) -> None:
             f"the settings of {library} in {path} cannot be read: {error}; mend the file, which is a table in JSON, or "
             "delete it"
         ) from None
+
+
+def _check_dolfinx(version: str) -> None:
+    """InputError where it is another version than the one that fracsim runs with."""
+    if version.split(".")[:2] != DOLFINX.split("."):
+        raise InputError(
+            f"DOLFINx {version} is installed, and fracsim runs with {DOLFINX} (0.10 and later: not yet): install "
+            f"python3-dolfinx {DOLFINX}, as Debian 13 has it, or start commands by ./env, which finds or makes an "
+            "environment with it"
+        )
 
 
 def begin_work() -> None:
