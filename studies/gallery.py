@@ -104,7 +104,7 @@ ENTRIES = (
     ),
     one("table-loaf", "A loaf torn over a table, and chunks that fell on it.", "--view 0.35,-1.3,0.45"),
     one("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9"),
-    one("rigid-wall", "A wall of adobe as rigid bodies.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor"),
+    one("rigid-wall", "A wall of adobe as rigid bodies, from behind.", "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor"),
     one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
     one("rigid-rods", "Rods of steel, bent and dented.", "--sheet 0,2,-1 --floor --view 0.25,-1.3,0.45"),
     one("rigid-vase", "A vase dropped on a floor.", "--sheet 0,4,10,-1 --floor"),
