@@ -31,6 +31,7 @@ from .output.summary import say, write_summary
 from .output.writing import written
 from .rigid.stepper import RigidReport
 from .scene.rigid import RigidScene
+from .stepping.stepper import Abandoned
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,8 +99,9 @@ class RigidRun:
     # --- a step, a frame, a checkpoint ---
 
     def step(self) -> RigidReport:
-        """Take a step and write its row. Raises NotConverged, CannotWrite."""
+        """Take a step and write its row. Raises NotConverged, CannotWrite, and Abandoned where the run is to stop."""
         stepper = self.scene.stepper
+        self._interrupt.begin_step()
         self.state, report = stepper.advance(self.state)
         if report.broken:
             self.frames.note(stepper.copies.damage()[0], self.state.t)
@@ -188,15 +190,23 @@ class RigidRun:
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint
         while not self.scene.ended(self.state):
-            self.step()
+            try:
+                self.step()
+            except Abandoned:
+                raise self._stopped("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
             if done or self._clock.due(self.state):  # type: ignore[arg-type]
                 self.write_frame()
             if every is not None and time.monotonic() - last > every:
                 self.checkpoint()
                 last = time.monotonic()
-            if not done and (reason := self._interrupt.reason()):
-                raise Stopped(f"stopped by {reason} at t = {self.state.t:g} s after {self.state.step} steps")
+            if not done and self._interrupt.reason():
+                raise self._stopped()
+
+    def _stopped(self, more: str = "") -> Stopped:
+        """What ends the run now."""
+        reason, state = self._interrupt.reason(), self.state
+        return Stopped(f"stopped by {reason} at t = {state.t:g} s after {state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         state, scene = self.state, self.scene

@@ -28,7 +28,7 @@ from .output.summary import Meter, say, write_summary
 from .output.writing import written
 from .process import import_outside
 from .scene import Scene, build_scene
-from .stepping.stepper import StepReport
+from .stepping.stepper import Abandoned, StepReport
 from .study import Study
 from .study.file import completed, study_text
 from .watched import Watched, wants_surface
@@ -82,8 +82,7 @@ class Run:
                 self.state = scene.start()
                 self.breaks = Breaks(stress, scene.fracture, cut_by_forces=by_forces)
                 notes = self._resume() if restart else None
-                if reason := self.interrupt.signalled():
-                    raise Stopped(f"stopped by {reason} while the run was set up; nothing was written")
+                self.interrupt.check_setup()
                 self._prepare(notes, check)
         except BaseException:
             self._lock.release()
@@ -126,6 +125,7 @@ class Run:
         )  # fmt: skip
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
+        self._frame_of: int | None = None  # the step of the last frame of this part of the run
         # it tells how the run ended, which is open again
         written(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
@@ -147,10 +147,12 @@ class Run:
     # --- one step, one frame, one checkpoint ---
 
     def step(self) -> StepReport:
-        """Take a step and write its row of history.csv, but no frame. Raises NotConverged, CannotWrite (collective)."""
+        """Take a step and write its row of history.csv, but no frame. Raises NotConverged, CannotWrite, and Abandoned
+        where the run is to stop, with the state of before (collective)."""
         if self._forgets:
             self.scene.stepper.forget()
             self._forgets = False
+        self.interrupt.begin_step()
         self.state, report = self.scene.stepper.advance(self.state)
         if report.broken:
             self.note_breaks()
@@ -174,6 +176,7 @@ class Run:
         self.watched.look_at_frame(self.state.t)
         self.frames.write(self.state)
         self._clock.wrote(self.state)
+        self._frame_of = self.state.step
         self._meter.output += time.perf_counter() - began
 
     def checkpoint(self) -> Path:
@@ -212,6 +215,7 @@ class Run:
 
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
+        self.scene.stepper.heed(self.interrupt.abandons)
         try:
             with Progress(self.comm, self.scene.study.time.end) as progress:
                 self._loop(progress)
@@ -229,7 +233,10 @@ class Run:
             raise Stopped(f"stopped by {reason} before the first step, at t = {self.state.t:g} s")
         last, every = time.monotonic(), self.scene.study.output.checkpoint
         while not self.ended:
-            report = self.step()
+            try:
+                report = self.step()
+            except Abandoned:
+                raise self._stopped("; the step that was under way begins anew") from None
             done = self.ended
             if done or self._clock.due(self.state):
                 self.write_frame()
@@ -237,9 +244,15 @@ class Run:
             if every is not None and self.comm.bcast(time.monotonic() - last > every):
                 self.checkpoint()
                 last = time.monotonic()
-            if not done and (reason := self.interrupt.reason()):
-                self.write_frame()
-                raise Stopped(f"stopped by {reason} at t = {self.state.t:g} s after {self.state.step} steps")
+            if not done and self.interrupt.reason():
+                raise self._stopped()
+
+    def _stopped(self, more: str = "") -> Stopped:
+        """What ends the run now, with a frame of now (collective)."""
+        if self._frame_of != self.state.step:
+            self.write_frame()
+        reason, t = self.interrupt.reason(), self.state.t
+        return Stopped(f"stopped by {reason} at t = {t:g} s after {self.state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
@@ -352,7 +365,8 @@ def _run_rigid(
         claim(lock, check)
         from .rigid_run import RigidRun, notes_of
 
-        scene = build_rigid_scene(study, comm)
+        scene = build_rigid_scene(study, comm, heed)
+        interrupt.check_setup()
         claim(lock, check, make=True)
         notes_of(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
@@ -369,9 +383,13 @@ def _run_rigid(
             if comm.size > 1:
                 tell(comm, None)
 
-    with Interrupt(MPI.COMM_SELF, wall_limit) as interrupt, FolderLock(folder) as lock:
+    def heed() -> None:
+        if interrupt.abandons():
+            raise Abandoned
+
+    with Interrupt(MPI.COMM_SELF, wall_limit, alone=comm.size == 1) as interrupt, FolderLock(folder) as lock:
         if comm.rank:
-            help_rigid(comm)
+            help_rigid(comm, heed)
         return from_root(comm, first)
 
 

@@ -6,6 +6,7 @@ that come of it are analysed in turn under what of the blow falls on them, until
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -124,9 +125,12 @@ class Breakable:
         within: Within,
         options: Options | None = None,
         flow: Flow | None = None,
+        heed: Callable[[], None] | None = None,
     ) -> None:
         """`criterion`: where surfaces open, averaging by `within`; None: nothing does.    `options`: PETSc's.
-        `flow`: of what does not break; None: nothing flows."""
+        `flow`: of what does not break; None: nothing flows.    `heed`: is called before an analysis, and raises
+        Abandoned where the run is to stop."""
+        self._heed = heed
         self._stiffness, self._criterion, self._within, self._options = stiffness, criterion, within, options
         self._flow = flow
         self._domain, self.graph, self.passes, self.iterations = stiffness.stress.domain, graph, 0, 0
@@ -212,7 +216,9 @@ class Breakable:
 
     def stress(self, piece: int, loads: PointLoads) -> Values:
         """(cells, 3 or 6) stress of a piece under loads that fall on it, 0 in all other cells, Pa. Raises
-        NotConverged."""
+        NotConverged, and Abandoned where the run is to stop."""
+        if self._heed is not None:
+            self._heed()
         body = self._free(piece)
         self.passes += 1
         u = body(loads.nodal(len(self._domain.nodes)))

@@ -6,7 +6,7 @@ its own damage, from the first blow on that may break it. One that is dented is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
+Kept = tuple[dict[int, dict[str, npt.NDArray[Any]]], "dict[int, Shape]"]  # by the numbers of copies
 
 
 class Copies:
@@ -127,17 +128,23 @@ class Copies:
 
     # --- a checkpoint ---
 
-    def saved(self) -> dict[str, npt.NDArray[Any]]:
+    def kept(self, names: Iterable[int]) -> Kept:
+        """What the copies are now that bodies of these names are of, for `saved` once they have been struck."""
+        return {n: self.copy(n).saved() for n in {name // self.nodes for name in names}}, self.shapes.copy()
+
+    def saved(self, kept: Kept | None = None) -> dict[str, npt.NDArray[Any]]:
         """What a checkpoint keeps: keys (n, 2) of broken edges and their cuts; where surfaces started, and in which;
-        shapes of those that flowed."""
-        if self.shapes:  # nothing breaks where something flows
-            every = self.shapes.values()
+        shapes of those that flowed. `kept`: what copies were that have been struck since."""
+        before, shapes = ({}, self.shapes) if kept is None else kept
+        if shapes:  # nothing breaks where something flows
+            every = shapes.values()
             return {
-                "shape_of": np.array([*self.shapes]),
+                "shape_of": np.array([*shapes]),
                 "shape_points": np.stack([each.points for each in every]),
                 "shape_yields": np.stack([each.yields for each in every]),
             }
-        parts = {number: each.saved() for number, each in sorted(self._made.items())}
+        parts = {number: before[number] if number in before else each.saved()
+                 for number, each in sorted(self._made.items())}  # fmt: skip
         parts = {number: each for number, each in parts.items() if each}
         if not parts:
             return {}

@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from ..errors import NotConverged
 from ..mechanics.contact.obstacle import Obstacle
+from ..stepping.stepper import Abandoned
 from .analyses import Analyses, Strike
 from .blows import Blows, Strain
 from .bodies import Bodies
-from .copies import Copies
+from .copies import Copies, Kept
 from .engine import Engine
 from .geometry import Geometry, Shapes
 from .hertz import Hertz, reduced
@@ -60,6 +61,16 @@ class RigidReport:
     worked: Values
     krylov: int
     seconds: float
+
+
+@dataclass
+class _Begun:
+    """What a step began with beside its state: overlaps, what `Blows.saved` gave, and of copies that are analysed in it
+    what they were."""
+
+    overlaps: Overlaps
+    blows: dict[str, npt.NDArray[Any]]
+    copies: Kept | None = None
 
 
 @dataclass
@@ -109,6 +120,7 @@ class RigidStepper:
             Overlaps.none(),
         )
         self._engine: Engine | None = None
+        self._abandoned: _Begun | None = None  # what was before a step that was abandoned
         self._broke: set[int] = set()  # copies, in this step
         self.look_again()
 
@@ -141,10 +153,14 @@ class RigidStepper:
     # --- a checkpoint ---
 
     def saved(self, state: RigidState) -> dict[str, npt.NDArray[Any]]:
-        """Arrays that `restore` goes on from."""
+        """Arrays that `restore` goes on from; where the step after `state` was abandoned, as they were before it."""
         bodies = {f"body.{name}": values for name, values in vars(state.bodies).items()}
-        overlaps = {f"overlap.{name}": values for name, values in vars(self.overlaps).items()}
-        return {**bodies, **overlaps, **self.copies.saved(), **self.blows.saved()}
+        begun = self._abandoned or self._begun()
+        overlaps = {f"overlap.{name}": values for name, values in vars(begun.overlaps).items()}
+        return {**bodies, **overlaps, **self.copies.saved(begun.copies), **begun.blows}
+
+    def _begun(self) -> _Begun:
+        return _Begun(self.overlaps, {name: values.copy() for name, values in self.blows.saved().items()})
 
     def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
         """The state that `saved` was of, with the mesh as broken as then."""
@@ -159,10 +175,19 @@ class RigidStepper:
     # --- a step ---
 
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
-        """The state a step later. Raises NotConverged where an analysis fails, or the motion is not finite.
+        """The state a step later. Raises NotConverged where an analysis fails, or the motion is not finite, Abandoned
+        where the run is to stop; then `saved` gives what was before.
 
         Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
         """
+        begun, self._abandoned = self._begun(), None
+        try:
+            return self._advance(state, begun)
+        except Abandoned:
+            self._abandoned = begun
+            raise
+
+    def _advance(self, state: RigidState, begun: _Begun) -> tuple[RigidState, RigidReport]:
         began = clock = time.perf_counter()
         iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
         _check_finite(bodies, state.t)
@@ -170,7 +195,9 @@ class RigidStepper:
         moved, touches = self._moved(state, bodies)
         due = self.blows.look(touches, bodies, self.names)
         clock = self.phases.add("motion", clock)
-        struck = self.analyses(self._strikes(due, touches))
+        if strikes := self._strikes(due, touches):
+            begun.copies = self.copies.kept(each.name for each in strikes)
+        struck = self.analyses(strikes)
         clock = self.phases.add("analysis", clock)
         broken = sum(struck.values())
         if broken:

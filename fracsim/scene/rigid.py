@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -73,12 +74,15 @@ class RigidScene:
         return state.t >= self.study.time.end * (1 - 1e-12)
 
 
-def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScene:
-    """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit."""
+def build_rigid_scene(
+    study: Study, comm: MPI.Comm = MPI.COMM_SELF, heed: Callable[[], None] | None = None
+) -> RigidScene:
+    """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit. `heed`:
+    is called before an analysis, and raises Abandoned where the run is to stop."""
     single = checked_mesh(study)
     _check_shell(study, single)
     places = places_of(study)
-    copies, poses, density = _copies(study, single, places), Poses.of(places), float(study.material.density)
+    copies, poses, density = _copies(study, single, places, heed), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
     contact, obstacles = study.contact or Contact(), every_obstacle(study)
@@ -97,16 +101,16 @@ def build_rigid_scene(study: Study, comm: MPI.Comm = MPI.COMM_SELF) -> RigidScen
     return RigidScene(study, placed(single, places), stepper, obstacles, first, (single, poses))
 
 
-def help_rigid(comm: MPI.Comm) -> None:
-    """On all ranks but the first: analyse bodies, until it lets go."""
+def help_rigid(comm: MPI.Comm, heed: Callable[[], None] | None = None) -> None:
+    """On all ranks but the first: analyse bodies, until it lets go; `heed` as there."""
 
     def made(begin: tuple[Study, MeshData, list[Place]]) -> Copies:
-        return _copies(*begin)
+        return _copies(*begin, heed)
 
     serve(comm, made)
 
 
-def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:
+def _copies(study: Study, mesh: MeshData, places: list[Place], heed: Callable[[], None] | None) -> Copies:
     """Of the mesh, in its own axes."""
     stiffness = _operator(study, mesh)
     average = average_of(study, stiffness.stress.domain)
@@ -114,9 +118,9 @@ def _copies(study: Study, mesh: MeshData, places: list[Place]) -> Copies:
 
     def made(number: int, shape: Shape | None) -> Breakable:
         if study.plasticity is None:
-            return _breakable(study, stiffness, average, number)
+            return _breakable(study, stiffness, average, number, heed)
         own = stiffness if shape is None else _operator(study, replace(mesh, points=shape.points))
-        return _flowing(study, own, shape)  # type: ignore[arg-type]
+        return _flowing(study, own, shape, heed)  # type: ignore[arg-type]
 
     return Copies(made, Poses.of(places), sizes)
 
@@ -133,7 +137,7 @@ def _operator(study: Study, mesh: MeshData) -> Operator:
     return ShellStiffness(stress, mesh.shell, study.material.young, study.material.poisson, density)
 
 
-def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None) -> Breakable:
+def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None, heed: Callable[[], None] | None) -> Breakable:
     """A copy of the mesh that blows dent."""
     from ..rigid.denting import Flow
 
@@ -144,10 +148,12 @@ def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None) -> Breakab
     else:
         yields = shape.yields[domain.cell_input]
     flow, within = Flow(stiffness, yields, table.hardening), Within(None, domain.cell_count)
-    return Breakable(stiffness, EdgeGraph(domain), None, within, study.solver, flow)
+    return Breakable(stiffness, EdgeGraph(domain), None, within, study.solver, flow, heed)
 
 
-def _breakable(study: Study, stiffness: Operator, average: Average | None, number: int) -> Breakable:
+def _breakable(
+    study: Study, stiffness: Operator, average: Average | None, number: int, heed: Callable[[], None] | None
+) -> Breakable:
     """A copy of the mesh, with what breaks of it. Chance differs from copy to copy."""
     domain = stiffness.stress.domain
     graph, within = EdgeGraph(domain), Within(average, domain.cell_count)
@@ -157,7 +163,7 @@ def _breakable(study: Study, stiffness: Operator, average: Average | None, numbe
 
         strength, rules = strength_of(study, domain, graph, number), surface_rules(study.brittle, number)
         criterion = BrittleSurfaces(stiffness.stress, graph, strength, within, rules)
-    return Breakable(stiffness, graph, criterion, within, study.solver)
+    return Breakable(stiffness, graph, criterion, within, study.solver, heed=heed)
 
 
 def _check_shell(study: Study, mesh: MeshData) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,10 @@ class ImplicitStepper(BalanceStepper):
     def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking, solver: Solver) -> None:
         super().__init__(balance, sizes, flow, breaking)
         self.solver = solver
+
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Ask `abandons` (collective) between Newton iterations whether the step is to be abandoned."""
+        self.solver.heed(abandons)
 
     def troubles(self) -> dict[str, int]:
         """Counts by name of what failed on the way, over all ranks (collective)."""

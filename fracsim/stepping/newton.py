@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from .linear import Linear, chosen_options
 from .petsc_options import Options, OptionSet, refusing
-from .stepper import SolveResult
+from .stepper import Abandoned, SolveResult
 
 if TYPE_CHECKING:
     from .downhill import Downhill
@@ -52,6 +52,8 @@ class Newton:
         self.first_down: Downhill | None = None
         self._down: Downhill | None = None  # what the SNES of the last attempt goes by
         self.gets_dear: Callable[[int, int], bool] = lambda krylov, its: False
+        self._abandons: Callable[[], bool] = lambda: False
+        self._abandoned = False  # in the last solve
         chosen = chosen_options(balance, given)
         self._options = OptionSet(chosen)
         snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
@@ -105,6 +107,10 @@ class Newton:
     def goes_down(self) -> bool:
         """Whether the last attempt went by the incremental potential."""
         return self._down is not None
+
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Ask `abandons` (collective) between iterations whether to go on; else an attempt raises Abandoned."""
+        self._abandons = abandons
 
     # --- the tangent ---
 
@@ -169,7 +175,10 @@ class Newton:
                 self._down.descent.begin()
             if self.linear.forcing is not None:
                 self.linear.forcing.begin()
+            self._abandoned = False
             self.snes.solve(None, self._x)
+            if self._abandoned:
+                raise Abandoned
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
                 return newton, krylov, False
@@ -185,6 +194,8 @@ class Newton:
                 solved = self._is_small(left := balance.vector.norm(), its)
             if solved:
                 return SolveResult(True, its, krylov, "")
+            if self._abandons():
+                raise Abandoned
             if its == LINEAR_SOLVES or (made := self.linear.correct(self._little(left))) is None:
                 break
             left, krylov = made[0], krylov + made[1]
@@ -232,6 +243,9 @@ class Newton:
             return int(reason.DIVERGED_FNORM_NAN)
         if self._is_small(norms[2], its) or self._is_small_at_rest(snes, its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
+        if self._abandons():  # asked of SNES to end its solve, which then can be used again
+            self._abandoned = True
+            return int(reason.DIVERGED_INNER)
         if self.gets_dear(snes.getLinearSolveIterations(), its):
             return int(reason.DIVERGED_INNER)
         if self._down is not None and self.balance.scheme.inertia and self._down.stalls(snes.getFunctionNorm(), its):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -68,7 +68,8 @@ class Solver:
         return self._failures_before + self.linear.failures
 
     def solve(self, guess: Values) -> SolveResult:
-        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice)."""
+        """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice).
+        Raises Abandoned (heed)."""
         choice = self._choice
         if choice.begins_with_factors() and choice.trusts(result := self._attempt_directly(guess)):
             return result
@@ -84,6 +85,10 @@ class Solver:
         elif not self._misled(result):
             choice.iterate()
         return result
+
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Ask `abandons` (collective) between Newton iterations; where it says so, `solve` raises Abandoned."""
+        self._newton.heed(abandons)
 
     def linear_response(self, force: Values) -> Values:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u (Linear.response)."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Protocol
 
@@ -73,6 +74,10 @@ class StepSizes:
         return min(float(self.course(t)[0]), float(np.min(later - t, initial=math.inf)))
 
 
+class Abandoned(Exception):
+    """The step was given up since the run is to stop; the body is as at the start of the step (on all ranks)."""
+
+
 class TooLong(Exception):
     """Edges break in a step that is longer than such a step may be (on all ranks)."""
 
@@ -122,7 +127,11 @@ class Stepper(Protocol):
         """Forget what a checkpoint does not hold, as a run that resumes from the checkpoint has done (collective)."""
 
     def advance(self, state: State) -> tuple[State, StepReport]:
-        """Take one step, as large as state.dt allows (collective). Raises NotConverged at the smallest step."""
+        """Take one step, as large as state.dt allows (collective). Raises NotConverged at the smallest step, Abandoned
+        where the run is to stop."""
+
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Ask `abandons` (collective) inside long steps whether they are to be abandoned."""
 
 
 class BalanceStepper:
@@ -178,8 +187,25 @@ class BalanceStepper:
 
     # --- a step ---
 
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Steps without a system are short: nothing is asked inside them."""
+
     def advance(self, state: State) -> tuple[State, StepReport]:
-        """Take one step, as large as state.dt allows. Raises NotConverged at the smallest step."""
+        """Take one step, as large as state.dt allows. Raises NotConverged at the smallest step, Abandoned where the run
+        is to stop."""
+        try:
+            return self._advance(state)
+        except Abandoned:
+            self._go_back(state)
+            raise
+
+    def _go_back(self, state: State) -> None:
+        """Have the body as it was in a state (collective)."""
+        self._recall(state)
+        self._recall_flow_and_terms(state)
+        self.balance.displace(state.u)
+
+    def _advance(self, state: State) -> tuple[State, StepReport]:
         began = time.perf_counter()
         self._recall(state)
         while True:
@@ -223,12 +249,15 @@ class BalanceStepper:
     def _begin(self, state: State, dt: float) -> None:
         """The step begins, for the first time or once more: with what the body had flowed at its start, and terms as
         they were there."""
+        self._recall_flow_and_terms(state)
+        self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
+        self.breaking.begin(state.t, dt)
+
+    def _recall_flow_and_terms(self, state: State) -> None:
         if "flow" in state.memory:
             self.flow.recall(state.memory["flow"])
         if terms := state.memory.get("terms"):
             self.balance.recall(terms)
-        self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
-        self.breaking.begin(state.t, dt)
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end, and no sliver left over before it."""
