@@ -47,7 +47,6 @@ def begin_process() -> None:
 
 
 _PARENT = os.getppid()
-_LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")  # first letters of names of processes
 _own = False  # whether this process was started as a command line
 _run_begun = False
 
@@ -154,25 +153,12 @@ def begin_run() -> None:
         signal.signal(number, signal.SIG_DFL)  # Open MPI's own handler waits for ever where the heap is damaged
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
     faulthandler.enable()
-    if has_launcher():
-        from .output.interrupt import end_with_launcher
+    from .mesh.ranks import starts_ranks
+    from .output.interrupt import end_with_launcher
 
+    if starts_ranks(_PARENT):
         end_with_launcher(_PARENT)
     _run_begun = True
-
-
-def has_launcher() -> bool:
-    """Whether the parent of this process starts the ranks of a job (Linux)."""
-    return name_of(_PARENT).startswith(_LAUNCHERS)
-
-
-def name_of(process: int) -> str:
-    """The name of a process; "" where the system does not tell."""
-    try:
-        with open(f"/proc/{process}/comm", encoding="utf-8", errors="replace") as file:
-            return file.read().strip()
-    except OSError:
-        return ""
 
 
 # --- imports ---

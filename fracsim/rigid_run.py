@@ -26,6 +26,7 @@ from .output.checkpoint_file import (
 from .output.folder import OutputClock, make_folder, versions
 from .output.history import History, history_columns, read_rows
 from .output.interrupt import Interrupt
+from .output.progress import Done, Progress
 from .output.rigid_frames import RigidFrames
 from .output.summary import say, write_summary
 from .output.writing import written
@@ -49,9 +50,19 @@ class RigidRun:
     """
 
     def __init__(
-        self, scene: RigidScene, folder: Path, text: str, interrupt: Interrupt, *, frames: float, restart: bool = False
+        self,
+        scene: RigidScene,
+        folder: Path,
+        text: str,
+        interrupt: Interrupt,
+        *,
+        frames: float,
+        restart: bool = False,
+        progress: Progress | None = None,
     ) -> None:
-        """`text`: study.toml, without its head; `frames`: s between them, if not `output.every`."""
+        """`text`: study.toml, without its head; `frames`: s between them, if not `output.every`; `progress`: one that
+        tells already."""
+        self._progress = progress or Progress(first=True, end=scene.study.time.end)
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
         self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
@@ -142,7 +153,8 @@ class RigidRun:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged, Stopped, CannotWrite."""
         try:
-            return self._run()
+            with self._progress:
+                return self._run()
         except CannotWrite as error:
             raise CannotWrite(f"{error}. {self._rescued()}") from None
         finally:
@@ -151,9 +163,13 @@ class RigidRun:
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
         try:
+            self._progress.stage("the first step")
             if self.state.step == 0:
                 self.write_frame()
-            self._loop()
+            try:
+                self._loop()
+            finally:
+                self._progress.end_line()
         except (NotConverged, Stopped) as error:
             failed = isinstance(error, NotConverged)
             saved = self._saved(failed=failed)
@@ -191,17 +207,23 @@ class RigidRun:
         last, every = time.monotonic(), self.scene.study.output.checkpoint
         while not self.scene.ended(self.state):
             try:
-                self.step()
+                report = self.step()
             except Abandoned:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
             if done or self._clock.due(self.state):  # type: ignore[arg-type]
                 self.write_frame()
+            self._tell(report)
             if every is not None and time.monotonic() - last > every:
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self._interrupt.reason():
                 raise self._stopped()
+
+    def _tell(self, report: RigidReport) -> None:
+        state, pieces, dt = self.state, self.scene.stepper.count, self.scene.study.time.longest
+        more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
+        self._progress.update(Done(state.t, dt, state.step, self.broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
         """What ends the run now."""

@@ -23,7 +23,7 @@ from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
 from .output.lock import FolderLock, claim
-from .output.progress import Progress
+from .output.progress import Done, Progress
 from .output.summary import Meter, say, write_summary
 from .output.writing import written
 from .process import import_outside
@@ -60,16 +60,18 @@ class Run:
         overwrite: bool = False,
         wall_limit: float | None = None,
         interrupt: Interrupt | None = None,
+        progress: Progress | None = None,
         began: float | None = None,
     ) -> None:
         """Start or resume; makes the output folder, once nothing stands in the way any more (collective).
 
         `overwrite`: throw away a run there that could go on; `wall_limit`: s from now; `interrupt`: in its place, one
-        that listens already; `began`: when the work on the scene began (perf_counter). Raises InputError, and Stopped
-        where a signal came before anything was written.
+        that listens already; `progress`: one that tells already; `began`: when the work on the scene began
+        (perf_counter). Raises InputError, and Stopped where a signal came before anything was written.
         """
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
         self.interrupt = interrupt or Interrupt(self.comm, wall_limit)
+        self._progress = progress or Progress(first=self.comm.rank == 0, end=scene.study.time.end)
         self._text = study_text(scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
         self._meter = Meter(self.comm, scene.stepper, began)
         self._forgets = False  # a checkpoint was written: the next step depends on what is in it alone
@@ -197,7 +199,7 @@ class Run:
     def __call__(self) -> dict[str, Any]:
         """Run to the end; returns what summary.json says. Raises NotConverged, Stopped or CannotWrite, with where to go
         on from (collective)."""
-        with self._lock:
+        with self._lock, self._progress:
             return self._run_and_draw()
 
     def _run_and_draw(self) -> dict[str, Any]:
@@ -210,6 +212,7 @@ class Run:
         finally:
             self.history.close()
         if self.comm.rank == 0 and self.scene.study.output.picture:
+            self._progress.stage("drawing the last frame")
             _draw(self.folder)
         return summary
 
@@ -217,8 +220,10 @@ class Run:
         """The loop, and a checkpoint where it does not end well."""
         self.scene.stepper.heed(self.interrupt.abandons)
         try:
-            with Progress(self.comm, self.scene.study.time.end) as progress:
-                self._loop(progress)
+            try:
+                self._loop()
+            finally:
+                self._progress.end_line()
         except (NotConverged, Stopped) as error:
             end_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
             saved = self._saved()
@@ -226,7 +231,8 @@ class Run:
             raise type(error)(f"{error}. {saved}") from None
         return self._finish("done")
 
-    def _loop(self, progress: Progress) -> None:
+    def _loop(self) -> None:
+        self._progress.stage("the first step")
         if self.state.step == 0:
             self.write_frame()
         if reason := self.interrupt.signalled():
@@ -240,12 +246,17 @@ class Run:
             done = self.ended
             if done or self._clock.due(self.state):
                 self.write_frame()
-            progress.update(self.state, report, self.breaks.figures)
+            self._tell(report)
             if every is not None and self.comm.bcast(time.monotonic() - last > every):
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self.interrupt.reason():
                 raise self._stopped()
+
+    def _tell(self, report: StepReport) -> None:
+        broken, _, pieces = self.breaks.figures
+        more = f"Newton {report.solve.newton}  {report.seconds:.2g} s/step"
+        self._progress.update(Done(self.state.t, report.dt, self.state.step, broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
         """What ends the run now, with a frame of now (collective)."""
@@ -334,14 +345,22 @@ def run_study(
     if study.time.scheme == "rigid":
         how = {"restart": restart, "overwrite": overwrite}
         return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
-    with Interrupt(comm, wall_limit) as interrupt, FolderLock(folder) as lock:
+    progress = Progress(first=comm.rank == 0, end=study.time.end)
+
+    def stage(name: str) -> None:
+        progress.stage(name)
+        interrupt.check_setup()
+
+    with Interrupt(comm, wall_limit) as interrupt, FolderLock(folder) as lock, progress:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         on_root(comm, lambda: claim(lock, check))  # at once, not after a mesh of minutes
-        scene = build_scene(comm, study)
-        if scene.domain.source is not None:
+        scene = build_scene(comm, study, stage)
+        if scene.domain.source is not None and scene.domain.source.notes:
+            progress.end_line()
             say(comm, list(scene.domain.source.notes))
         try:
-            return Run(scene, folder, restart=restart, overwrite=overwrite, interrupt=interrupt, began=began)()
+            ways: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
+            return Run(scene, folder, restart=restart, overwrite=overwrite, **ways)()
         finally:
             scene.destroy()
 
@@ -365,14 +384,17 @@ def _run_rigid(
         claim(lock, check)
         from .rigid_run import RigidRun, notes_of
 
+        progress.stage("building the bodies")
         scene = build_rigid_scene(study, comm, heed)
         interrupt.check_setup()
         claim(lock, check, make=True)
+        progress.end_line()
         notes_of(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
         frames = study.output.interval or study.time.end / FRAMES
-        summary = RigidRun(scene, folder, text, interrupt, frames=frames, restart=restart)()
+        summary = RigidRun(scene, folder, text, interrupt, frames=frames, restart=restart, progress=progress)()
         if study.output.picture:
+            progress.stage("drawing the last frame")
             _draw(folder)
         return summary
 
@@ -387,7 +409,8 @@ def _run_rigid(
         if interrupt.abandons():
             raise Abandoned
 
-    with Interrupt(MPI.COMM_SELF, wall_limit, alone=comm.size == 1) as interrupt, FolderLock(folder) as lock:
+    alone, progress = comm.size == 1, Progress(first=comm.rank == 0, end=study.time.end)
+    with Interrupt(MPI.COMM_SELF, wall_limit, alone=alone) as interrupt, FolderLock(folder) as lock, progress:
         if comm.rank:
             help_rigid(comm, heed)
         return from_root(comm, first)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 PATIENCE = 5.0  # s that a rank which failed waits for the others to say that they failed as well
+LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")  # how names of their processes begin
 _FAILED = 7919  # tag of that message
 
 
@@ -88,6 +89,15 @@ def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late:
         time.sleep(PATIENCE)  # a lower rank says why, and ends this one
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
     comm.Abort(code or 1)
+
+
+def starts_ranks(process: int) -> bool:
+    """Whether a process is one that starts the ranks of a job; False where the system does not tell."""
+    try:
+        with open(f"/proc/{process}/comm", encoding="utf-8", errors="replace") as file:
+            return file.read().startswith(LAUNCHERS)
+    except OSError:
+        return False
 
 
 def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:

@@ -11,6 +11,7 @@ breaking    what flows and what breaks after a step
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -73,17 +74,31 @@ class Scene:
         self.balance.destroy()
 
 
-def build_scene(comm: MPI.Comm, study: Study) -> Scene:
-    """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit."""
-    return scene_on(distribute(comm, on_root(comm, lambda: checked_mesh(study)), study.mesh.order), study)
+def build_scene(comm: MPI.Comm, study: Study, stage: Callable[[str], None] = lambda name: None) -> Scene:
+    """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit.
+
+    `stage`: is told what is done from now on (collective).
+    """
+    stage("building the mesh" if study.mesh.builder else "reading the mesh")
+    mesh = on_root(comm, lambda: checked_mesh(study))
+    stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
+    return scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
 
 
-def scene_on(domain: Domain, study: Study, material: MaterialFields | None = None) -> Scene:
-    """The scene of a study on a mesh that is there; `material`: in place of the study's own."""
+def scene_on(
+    domain: Domain,
+    study: Study,
+    material: MaterialFields | None = None,
+    *,
+    stage: Callable[[str], None] = lambda name: None,
+) -> Scene:
+    """The scene of a study on a mesh that is there; `material`: in place of the study's own; `stage`: as above."""
+    stage("setting up the balance of forces (kernels are compiled the first time)")
     scheme = make_scheme(study.time)
     balance = balance_of(study, domain, scheme, material or material_of(study, domain))
     if not scheme.inertia:
         check_supports(domain, balance.motion)
+    stage("setting up what breaks and what solves")
     flow = flow_of(study, balance)
     breaking = breaking_of(study, balance)
     solver = Solver(balance, study.solver) if scheme.implicit else None
