@@ -81,7 +81,7 @@ def test_what_holds_a_side_reads_the_force_that_presses_it(scheme: str) -> None:
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.5}, boundary=[{"on": "top", "fix": "xy"}],
         contact={"distance": 0.03, "itself": False}, probe=[{"name": "held", "on": "top"}],
         obstacle=[{"name": "platen", "shape": "plane", "at": [0.0, 0.525], "normal": [0.0, -1.0],
-                   "velocity": [0.0, -0.2]}],
+                   "velocity": [0.0, -0.3]}],
         time={"scheme": scheme, "step": 0.01, "end": 0.05},
     )  # fmt: skip
     march(scene, state)

@@ -19,6 +19,7 @@ from ..mechanics.contact.barrier import Barrier
 from ..mechanics.contact.law import Law
 from ..mechanics.contact.obstacle import Obstacle
 from ..mechanics.contact.obstacles import Obstacles
+from ..mechanics.contact.set_down import set_down
 from ..mechanics.contact.shapes import Shape
 from ..mechanics.material import MaterialFields
 from ..mechanics.stress import Stress
@@ -54,13 +55,13 @@ OF_SPEED = 0.05
 
 def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
-    entries = obstacle_entries(study, domain.dim)
-    law = _law(_contact(study), domain, material)
+    entries, law = obstacle_entries(study, domain.dim), _law(_contact(study), domain, material)
     if not any(each.free for each in entries):
-        return Obstacles(domain, u, entries, law)
+        return set_down(domain, entries, law, partial(Obstacles, domain, u), mutual=False)
     from ..mechanics.contact.free_obstacles import FreeObstacles
 
-    return FreeObstacles(domain, u, entries, law, scheme)
+    made = partial(FreeObstacles, domain, u, scheme=scheme)
+    return set_down(domain, entries, law, made, mutual=True)
 
 
 def explicit_obstacles_of(
@@ -73,11 +74,12 @@ def explicit_obstacles_of(
     entries = obstacle_entries(study, domain.dim)
     contact = _contact(study)
     law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
-    if not any(each.free for each in entries):
-        return ExplicitObstacles(domain, u, entries, law, mass, most)
-    from ..mechanics.contact.explicit_free import ExplicitFreeObstacles
+    kind = ExplicitObstacles
+    if any(each.free for each in entries):
+        from ..mechanics.contact.explicit_free import ExplicitFreeObstacles
 
-    return ExplicitFreeObstacles(domain, u, entries, law, mass, most)
+        kind = ExplicitFreeObstacles
+    return set_down(domain, entries, law, partial(kind, domain, u, mass=mass, most=most), mutual=False)
 
 
 def _most_added(contact: Contact, domain: Domain, stress: Stress) -> float:
@@ -106,13 +108,19 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     of_speed = 0.0 if contact.creep else OF_SPEED
     how = crowd.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed, straight=_straight(study))
     if not any(each.free for each in entries.values()):
-        return Solids(domain, u, entries, how)
+        return _with_room(partial(Solids, domain, u, entries), how, contact, "an obstacle from a file and the body")
+    from ..mechanics.contact.set_down import before_solids
     from ..mechanics.contact.solids.free_term import FreeSolids
 
     every = enumerate(obstacles(study, domain.dim))
     rest = {number: each for number, each in every if each.shape != "mesh" and each.loose is None}
-    others = {number: _obstacle(each, number) for number, each in rest.items()}
-    return FreeSolids(domain, u, entries, how, scheme, others, cast("Barrier", law.barrier))
+    free = [each for each in entries.values() if each.free]
+    shapes = {number: _obstacle(each, number) for number, each in rest.items()}
+    others = before_solids(shapes, free, law.barrier.width, domain.mean_edge)
+    made = partial(
+        FreeSolids, domain, u, entries, scheme=scheme, others=others, barrier=cast("Barrier", law.barrier)
+    )  # fmt: skip
+    return _with_room(made, how, contact, "an obstacle from a file and the body")
 
 
 def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
@@ -175,13 +183,21 @@ def _self_contact(
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
     pieces, straight = contact.itself == "pieces", _straight(study)
     law = crowd.Law(distance, stiffness, contact.friction, creep, of_speed, pieces, straight)
+    return _with_room(made, law, contact, "parts of the body")
+
+
+def _with_room(made: Callable[[Any], Any], law: Any, contact: Contact, what: str) -> Any:
+    """The term that is `made` of a law whose barrier begins below half of the gap at rest between `what` (collective).
+
+    InputError where the study gives a distance that is more than the gap.
+    """
     term = made(law)
-    if (gap := term.least_gap()) == np.inf:
+    if (gap := term.least_gap()) >= (1 - 1e-6) * law.distance:
         return term
-    term.destroy()  # thin walls would push each other apart from the start
+    term.destroy()  # they would push each other apart from the start
     if contact.distance:
         raise InputError(
-            f"contact.distance = {distance:g} m is more than what lies between parts of the body at rest, {gap:.3g} m; "
+            f"contact.distance = {contact.distance:g} m is more than what lies between {what} at rest, {gap:.3g} m; "
             f"give at most {0.5 * gap:.2g}, or leave it out"
         )
     return made(replace(law, distance=0.5 * gap))

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.contact.overlap import LEAST, overlaps, pairs
+from ..mechanics.contact.overlap import overlaps, pairs
 from ..mechanics.contact.placed import Placed
 from ..mechanics.contact.pose import Pose
 from ..mechanics.contact.shapes import SHAPES, Shape
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+ROUND_OFF = 1e-9  # of the body's size: what overlaps an obstacle by less touches it, and may
 WITHIN = 1e-6  # least barycentric coordinate of what lies in a cell: bodies may touch
 DEEP = 0.05  # of the mean edge: rigid bodies may lie in an obstacle by so much, as convex parts of them may in a run
 PAIRS = 1 << 21  # of cells and points that are compared at a time
@@ -109,7 +110,7 @@ def _check_free(entries: list[Placing], placed: list[Placed | None]) -> None:
     """InputError where an obstacle that moves freely overlaps another one; those from files are left to the run."""
     shapes = [(number, each, at) for number, (each, at) in enumerate(zip(entries, placed, strict=True)) if at]
     among = pairs([_Named(each.name, each.loose is not None) for _, each, _ in shapes])  # type: ignore[misc]
-    for a, b, deep in overlaps([at for _, _, at in shapes], among, -LEAST):
+    for a, b, deep in overlaps([at for _, _, at in shapes], among):
         raise InputError(
             f"obstacle.{shapes[a][0]}: {shapes[a][1].name} moves freely and overlaps {shapes[b][1].name} at the start, "
             f"by {max(0.0, deep):.4g} m; move it away or make it smaller"
@@ -128,7 +129,7 @@ def _check_shape(entry: Placing, number: int, mesh: MeshData) -> None:
     if placed.beyond(mesh.points) > 0:
         return
     least = float(placed.distance(mesh.points).min())
-    if least <= 0:
+    if least < -ROUND_OFF * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
         raise InputError(
             f"obstacle.{number}: {entry.name} overlaps the body at the start, by {-least:.4g} m; "
             "move it away or make it smaller"

@@ -15,6 +15,7 @@ rigid_step, push  its pose in a step as the least of an incremental potential; w
 flights           what terms with free obstacles have in common
 turn              rotation vectors that are not small
 overlap           free obstacles that lie in others
+set_down          obstacles that start nearer to the body, or to a free one, than they act: moved back
 reach             how far points may go, first guesses that have passed through nothing
 
 explicit_obstacles  the term in explicit steps: penalty, and springs that hold and slip
@@ -49,8 +50,8 @@ explicit_itself   the term in explicit steps; pushing: a penalty on points befor
 
 solids            obstacles whose surface is read from a file, by the same
 
-All but the terms, what they alone use (touching, skin, course, free_pose) and `reach` are NumPy and SciPy alone: no
-DOLFINx, no MPI. Every rank asks about its own points.
+All but the terms, what they alone use (touching, skin, course, free_pose, set_down) and `reach` are NumPy and SciPy
+alone: no DOLFINx, no MPI. Every rank asks about its own points.
 
 IPC is M. Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49. Its barrier acts on squared
 distances; here it acts on the distance itself and is an energy per area, a law that does not depend on the mesh.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -52,6 +53,12 @@ class _Swept(Body):
 
     def _radius(self) -> float:
         return self._core()[2]
+
+    def _depth(self) -> float:
+        return self._radius()
+
+    def _resized(self, by: float) -> Self:
+        return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
 
     def _outline(self) -> Outline:
         axis, half, radius = self._core()

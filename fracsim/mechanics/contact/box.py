@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ...errors import InputError
 from .corner import Corner
 from .moments import rounded_box
 from .outlines import Outline, polygon, profile, rounded_block
-from .shape import FILLET, Body, Values, require_fillet, require_lengths
+from .shape import FILLET, Body, Values, require_fillet, require_lengths, resized_fillet
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,13 @@ class Box(Body):
 
     def _radius(self) -> float:
         return self.fillet
+
+    def _depth(self) -> float:
+        return min(self.size) / 2
+
+    def _resized(self, by: float) -> Box:
+        size = tuple(side + 2 * by for side in self.size)
+        return replace(self, size=size, rounding=resized_fillet(self.fillet, by))
 
     def _outline(self) -> Outline:
         half = self._half()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from .axes import frame, unit
 from .corner import Corner
 from .moments import revolved
 from .outlines import Outline, profile, surface_of_revolution
-from .shape import FILLET, Body, Values, require_fillet, require_lengths
+from .shape import FILLET, Body, Values, require_fillet, require_lengths, resized_fillet
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,13 @@ class Cylinder(Body):
 
     def _radius(self) -> float:
         return self.fillet
+
+    def _depth(self) -> float:
+        return min(self.radius, self.length / 2)
+
+    def _resized(self, by: float) -> Cylinder:
+        rounding = resized_fillet(self.fillet, by)
+        return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
 
     def _outline(self) -> Outline:
         radius, half = self._core()

@@ -62,6 +62,17 @@ class Obstacles(Touching, Term):
         """What touches has to be found anew."""
         self._touches = None
 
+    def gaps_at_rest(self) -> Values:
+        """(obstacles,) least gaps to points, and to facets where they are felt, of the body at rest where each obstacle
+        is at t = 0, m (collective)."""
+        x, placed = self.skin.rest, [each.placed(0.0) for each in self.obstacles]
+        least = np.array([self.skin.least(each.distance(x)) for each in placed])
+        for number in self._sharp:
+            facets = self.skin.facets.gaps(placed[number], x, self.width)
+            least[number] = min(least[number], float(facets.min(initial=np.inf)))
+        self.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
+        return least
+
     # --- what it adds to the balance ---
 
     def struck(self) -> Values:

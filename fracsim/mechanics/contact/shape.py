@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -113,9 +113,27 @@ class Body(ABC):
         S = self._moments()[1]
         return density * (np.trace(S) * np.eye(3) - S if self.dim == 3 else np.asarray(np.trace(S)))
 
+    def inset(self, by: float) -> Self:
+        """The body without the outermost `by` m of it, which is no more than `most_inset`; of a hollow one more room:
+        distances are more by as much, at rounded edges by no less."""
+        return self._resized(-self._sign * by)
+
+    @property
+    def most_inset(self) -> float:
+        """m; infinite of a hollow body."""
+        return float("inf") if self.hollow else self._depth() / 2
+
     @property
     def _sign(self) -> float:
         return -1.0 if self.hollow else 1.0
+
+    @abstractmethod
+    def _resized(self, by: float) -> Self:
+        """The same with its surface further out by `by` m, which may be negative."""
+
+    @abstractmethod
+    def _depth(self) -> float:
+        """The greatest distance of a point inside from the surface, m."""
 
     @abstractmethod
     def _distance(self, x: Values) -> Values: ...
@@ -135,6 +153,11 @@ class Body(ABC):
     @abstractmethod
     def _moments(self) -> tuple[float, Values]:
         """Volume and second moments S (d, d) of the filled body."""
+
+
+def resized_fillet(fillet: float, by: float) -> float:
+    """The rounding, m, of edges whose surface is further out by `by` m: never less than half of what it was."""
+    return max(fillet + by, fillet / 2)
 
 
 def require_lengths(shape: Shape, **lengths: float) -> None:
