@@ -23,8 +23,8 @@ from .output.checkpoint_file import (
     require,
     write_arrays,
 )
-from .output.folder import OutputClock, make_folder, versions
-from .output.history import History, history_columns, read_rows
+from .output.folder import OutputClock, check_text, make_folder, missing_frames, versions
+from .output.history import History, history_columns, read_earlier
 from .output.interrupt import Interrupt
 from .output.progress import Done, Progress
 from .output.rigid_frames import RigidFrames
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")
+_MONITORS = {"blows", "loads", "frames"}
 _SOMETIMES = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
 
 
@@ -67,14 +68,14 @@ class RigidRun:
         self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
         self._start = scene.first.bodies.kinetic
-        self._saved_at: float | None = None  # s, of the last checkpoint
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
         self._saved_at = t  # s, of the last checkpoint
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
         names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.others.columns()
         if step is not None:
-            read_rows(folder / "history.csv", history_columns(names), step)
+            read_earlier(folder / "history.csv", history_columns(names), step)
+            check_text(folder)
         interrupt.writing = True
         make_folder(folder, text, restart=restart)
         self.history = History(ALONE, folder / "history.csv", names, step)
@@ -85,6 +86,7 @@ class RigidRun:
             self.frames.resume(arrays["broken_at"])
             self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))
             self.history.worked |= dict(zip(self.history.worked, map(float, arrays["worked"]), strict=True))
+            say(ALONE, [*self.history.notes, *missing_frames(folder, self._had, self.frames.files.counts)])
         self._clock = OutputClock(scene.study.output.every, frames)
         self._clock.wrote(self.state)  # type: ignore[arg-type]
         written(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
@@ -104,7 +106,7 @@ class RigidRun:
         self.state = stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
         if len(self.state.bodies) != len(stepper.names) or len(arrays["broken_at"]) != len(stepper.copies.damage()[1]):
             raise refusal(stored.path, "its bodies are not those that its broken edges leave")
-        self.blows, self.loads, self._saved_at = earlier["blows"], earlier["loads"], self.state.t
+        self.blows, self.loads, self._had = earlier["blows"], earlier["loads"], earlier["frames"]
         return arrays
 
     # --- a step, a frame, a checkpoint ---
@@ -143,7 +145,8 @@ class RigidRun:
         arrays = self.scene.stepper.saved(state) | {"broken_at": self.frames.broken_at}
         arrays["worked"] = np.array([*self.history.worked.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
-        notes = Notes(self.text, {"blows": self.blows, "loads": self.loads})
+        counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.counts}
+        notes = Notes(self.text, counts)
         written(ALONE, path, lambda: write_arrays(path, arrays, clock, self.scene.mesh, notes))
         self._saved_at = state.t
         return path
@@ -181,13 +184,7 @@ class RigidRun:
         """Write a checkpoint on the way out, and say where; none where a step `failed`: a blow in it would be lost."""
         if not failed:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
-        last = (
-            ""
-            if self._saved_at is None
-            else f". The last good checkpoint: {checkpoint_path(self.folder)} at t = "
-            f"{self._saved_at:g} s; go on with --restart"
-        )
-        return f"No checkpoint was written: a blow in the step that failed would be lost{last}"
+        return f"No checkpoint was written: a blow in the step that failed would be lost. {self._last_saved()}"
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
@@ -198,6 +195,10 @@ class RigidRun:
                 return self._saved(failed=False)
         except CannotWrite:
             pass
+        return self._last_saved()
+
+    def _last_saved(self) -> str:
+        """Where the last good checkpoint is."""
         if self._saved_at is None:
             return "There is no checkpoint"
         path = checkpoint_path(self.folder)
@@ -267,7 +268,7 @@ def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles:
     wanted = fresh | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
     require(arrays, set(wanted), {*wanted, *_SOMETIMES}, path)
     require(stored.clock, set(CLOCK), set(CLOCK), path)
-    require(stored.notes.monitors, {"blows", "loads"}, {"blows", "loads"}, path)
+    require(stored.notes.monitors, _MONITORS, _MONITORS, path)
     bodies = len(arrays["body.mass"])
     for name, values in arrays.items():
         first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})

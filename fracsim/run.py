@@ -18,7 +18,7 @@ from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
 from .output.checkpoint import read_checkpoint, write_checkpoint
 from .output.checkpoint_file import Notes, checkpoint_path, read_notes
-from .output.folder import OutputClock, check_folder, check_readable, make_folder, versions
+from .output.folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
@@ -125,6 +125,9 @@ class Run:
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
             passing=self.watched.passing, resume_at=t, thickness=study.thickness,
         )  # fmt: skip
+        if notes is not None:
+            had = notes.monitors["frames"]
+            say(self.comm, [*self.history.notes, *missing_frames(folder, had, self.frames.counts)])
         self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
         self._clock.wrote(self.state)
         self._frame_of: int | None = None  # the step of the last frame of this part of the run
@@ -187,7 +190,7 @@ class Run:
         began = time.perf_counter()
         domain, balance, breaks = self.scene.domain, self.scene.balance, self.breaks
         front = self.front.monitors() if self.front is not None else {}
-        notes = Notes(self._text, self.watched.saved() | front)
+        notes = Notes(self._text, self.watched.saved() | front | {"frames": self.frames.counts})
         breaks.remember()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
         self._saved_at, self._forgets = self.state.t, True

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..stepping.state import State
 from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import read_times
-from .history import read_rows
+from .history import read_earlier
 from .own_files import STUDY, check_not_resumable, check_owner, clear
 from .same_study import check_same_study
 from .writing import reason, replace_text
@@ -60,9 +60,31 @@ def make_folder(folder: Path, study: str, *, restart: bool) -> None:
 
 def check_readable(folder: Path, columns: list[str], step: int) -> None:
     """InputError where what a run has written so far cannot be continued; changes nothing (rank 0)."""
-    read_rows(folder / "history.csv", columns, step)
+    read_earlier(folder / "history.csv", columns, step)
     if (folder / "fields.h5").exists():
         read_times(folder / "fields.h5")
+    check_text(folder)
+
+
+def check_text(folder: Path) -> None:
+    """InputError where what tells of frames of the surface is not text; changes nothing (rank 0)."""
+    for path in (folder / "surface.pvd", folder / "pieces.csv"):
+        try:
+            if path.exists():
+                path.read_text(encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--restart: cannot read {path} ({error}); move it away to go on without its frames"
+            ) from None
+
+
+def missing_frames(folder: Path, had: dict[str, int], has: dict[str, int]) -> list[str]:
+    """Notes on files by name that have fewer frames than they `had` as the run wrote its checkpoint."""
+    return [
+        f"{folder / name} has {has[name]} of the {count} frames that the run had written: the others are missing"
+        for name, count in had.items()
+        if has.get(name, count) < count
+    ]
 
 
 def versions(comm: MPI.Comm) -> dict[str, str]:

@@ -53,6 +53,14 @@ class FrameFiles:
         if surface:
             self.surface = _surface(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames in each file (rank 0; none elsewhere)."""
+        if self.fields is None:
+            return {}
+        surface = {} if self.surface is None or self.surface.made is None else self.surface.made[1].counts
+        return {"fields.h5": len(self.fields.times), **surface}
+
     def write(self, state: State) -> None:
         """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
         fields = self._values(state, self._breaks.pieces)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import csv
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,6 +33,7 @@ COLUMNS = (
 Reading = Callable[[], npt.NDArray[np.float64]]
 Figure = Callable[[], float]
 WORK = "work_"  # columns that are summed over steps
+_NAMED = 5  # gaps between rows that a note names
 # what a body of some thickness has as many times as one of 1 m: columns, and heads of columns of probes
 OF_THICKNESS = ("kinetic", "elastic", "dissipated", "external_work", "reaction_", "contact_", WORK, "kinetic_")
 
@@ -124,6 +126,7 @@ class History:
     Attributes:
         peaks: name -> greatest absolute value of each reaction so far, N.        step: of the last row.
         worked: name -> sum of the work of each obstacle so far, J.
+        notes: sentences on rows that a restart has not found (rank 0).
     """
 
     def __init__(
@@ -136,11 +139,15 @@ class History:
         self.step = resume_at or 0
         self.peaks = dict.fromkeys((name for name in probe_names if name.startswith("reaction_")), 0.0)
         self.worked = dict.fromkeys((name for name in probe_names if name.startswith(WORK)), 0.0)
+        self.notes: list[str] = []
         self._file: RawIOBase | None = written(comm, path, lambda: self._open(resume_at))
 
     def _open(self, resume_at: int | None) -> RawIOBase:
-        kept = read_rows(self._path, self.columns, resume_at) if resume_at is not None else []
-        replace_text(self._path, "".join(map(_line, [self.columns, *kept])))
+        earlier = Earlier([], []) if resume_at is None else read_earlier(self._path, self.columns, resume_at)
+        self.notes = earlier.notes
+        if not earlier.readable:
+            self.notes.append(f"it is {set_aside(self._path)} from here on, and {self._path.name} begins anew")
+        replace_text(self._path, "".join(map(_line, [self.columns, *earlier.rows])))
         return self._path.open("ab", buffering=0)
 
     def append(
@@ -178,18 +185,78 @@ class History:
             self._file.close()
 
 
-def read_rows(path: Path, columns: list[str], until: int) -> list[list[str]]:
-    """The whole rows up to a step. InputError where the file has other columns; none where there is no file."""
+@dataclass(frozen=True)
+class Earlier:
+    """What history.csv has of the steps before a restart.
+
+    Attributes:
+        rows: values of whole rows, one a step, in rising order.    notes: sentences on what is not as a run leaves it.
+        readable: whether it is a table of a run at all.
+    """
+
+    rows: list[list[str]]
+    notes: list[str]
+    readable: bool = True
+
+
+def read_earlier(path: Path, columns: list[str], until: int) -> Earlier:
+    """The rows up to the step of a checkpoint (rank 0). InputError where the file has other columns."""
     if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        head, *rows = [*csv.reader(file)] or [[]]
-    if head and head != columns:
+        return Earlier([], _of_missing(path, "is gone", [], until))
+    if not path.is_file():
+        raise InputError(f"--restart: {path} is no file; move it away to go on without its rows")
+    try:
+        lines = path.read_bytes().decode("utf-8-sig").splitlines(keepends=True)
+    except UnicodeDecodeError:
+        return Earlier([], _of_missing(path, "is not text", [], until), readable=False)
+    whole = [line.rstrip("\r\n").split(",") for line in lines if line.endswith("\n")]  # the last one may be cut
+    head = whole[0] if whole else lines[0].split(",") if lines else []
+    if any("\0" in name for name in head):
+        return Earlier([], _of_missing(path, "is not text", [], until), readable=False)
+    if head != columns and (whole or not ",".join(columns).startswith(",".join(head))):
         raise InputError(
             f"--restart: {path} has other columns than this study ({', '.join(sorted({*head} ^ {*columns}))}); "
             "move it away to go on without its rows"
         )
-    return [row for row in rows if len(row) == len(columns) and int(row[0]) <= until]
+    steps = [(step, row) for row in whole[1:] if 1 <= (step := _step(row, len(columns))) <= until]
+    known = dict(steps)
+    twice = sorted(step for step, count in Counter(step for step, _ in steps).items() if count > 1)
+    notes = _of_missing(path, "is cut or damaged" if lines else "is empty", sorted(known), until)
+    if twice:
+        notes.append(f"{path} had the rows of {_ranges(twice)} twice: the last ones are kept")
+    return Earlier([known[step] for step in sorted(known)], notes)
+
+
+def _step(row: list[str], columns: int) -> int:
+    """Of a row of numbers; 0: it is none."""
+    try:
+        return int(row[0]) if len([float(each) for each in row]) == columns else 0
+    except ValueError:
+        return 0
+
+
+def _of_missing(path: Path, why: str, there: list[int], until: int) -> list[str]:
+    """A note on the steps up to `until` that have no row."""
+    if not (missing := sorted({*range(1, until + 1)} - {*there})):
+        return []
+    return [f"{path} {why}: the rows of {_ranges(missing)} are missing, of the {until} that the run had taken"]
+
+
+def _ranges(steps: list[int]) -> str:
+    """Steps in words, ascending."""
+    ends = np.flatnonzero(np.diff(steps) > 1)
+    first, last = [steps[0], *(steps[end + 1] for end in ends)], [*(steps[end] for end in ends), steps[-1]]
+    parts = [str(a) if a == b else f"{a} to {b}" for a, b in zip(first, last, strict=True)]
+    more = f" and {len(parts) - _NAMED} more gaps" if len(parts) > _NAMED else ""
+    return f"step{'s' * (len(steps) > 1)} {', '.join(parts[:_NAMED])}{more}"
+
+
+def set_aside(path: Path) -> Path:
+    """Give a file another name, which no file has yet; returns that. Raises OSError."""
+    names = (path.with_name(f"{path.name}.unreadable{number}") for number in ("", *range(2, 1000)))
+    free = next(name for name in names if not os.path.lexists(name))
+    path.rename(free)
+    return free
 
 
 def _line(values: list[str]) -> str:

@@ -41,6 +41,7 @@ class SurfaceFiles:
             update_vtu(folder / entry.file)
         self._write_pvd()
         replace_text(self._csv, _csv_text([self._columns, *rows]))
+        self._with_rows = len({row[0] for row in rows})  # frames in pieces.csv
         for path in (folder / "surface").glob("*.vtu"):
             if FRAME.fullmatch(path.name) and f"surface/{path.name}" not in keep:
                 path.unlink()
@@ -49,6 +50,11 @@ class SurfaceFiles:
     def times(self) -> list[float]:
         return [entry.t for entry in self._entries if not entry.part]
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames in each file."""
+        return {self._pvd.name: len(self.times), self._csv.name: self._with_rows}
+
     def write(self, frame: Frame, beside: dict[str, Drawn] | None = None) -> Path:
         """The VTUs first, then the files that name them; `beside`: by the names of obstacles."""
         number = len(self.times)
@@ -56,6 +62,7 @@ class SurfaceFiles:
         write_vtu(self._folder / body.file, grid_of(frame))
         others = [(name, self._drawn(name, drawn, number)) for name, drawn in (beside or {}).items()]
         append(self._csv, _csv_text(_rows(frame.t, frame.pieces)).encode())
+        self._with_rows += 1
         self._entries += [body, *(Entry(frame.t, file, part, name) for part, (name, file) in enumerate(others, 1))]
         self._write_pvd()
         return self._folder / body.file
