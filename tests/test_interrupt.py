@@ -295,6 +295,37 @@ def test_a_crash_ends_the_process_and_says_where(tmp_path: Path) -> None:
     assert "Fatal Python error: Segmentation fault" in done.stderr and "in crash" in done.stderr
 
 
+ABANDONED = """
+import os, signal, sys
+from mpi4py import MPI
+from fracsim.output import interrupt
+interrupt.SHORT = -1.0
+asked, calls = interrupt.Interrupt.abandons, iter(range(1, 1000))
+def abandons(of):
+    if next(calls) == 9 and MPI.COMM_WORLD.rank == 1:
+        os.kill(os.getpid(), signal.SIGUSR1)
+    return asked(of)
+interrupt.Interrupt.abandons = abandons
+sys.argv = ["fracsim", "run", {study!r}, "-o", {out!r}]
+from fracsim.cli import program
+program()
+"""
+
+
+def test_ranks_abandon_a_step_together(tmp_path: Path) -> None:
+    """A signal that comes to one of two ranks ends both in the same Newton iteration; one rank goes on from there."""
+    strip, out = write_study(tmp_path / "strip.toml", STRIPS["passes"]), tmp_path / "out"
+    code = ABANDONED.format(study=str(strip), out=str(out))
+    whole = [*mpirun(2), sys.executable, "-c", code]
+    done = subprocess.run(whole, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == Exit.STOPPED, done.stderr
+    assert done.stderr.count("fracsim: stopped by signal SIGUSR1 at t = ") == 1
+    assert done.stderr.count("the step that was under way begins anew. Checkpoint: ") == 1
+    Run(build_scene(MPI.COMM_SELF, study(STRIPS["passes"])), out, restart=True)()
+    Run(build_scene(MPI.COMM_SELF, study(STRIPS["passes"])), tmp_path / "whole")()
+    assert_same(out, tmp_path / "whole")
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks the kernel of Linux")
 def test_ranks_end_with_mpirun(tmp_path: Path) -> None:
     """It is killed; so are its ranks, whatever they wait for."""

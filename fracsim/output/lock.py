@@ -42,7 +42,7 @@ class _Handle:
             return
         if os.getpid() == self._process:  # a child shares the lock, and must not end it
             with contextlib.suppress(OSError):
-                self._path.unlink()  # while the lock is held: nobody else can hold this very file
+                os.unlink(self._path)  # while the lock is held: nobody else can hold this very file
         with contextlib.suppress(OSError):
             os.close(self._descriptor)
         self._descriptor = -1
