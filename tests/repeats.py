@@ -8,6 +8,12 @@ REPEATS = (
     "test_restart.py::test_a_signal_right_after_the_start[2]",
     "test_restart.py::test_a_signal_ends_a_run_with_a_checkpoint[SIGTERM-0]",
     "test_restart.py::test_ending_mpirun_itself_leaves_a_checkpoint",
+    # Ctrl-C while a run imports, as SIGTERM; a step that is abandoned: of a body that flows, as of one that breaks
+    "test_interrupt.py::test_a_signal_while_a_run_imports_ends_it[2]",
+    "test_interrupt.py::test_a_long_step_is_abandoned[flow]",
+    # a run that nobody hears: its streams are closed, or its log is full; on a terminal: without mpirun
+    "test_process.py::test_a_run_goes_on_where_nobody_reads_what_it_says[> /dev/full",
+    "test_progress.py::test_a_terminal_has_a_line_that_rewrites_itself[0]",
     # another study than that of the checkpoint: on one rank, as a run that would be thrown away is on two
     "test_restart.py::test_the_study_compared_is_that_of_the_checkpoint[2]",
     # a checkpoint of two ranks: on one; the exit code of what does not converge: of the other codes on two ranks

@@ -202,8 +202,6 @@ def hang(run):
         C, lock = ctypes.PyDLL(None), ctypes.create_string_buffer(64)
         C.pthread_mutex_lock(lock), C.pthread_mutex_lock(lock)
     return step(run)
-def crash(run):
-    return ctypes.string_at(0) if run.state.step == 2 else step(run)
 def late(run):
     if run.state.step == 2:
         ready()
@@ -285,14 +283,6 @@ def test_a_signal_that_is_ignored_ends_nothing(tmp_path: Path) -> None:
     process.send_signal(signal.SIGUSR1)
     said, error = process.communicate(timeout=20)
     assert process.returncode == Exit.STOPPED and "stopped by signal SIGUSR1 at t = " in said + error
-
-
-def test_a_crash_ends_the_process_and_says_where(tmp_path: Path) -> None:
-    bar = write_study(tmp_path / "bar.toml", BAR)
-    code = START.format(folder=str(tmp_path), study=str(bar), what="crash")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=40, check=False)
-    assert done.returncode == -signal.SIGSEGV
-    assert "Fatal Python error: Segmentation fault" in done.stderr and "in crash" in done.stderr
 
 
 ABANDONED = """
