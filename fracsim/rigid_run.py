@@ -37,6 +37,8 @@ from .stepping.stepper import Abandoned
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from .rigid.copies import Copies
+
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")
 _MONITORS = {"blows", "loads", "frames"}
@@ -101,7 +103,7 @@ class RigidRun:
         stored, stepper = read_stored(self.folder), self.scene.stepper
         check_mesh(stored, self.scene.mesh)
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
-        _check_stored(stored, stepper.saved(self.state), len(self.scene.obstacles))
+        _check_stored(stored, stepper.saved(self.state), len(self.scene.obstacles), stepper.copies)
         self._start = float(clock["start"])
         self.state = stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
         if len(self.state.bodies) != len(stepper.names) or len(arrays["broken_at"]) != len(stepper.copies.damage()[1]):
@@ -259,7 +261,7 @@ def notes_of(scene: RigidScene) -> None:
     say(ALONE, list(scene.mesh.notes))
 
 
-def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles: int) -> None:
+def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Copies) -> None:
     """InputError where a checkpoint lacks something that a run goes on from, or has it in another shape, or not finite.
 
     `fresh`: what the run would write at its start; `obstacles`: how many there are.
@@ -286,5 +288,10 @@ def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles:
     for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
         if len({len(arrays.get(name, ())) for name in group}) > 1:
             raise refusal(path, f"{' and '.join(group)} do not belong together")
+    most = {"broken": len(copies) * copies.nodes, "starts_of": len(copies), "shape_of": len(copies)}
+    for name, count in most.items():
+        numbers = arrays.get(name, np.empty(0, np.int64))
+        if numbers.dtype.kind != "i" or np.any((numbers < 0) | (numbers >= count)):
+            raise refusal(path, f"{name} is not all from 0 to {count - 1}")
     if len(arrays.get("broken", ())) != np.count_nonzero(np.isfinite(arrays["broken_at"])):
         raise refusal(path, "broken and broken_at do not belong together")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,14 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.output.interrupt import Interrupt
+from fracsim.run import Run
+from fracsim.scene import build_scene
+from fracsim.stepping.stepper import Abandoned
 from fracsim.study import Study
 from fracsim.study.file import study_text
 from support.continued import CASES, differences, other, unlike
 from support.ranks import run_on_ranks
+from support.scenes import make_study
 
 # seconds each: what they show of a scheme or a feature a shorter case shows of another
 SLOW = {"free-obstacles", "contact-of-pieces", "newmark", "branching", "grains", "ductile-implicit", "explicit-joined"}
@@ -28,6 +34,24 @@ def test_a_run_that_resumes_takes_the_same_steps(tmp_path: Path, name: str) -> N
 @pytest.mark.ranks
 def test_on_two_ranks_as_well(tmp_path: Path) -> None:
     assert run_on_ranks("support.continued", 2, tmp_path)["differences"].tolist() == []
+
+
+@pytest.mark.parametrize("name", ["contact", "backward-euler", "one-solve"])
+def test_a_solver_that_is_renewed_leaves_nothing(tmp_path: Path, name: str) -> None:
+    """What was there before a checkpoint is given back: each would keep matrices. It asks on whether to stop."""
+    study = make_study(**{"solver": {}, "output": {"picture": False}} | CASES[name][0])
+    run = Run(build_scene(MPI.COMM_SELF, study), tmp_path)
+    solver, asked = run.scene.solver, iter([False, False, True])
+    assert solver is not None
+    run.step()
+    before = [weakref.ref(each) for each in (solver._newton, solver.linear, run.scene.balance.stiffness)]
+    run.scene.stepper.heed(lambda: next(asked, True))
+    run.checkpoint()
+    with pytest.raises(Abandoned):
+        while True:
+            run.step()
+    gc.collect()
+    assert [each() for each in before] == [None] * 3
 
 
 FLOOR = {"name": "floor", "shape": "plane", "at": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": 0.5}

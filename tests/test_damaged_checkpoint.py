@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from cases import STRIP, changed, fracsim_here, write_study
 from fracsim.errors import Exit
-from fracsim.run import Run
+from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.file import validate
 from support import damaged_checkpoint as damaged
@@ -96,3 +96,66 @@ def test_what_is_no_file_is_not_opened(stopped: Path, tmp_path: Path, kind: str)
         os.mkfifo(path) if kind == "fifo" else path.mkdir()
 
     assert "there is no checkpoint" in refused(stopped, tmp_path, damage)
+
+
+# --- of rigid bodies --------------------------------------------------------------------------------------------------
+
+FALLING: dict[str, Any] = {
+    "title": "falls", "mesh": {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1},
+    "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
+    "fracture": {"strength": 3e5, "kernel": "neighbours"}, "brittle": {"surfaces": 4},
+    "body": [{"position": [0.0, 0.0, 0.05], "rotation": [0.0, -0.1, 0.0], "velocity": [0.0, 0.0, -4.0]}],
+    "obstacle": [{"name": "floor", "shape": "plane", "at": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}],
+    "load": {"gravity": [0.0, 0.0, -9.81]}, "time": {"scheme": "rigid", "step": 2e-3, "end": 0.03},
+    "output": {"every": 10, "picture": False, "checkpoint": 1e-9},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def fallen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of a bar that has fallen and broken, at its end, and a study that ends later."""
+    pytest.importorskip("mujoco", reason="an environment made without a network")
+    folder = tmp_path_factory.mktemp("fallen")
+    assert run_study(MPI.COMM_SELF, validate(FALLING, "torn.toml"), folder / "out")["broken_edges"] > 0
+    write_study(folder / "torn.toml", FALLING, time={"end": 0.036})
+    return folder
+
+
+def _few(file: Any) -> None:
+    """One body less."""
+    for name in [each for each in file if each.startswith("body.")]:
+        values = file[name][:-1]
+        del file[name]
+        file[name] = values
+
+
+RIGID: dict[str, damaged.Edit] = {
+    **{f"no {name}": damaged.without(name) for name in (
+        "body.mass", "body.turn", "overlap.depth", "known.quiet", "broken_at", "worked", "broken", "cut", "starts_of",
+        "start", "work", "t",
+    )},
+    **{f"{name} nan": damaged.at(name, np.nan)
+       for name in ("body.place", "body.spin", "known.borne", "worked", "broken_at")},
+    "body.velocity of 1e300": damaged.at("body.velocity", 1e300), "a body less": _few,
+    "body.turn flat": damaged.array("body.turn", lambda turn: turn.reshape(len(turn), -1)),
+    "broken negative": damaged.at("broken", -1), "broken far out": damaged.at("broken", 10**9),
+    "broken short": damaged.array("broken", lambda keys: keys[1:]), "starts_of far out": damaged.at("starts_of", 7),
+    "broken_at short": damaged.array("broken_at", lambda at: at[:-1]),
+    "worked long": damaged.array("worked", lambda worked: np.append(worked, 0.0)),
+    "start nan": damaged.number("start", np.nan), "step -5": damaged.number("step", -5),
+    "t nan": damaged.number("t", np.nan), "an array more": lambda file: file.__setitem__("more", [1.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", RIGID)
+def test_rigid_bodies_that_cannot_be_are_refused(fallen: Path, tmp_path: Path, kind: str) -> None:
+    said = refused(fallen, tmp_path, lambda path: damaged.resealed(path, RIGID[kind]))
+    assert "digest" not in said
+
+
+def test_rigid_bodies_go_on_from_a_whole_one(fallen: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(fallen / "out", tmp_path / "out")
+    damaged.resealed(out / "checkpoint" / "state.h5", lambda file: None)
+    assert fracsim_here("run", fallen / "torn.toml", "-o", out, "--restart").returncode == 0
+    said = refused(fallen, tmp_path / "edited", lambda path: damaged.edit(path, RIGID["body.place nan"]))
+    assert "damaged: its digest" in said

@@ -79,6 +79,7 @@ class Linear:
         self._small: float | None = None  # of the last tangent
         self._blocks: Blocks | None = None  # of the tangent
         self._products: PETSc.Mat | None = None  # a matrix of them
+        self._condensed: PETSc.Mat | None = None  # of what is multiplied with, and of parts of low rank
         self.correction = balance.vector.duplicate()
         self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
         self._by_blocks = chosen["pc_type"] == "gamg"
@@ -112,13 +113,20 @@ class Linear:
     def _take_tangent(self) -> None:
         """Solve with the matrix that the balance has now."""
         self._use_blocks()
+        self._forget_condensed()
         self.operator = self._products or self.stiffness.matrix
         if self.stiffness.is_incomplete:
             from .condensed import Condensed
 
             parts, springs = (lambda: self.stiffness.low_rank), (lambda: self.stiffness.springs)
-            self.operator = Condensed(self.operator, parts, springs).matrix()
+            self.operator = self._condensed = Condensed(self.operator, parts, springs).matrix()
         self._know_rigid_motions()
+
+    def _forget_condensed(self) -> None:
+        """Its context holds this object, and so it would stay for ever."""
+        if self._condensed is not None:
+            self._condensed.destroy()
+            self._condensed = None
 
     def _know_rigid_motions(self) -> None:
         """Tell the matrix of them, once more where entries beyond its pattern were added: PETSc's sum is another matrix
@@ -302,6 +310,7 @@ class Linear:
             self._ending.destroy()
         if self._blocks is not None:
             self._blocks.forget()
+        self._forget_condensed()
         if self._near_null is not None:
             self._near_null.destroy()
 

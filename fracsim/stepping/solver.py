@@ -39,11 +39,13 @@ class Solver:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance, self._given = balance, given
         self._failures_before = 0  # linear solves that failed before `renew`
+        self._abandons: Callable[[], bool] = lambda: False
         self._make()
 
     def _make(self) -> None:
         balance, given = self.balance, self._given
         self._newton = newton = Newton(balance, given)
+        newton.heed(self._abandons)
         self._downhill: Downhill | None = newton.first_down
         self._led_astray = 0  # solves running whose first exact tangents have misled
         self._astray = 0  # solves to come that go downhill at once
@@ -88,6 +90,7 @@ class Solver:
 
     def heed(self, abandons: Callable[[], bool]) -> None:
         """Ask `abandons` (collective) between Newton iterations; where it says so, `solve` raises Abandoned."""
+        self._abandons = abandons
         self._newton.heed(abandons)
 
     def linear_response(self, force: Values) -> Values:

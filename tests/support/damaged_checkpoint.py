@@ -50,7 +50,7 @@ RAW: dict[str, Damage] = {
 }
 
 
-def _array(name: str, change: Callable[[Any], Any]) -> Edit:
+def array(name: str, change: Callable[[Any], Any]) -> Edit:
     def edit(file: h5py.File) -> None:
         values = change(file[name][()])
         del file[name]
@@ -59,21 +59,21 @@ def _array(name: str, change: Callable[[Any], Any]) -> Edit:
     return edit
 
 
-def _at(name: str, value: float) -> Edit:
+def at(name: str, value: float) -> Edit:
     """The first number of an array is another."""
 
     def change(values: Any) -> Any:
         values.reshape(-1)[0] = value
         return values
 
-    return _array(name, change)
+    return array(name, change)
 
 
-def _number(name: str, value: Any) -> Edit:
+def number(name: str, value: Any) -> Edit:
     return lambda file: file.attrs.__setitem__(name, value)
 
 
-def _without(name: str) -> Edit:
+def without(name: str) -> Edit:
     def edit(file: h5py.File) -> None:
         if name in file.attrs:
             del file.attrs[name]
@@ -83,7 +83,7 @@ def _without(name: str) -> Edit:
     return edit
 
 
-def _linked(name: str, link: Any) -> Edit:
+def linked(name: str, link: Any) -> Edit:
     def edit(file: h5py.File) -> None:
         del file[name]
         file[name] = link
@@ -116,40 +116,40 @@ def _huge(file: h5py.File) -> None:
 
 
 EDITS: dict[str, Edit] = {
-    **{f"no {name}": _without(name) for name in (
+    **{f"no {name}": without(name) for name in (
         "u", "v", "a", "forces", "chi", "plastic", "weakened", "integrity", "broken", "breaks",
         "t", "step", "dt", "dissipated", "work", "easy", "elastic", "mesh", "notes", "notes/study", "notes/monitors",
     )},
-    **{f"{name} nan": _at(name, np.nan) for name in ("u", "v", "a", "forces", "chi", "plastic", "integrity")},
-    "u infinite": _at("u", np.inf), "u of 1e300": _at("u", 1e300), "u short": _array("u", lambda u: u[:-1]),
-    "u long": _array("u", lambda u: np.concatenate([u, u[:1]])), "u flat": _array("u", lambda u: u.reshape(-1)),
-    "u of whole numbers in words": _array("u", lambda u: np.array([b"1.0"] * len(u))),
-    "u one number": _array("u", lambda u: 1.0), "u a group": _linked("u", h5py.SoftLink("/notes")),
-    "u elsewhere": _linked("u", h5py.ExternalLink("other.h5", "/u")),
-    "u by another name": _linked("u", h5py.SoftLink("/v")),
+    **{f"{name} nan": at(name, np.nan) for name in ("u", "v", "a", "forces", "chi", "plastic", "integrity")},
+    "u infinite": at("u", np.inf), "u of 1e300": at("u", 1e300), "u short": array("u", lambda u: u[:-1]),
+    "u long": array("u", lambda u: np.concatenate([u, u[:1]])), "u flat": array("u", lambda u: u.reshape(-1)),
+    "u of whole numbers in words": array("u", lambda u: np.array([b"1.0"] * len(u))),
+    "u one number": array("u", lambda u: 1.0), "u a group": linked("u", h5py.SoftLink("/notes")),
+    "u elsewhere": linked("u", h5py.ExternalLink("other.h5", "/u")),
+    "u by another name": linked("u", h5py.SoftLink("/v")),
     "u in another file": _elsewhere, "u put together": _virtual, "u huge": _huge,
-    "notes elsewhere": _linked("notes", h5py.ExternalLink("other.h5", "/notes")),
-    "chi above 1": _at("chi", 1.5), "chi below 0": _at("chi", -0.5), "chi short": _array("chi", lambda chi: chi[1:]),
-    "plastic short": _array("plastic", lambda rows: rows[:, :-1]),
-    "weakened out of range": _at("weakened", 10**6), "weakened negative": _at("weakened", -3),
-    "weakened permuted": _array("weakened", lambda keys: keys[::-1]),
-    "weakened twice": _array("weakened", lambda keys: np.concatenate([keys[:1], keys[:-1]])),
-    "weakened no edges": _array("weakened", lambda keys: np.column_stack([keys[:, 0] * 0, 20 + np.arange(len(keys))])),
-    "weakened short": _array("weakened", lambda keys: keys[:-1]),
-    "weakened of real numbers": _array("weakened", lambda keys: keys.astype(float)),
-    "integrity negative": _at("integrity", -1.0), "integrity whole": _at("integrity", 1.0),
-    "integrity short": _array("integrity", lambda values: values[:-1]), "breaks infinite": _at("breaks", np.inf),
-    "broken short": _array("broken", lambda keys: keys[1:]),
-    "t nan": _number("t", np.nan), "t infinite": _number("t", np.inf), "t before the start": _number("t", -1.0),
-    "t in words": _number("t", "late"), "t many": _number("t", [1.0, 2.0]), "step -5": _number("step", -5),
-    "step of a half": _number("step", 1.5), "step 0 later": _number("step", 0), "dt nan": _number("dt", np.nan),
-    "dt 0": _number("dt", 0.0), "dt backwards": _number("dt", -0.1),
-    "dissipated infinite": _number("dissipated", np.inf),
-    "work nan": _number("work", np.nan), "easy -1": _number("easy", -1), "a step before": _number("dt_before", 0.1),
-    "another mesh": _number("mesh", "0123456789abcdef"),
+    "notes elsewhere": linked("notes", h5py.ExternalLink("other.h5", "/notes")),
+    "chi above 1": at("chi", 1.5), "chi below 0": at("chi", -0.5), "chi short": array("chi", lambda chi: chi[1:]),
+    "plastic short": array("plastic", lambda rows: rows[:, :-1]),
+    "weakened out of range": at("weakened", 10**6), "weakened negative": at("weakened", -3),
+    "weakened permuted": array("weakened", lambda keys: keys[::-1]),
+    "weakened twice": array("weakened", lambda keys: np.concatenate([keys[:1], keys[:-1]])),
+    "weakened no edges": array("weakened", lambda keys: np.column_stack([keys[:, 0] * 0, 20 + np.arange(len(keys))])),
+    "weakened short": array("weakened", lambda keys: keys[:-1]),
+    "weakened of real numbers": array("weakened", lambda keys: keys.astype(float)),
+    "integrity negative": at("integrity", -1.0), "integrity whole": at("integrity", 1.0),
+    "integrity short": array("integrity", lambda values: values[:-1]), "breaks infinite": at("breaks", np.inf),
+    "broken short": array("broken", lambda keys: keys[1:]),
+    "t nan": number("t", np.nan), "t infinite": number("t", np.inf), "t before the start": number("t", -1.0),
+    "t in words": number("t", "late"), "t many": number("t", [1.0, 2.0]), "step -5": number("step", -5),
+    "step of a half": number("step", 1.5), "step 0 later": number("step", 0), "dt nan": number("dt", np.nan),
+    "dt 0": number("dt", 0.0), "dt backwards": number("dt", -0.1),
+    "dissipated infinite": number("dissipated", np.inf),
+    "work nan": number("work", np.nan), "easy -1": number("easy", -1), "a step before": number("dt_before", 0.1),
+    "another mesh": number("mesh", "0123456789abcdef"),
     "an array more": lambda file: file.__setitem__("more", [1.0]),
-    "a number more": _number("more", 1.0), "study no TOML": _linked("notes/study", "title = ["),
-    "monitors no JSON": _linked("notes/monitors", "{"),
+    "a number more": number("more", 1.0), "study no TOML": linked("notes/study", "title = ["),
+    "monitors no JSON": linked("notes/monitors", "{"),
 }  # fmt: skip
 
 
