@@ -30,6 +30,7 @@ from .process import import_outside
 from .scene import Scene, build_scene
 from .stepping.stepper import Abandoned, StepReport
 from .study import Study
+from .study.conditions import cracks
 from .study.file import completed, study_text
 from .watched import Watched, wants_surface
 
@@ -142,7 +143,7 @@ class Run:
         from .output.crack_front import CrackFront
 
         assert self.breaks.record is not None
-        return CrackFront(self.breaks.record)
+        return CrackFront(self.breaks.record, cracks(study, self.scene.domain.dim))
 
     @property
     def ended(self) -> bool:

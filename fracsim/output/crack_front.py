@@ -2,34 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ..fracture.cracks import ends_in_order
 from ..fracture.record import EdgeRecord
+from ..mesh.cracks import Crack
 from ..mesh.ranks import joined, total
 from ..meshes.words import AXES
 
+Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
+INSIDE = -1e-9  # least barycentric coordinate of a point in a cell
 PAIRINGS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])  # of four corners in two diagonals
 
 
 class CrackFront:
     """Length of the cracks in m (3D: area in m^2) and the place of their tip at rest, m.
 
+    The tip is that of the crack that advanced last: where it came into a cell that holds together. Where it has run
+    into a hole, out of the body or into another crack, the tip stays at the last place that it cut.
+
+    A segment of the study ends where the study says, in a cell of which the side is cut where the crack comes in. Such
+    a cell gives way as if it were cut half-way, so that cracks are as compliant as those of their length (within 0.1 h
+    in the mean).
+
     Attributes:
         names: columns of history.csv.
     """
 
-    def __init__(self, record: EdgeRecord) -> None:
+    def __init__(self, record: EdgeRecord, cracks: Sequence[Crack] = ()) -> None:
+        """`cracks`: those of the study, which were open at t = 0 (collective)."""
         graph = record.graph
         self._record, self._graph, self._domain = record, graph, graph.domain
         d = self._domain.dim
         self.names = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
         self._ends = ends_in_order(graph)
-        self._figures = np.full(1 + d, np.nan)
+        self._figures = np.array([0.0] + d * [np.nan])
         self._pattern = np.zeros_like(graph.pattern)  # at the last look
         self._size = np.zeros(len(self._pattern))  # of the cut through each cell
+        self._asked: dict[int, Values] = {}  # ends of segments by the cells of this rank that they lie in
+        for crack in cracks if d == 2 else ():
+            for end in () if crack.corners is None else crack.corners:
+                self._ask(end)
         self.look()
 
     def __call__(self) -> Values:
@@ -47,20 +65,69 @@ class CrackFront:
     def look(self) -> None:
         """Edges have broken (collective)."""
         changed = np.flatnonzero(self._graph.pattern != self._pattern)
+        if not total(self._domain.comm, len(changed))[0]:
+            return
         self._pattern = self._graph.pattern.copy()
         self._size[changed] = self._cut(changed)
-        self._figures[0] = total(self._domain.comm, float(self._size.sum()))[0]
-        tips = joined(self._domain.comm, self._tips())
-        if len(tips):  # a crack that has run through has none: its last one stays
-            first = np.lexsort([tips[:, 2], tips[:, 1], -tips[:, 0]])[0]
-            self._figures[1:] = tips[first, 3:]
+        held = {cell: end for cell, end in self._asked.items() if not self._graph.split[cell]}
+        size = self._size.sum() + sum(float(np.linalg.norm(end - self._entry(cell))) for cell, end in held.items())
+        self._figures[0] = total(self._domain.comm, float(size))[0]
+        self._find_tip(held)
+
+    def _find_tip(self, held: dict[int, Values]) -> None:
+        """The tip of the crack that advanced last; `held`: ends that were asked for, by their cells (collective)."""
+        comm, graph, at = self._domain.comm, self._graph, self._record.at
+        newest = np.flatnonzero(at == comm.allreduce(float(np.fmax.reduce(at, initial=-np.inf)), MPI.MAX))
+        cells = graph.cells_at(newest)
+        cells = cells[~graph.split[cells]]
+        which, side = np.nonzero(np.isin(graph.cell_edges[cells], newest))
+        leading = graph.cell_edges[cells][which, side]
+        places = self._places(leading)
+        for cell, end in held.items():
+            places[cells[which] == cell] = end
+        rows = joined(comm, np.column_stack([self._keys(leading), places]))
+        away = np.zeros(len(rows))
+        if not len(rows):
+            rows = joined(comm, np.column_stack([self._keys(newest), self._places(newest)]))
+            away = np.nan_to_num(np.linalg.norm(rows[:, 2:] - self._figures[1:], axis=1))
+        if len(rows):
+            self._figures[1:] = rows[np.lexsort([*rows.T[::-1], -away])[0], 2:]
+
+    def _keys(self, edges: Ints) -> Values:
+        """(n, 2) input nodes of edges."""
+        return np.asarray(self._domain.node_input[self._ends[edges]], float)
+
+    def _ask(self, end: Values) -> None:
+        """A segment of the study ends there: in the cell that it comes into and that holds together (collective)."""
+        graph = self._graph
+        opened = self._record.at == 0
+        cells = np.flatnonzero(opened[graph.cell_edges].sum(axis=1) == 1)
+        corners = self._domain.nodes[graph.cell_nodes[cells]]
+        sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        inner = np.linalg.solve(sides, (end - corners[:, 0])[:, :, None])[:, :, 0]
+        cells = cells[(inner.min(axis=1) > INSIDE) & (inner.sum(axis=1) < 1 - INSIDE)]
+        found = [(float(np.linalg.norm(end - self._entry(k))), -int(self._domain.cell_input[k]), int(k)) for k in cells]
+        farthest = max(found, default=(-1.0, 0, -1))
+        first = max(self._domain.comm.allgather(farthest[:2]))
+        if farthest[2] >= 0 and farthest[:2] == first:
+            self._asked[farthest[2]] = end
+
+    def _entry(self, cell: int) -> Values:
+        """(d,) where a segment of the study comes into a cell."""
+        edges = self._graph.cell_edges[cell]
+        return self._places(edges[self._record.at[edges] == 0])[0]
+
+    def _places(self, edges: Ints) -> Values:
+        """(n, d) places of the cuts of broken edges, m."""
+        cut = self._record.cut[edges]
+        share = np.where(np.isnan(cut), 0.5, cut)[:, None]
+        ends = self._domain.nodes[self._ends[edges]]
+        return np.asarray(ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
 
     def _points(self, cells: npt.NDArray[np.integer]) -> Values:
         """(n, k, d) places of the cuts of all edges of cells, m; nan of whole ones."""
         edges = self._graph.cell_edges[cells]
-        share = np.where(np.isnan(self._record.cut[edges]), 0.5, self._record.cut[edges])[..., None]
-        ends = self._domain.nodes[self._ends[edges]]
-        at = ends[:, :, 0] + share * (ends[:, :, 1] - ends[:, :, 0])
+        at = self._places(edges.reshape(-1)).reshape(*edges.shape, self._domain.dim)
         return np.where(self._graph.broken[edges][..., None], at, np.nan)
 
     def _cut(self, cells: npt.NDArray[np.integer]) -> Values:
@@ -83,27 +150,6 @@ class CrackFront:
         """(n, count, d) places of the cuts of cells with so many."""
         points = self._points(cells)
         return points[~np.isnan(points[..., 0])].reshape(len(cells), count, points.shape[-1])
-
-    def _tips(self) -> Values:
-        """(n, 3 + d) of this rank's cells that cracks have come into last and not left: when, which edge (two input
-        nodes), and where, m."""
-        graph, at = self._graph, self._record.at
-        newest = at == np.fmax.reduce(at, initial=-np.inf)  # NaN: whole ones
-        cells, entry = self._entered(graph.cells_at(np.flatnonzero(newest)))
-        if not newest[graph.cell_edges[cells, entry]].any():  # what broke last led nowhere
-            cells, entry = self._entered(np.flatnonzero((graph.pattern > 0) & ~graph.split))
-        edges = graph.cell_edges[cells, entry]
-        keys = self._domain.node_input[self._ends[edges]]
-        return np.column_stack([at[edges], keys, self._points(cells)[np.arange(len(cells)), entry]])
-
-    def _entered(self, cells: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
-        """Of cells with broken edges those that hold together and were entered last, and by which local edge."""
-        graph, at = self._graph, self._record.at
-        cells = cells[~graph.split[cells]]
-        entry = np.argmin(graph.intact(cells), axis=1)
-        when = at[graph.cell_edges[cells, entry]]
-        last = when == np.max(when, initial=-np.inf)
-        return cells[last], entry[last]
 
 
 def _triangles(corners: Values) -> Values:
