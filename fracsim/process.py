@@ -47,6 +47,7 @@ def begin_process() -> None:
 
 
 _PARENT = os.getppid()
+_RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # variables that tell a process its rank
 _own = False  # whether this process was started as a command line
 _run_begun = False
 
@@ -136,7 +137,12 @@ def _end_before_the_run(number: int, frame: FrameType | None) -> None:
 
 def is_first_rank() -> bool:
     """Whether this process is rank 0, without starting MPI."""
-    return all(os.environ.get(name, "0") == "0" for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK"))
+    return all(os.environ.get(name, "0") == "0" for name in _RANK)
+
+
+def _is_rank() -> bool:
+    """Whether something started this process as a rank of a job."""
+    return any(name in os.environ for name in _RANK)
 
 
 def begin_run() -> None:
@@ -153,11 +159,11 @@ def begin_run() -> None:
         signal.signal(number, signal.SIG_DFL)  # Open MPI's own handler waits for ever where the heap is damaged
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
     faulthandler.enable()
-    from .mesh.ranks import starts_ranks
-    from .output.interrupt import end_with_launcher
+    from .mesh.ranks import launcher
+    from .output.interrupt import end_with
 
-    if starts_ranks(_PARENT):
-        end_with_launcher(_PARENT)
+    if _is_rank() and (process := launcher(_PARENT)) is not None:
+        end_with(process, parent=_PARENT)
     _run_begun = True
 
 

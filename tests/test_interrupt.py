@@ -219,11 +219,13 @@ fracsim.cli.program()
 """
 
 
-def begun(folder: Path, what: str, ranks: int = 0, prefix: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+def begun(
+    folder: Path, what: str, ranks: int = 0, prefix: tuple[str, ...] = (), between: tuple[str, ...] = ()
+) -> subprocess.Popen[str]:
     """A long run whose third step, or whose imports, do as START says; on all ranks where that is."""
     bar = write_study(folder / "bar.toml", LONG)
     code = START.format(folder=str(folder), study=str(bar), what=what)
-    whole = [*prefix, *(mpirun(ranks) if ranks else []), sys.executable, "-c", code]
+    whole = [*prefix, *(mpirun(ranks) if ranks else []), *between, sys.executable, "-c", code]
     process = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: len(ready(folder)) == max(ranks, 1))
     return process
@@ -317,11 +319,16 @@ def test_ranks_abandon_a_step_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks the kernel of Linux")
-def test_ranks_end_with_mpirun(tmp_path: Path) -> None:
-    """It is killed; so are its ranks, whatever they wait for."""
-    process = begun(tmp_path, "hang", ranks=2)
+@pytest.mark.parametrize("between", [(), ("sh", "-c", 'exec 3>&1; "$@"; exit', "sh")], ids=["mpirun", "a shell"])
+def test_ranks_end_with_mpirun(tmp_path: Path, between: tuple[str, ...]) -> None:
+    """It is killed; so are its ranks, whatever they wait for, and whether it or a shell of a script started them."""
+    process = begun(tmp_path, "hang", ranks=2, between=between)
     ranks = ready(tmp_path)
     assert all(map(is_there, ranks))
     process.kill()
-    wait_until(lambda: not any(map(is_there, ranks)), 5)
-    process.communicate()
+    try:
+        wait_until(lambda: not any(map(is_there, ranks)), 5)
+    finally:
+        for rank in filter(is_there, ranks):
+            os.kill(rank, signal.SIGKILL)
+        process.communicate()

@@ -93,11 +93,27 @@ def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late:
 
 def starts_ranks(process: int) -> bool:
     """Whether a process is one that starts the ranks of a job; False where the system does not tell."""
+    return _name_and_parent(process)[0].startswith(LAUNCHERS)
+
+
+def launcher(process: int) -> int | None:
+    """The process that starts the ranks of a job, among a process and its ancestors; None: there is none."""
+    while process > 1:
+        name, parent = _name_and_parent(process)
+        if name.startswith(LAUNCHERS):
+            return process
+        process = parent
+    return None
+
+
+def _name_and_parent(process: int) -> tuple[str, int]:
+    """The name of a process and its parent's number; "" and 0 where the system does not tell."""
     try:
-        with open(f"/proc/{process}/comm", encoding="utf-8", errors="replace") as file:
-            return file.read().startswith(LAUNCHERS)
-    except OSError:
-        return False
+        with open(f"/proc/{process}/stat", encoding="utf-8", errors="replace") as file:
+            before, _, after = file.read().rpartition(")")
+        return before.partition("(")[2], int(after.split()[1])
+    except (OSError, ValueError, IndexError):
+        return "", 0
 
 
 def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:

@@ -115,10 +115,15 @@ class Interrupt:
         return long if self.comm.size == 1 else bool(self.comm.bcast(long))
 
 
-def end_with_launcher(parent: int) -> None:
-    """Have this process end with its parent, the launcher of ranks: without it they would wait for ever (Linux)."""
-    if (code := _code()) is not None:
-        code.end_with_launcher(parent, int(signal.SIGRTMAX) - 1)
+def end_with(launcher: int, *, parent: int) -> None:
+    """Have this process end with the launcher of ranks, its `parent` or an ancestor, in whatever way that ends: the
+    ranks would wait for ever (Linux)."""
+    if (code := _code()) is None:
+        return
+    if launcher == parent:
+        code.end_with_parent(parent, int(signal.SIGRTMAX) - 1)
+    else:  # a shell is between them, which goes on
+        code.end_with_process(launcher)
 
 
 @cache
