@@ -59,12 +59,10 @@ class RigidRun:
         text: str,
         interrupt: Interrupt,
         *,
-        frames: float,
         restart: bool = False,
         progress: Progress | None = None,
     ) -> None:
-        """`text`: study.toml, without its head; `frames`: s between them, if not `output.every`; `progress`: one that
-        tells already."""
+        """`text`: study.toml, without its head; `progress`: one that tells already."""
         self._progress = progress or Progress(first=True, end=scene.study.time.end)
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
         self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
@@ -89,8 +87,8 @@ class RigidRun:
             self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))
             self.history.worked |= dict(zip(self.history.worked, map(float, arrays["worked"]), strict=True))
             say(ALONE, [*self.history.notes, *missing_frames(folder, self._had, self.frames.files.counts)])
-        self._clock = OutputClock(scene.study.output.every, frames)
-        self._clock.wrote(self.state)  # type: ignore[arg-type]
+        self._clock = OutputClock(scene.study.output.every, scene.study.frame_interval)
+        self._clock.wrote(self.state.t)
         written(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
     def _writing[T](self, path: Path, work: Callable[[], T]) -> T:
@@ -139,7 +137,7 @@ class RigidRun:
         damage, dented = copies.damage(), {number: each.points for number, each in copies.shapes.items()}
         path, placed = self.folder / "surface.pvd", self.scene.stepper.others.placed(state.t, state.bodies)
         written(ALONE, path, lambda: self.frames.write(state.t, state.bodies, *damage, dented, placed))
-        self._clock.wrote(state)  # type: ignore[arg-type]
+        self._clock.wrote(state.t)
 
     def checkpoint(self) -> Path:
         """Write one of now: all states that a step ends with are finite; returns its path. Raises CannotWrite."""
@@ -214,7 +212,7 @@ class RigidRun:
             except Abandoned:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
-            if done or self._clock.due(self.state):  # type: ignore[arg-type]
+            if done or self._clock.due(self.state.t, self.state.step):
                 self.write_frame()
             self._tell(report)
             if every is not None and time.monotonic() - last > every:

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
     from .output.crack_front import CrackFront
 
-FRAMES = 50  # of a run whose study says neither every nor interval
-
 
 class Run:
     """A scene and its output folder: `run()` steps to the end; `run.step()` takes one step of it.
@@ -129,8 +127,8 @@ class Run:
         if notes is not None:
             had = notes.monitors["frames"]
             say(self.comm, [*self.history.notes, *missing_frames(folder, had, self.frames.counts)])
-        self._clock = OutputClock(study.output.every, study.output.interval or study.time.end / FRAMES)
-        self._clock.wrote(self.state)
+        self._clock = OutputClock(study.output.every, study.frame_interval)
+        self._clock.wrote(self.state.t)
         self._frame_of: int | None = None  # the step of the last frame of this part of the run
         # it tells how the run ended, which is open again
         written(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
@@ -181,7 +179,7 @@ class Run:
         began = time.perf_counter()
         self.watched.look_at_frame(self.state.t)
         self.frames.write(self.state)
-        self._clock.wrote(self.state)
+        self._clock.wrote(self.state.t)
         self._frame_of = self.state.step
         self._meter.output += time.perf_counter() - began
 
@@ -248,7 +246,7 @@ class Run:
             except Abandoned:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.ended
-            if done or self._clock.due(self.state):
+            if done or self._clock.due(self.state.t, self.state.step):
                 self.write_frame()
             self._tell(report)
             if every is not None and self.comm.bcast(time.monotonic() - last > every):
@@ -346,6 +344,7 @@ def run_study(
     file, which must not be written over.
     """
     began = time.perf_counter()
+    say(comm, study.frame_notes)
     if study.time.scheme == "rigid":
         how = {"restart": restart, "overwrite": overwrite}
         return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
@@ -395,8 +394,7 @@ def _run_rigid(
         progress.end_line()
         notes_of(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
-        frames = study.output.interval or study.time.end / FRAMES
-        summary = RigidRun(scene, folder, text, interrupt, frames=frames, restart=restart, progress=progress)()
+        summary = RigidRun(scene, folder, text, interrupt, restart=restart, progress=progress)()
         if study.output.picture:
             progress.stage("drawing the last frame")
             _draw(folder)

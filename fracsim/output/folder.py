@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 import tomllib
 from collections.abc import Callable, Iterable
@@ -15,7 +14,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError
-from ..stepping.state import State
+from ..stepping.stepper import intervals
 from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import read_times
 from .history import read_earlier
@@ -104,13 +103,15 @@ class OutputClock:
     def __init__(self, every: int | None, interval: float) -> None:
         """Every so many steps; with None, every so many seconds of simulated time."""
         self._every, self._interval = every, interval
-        self._last = 0.0
+        self._passed = 0  # intervals, at the last frame
 
-    def due(self, state: State) -> bool:
+    def due(self, t: float, step: int) -> bool:
+        """Whether it is, at the end of this step at time t, s."""
         if self._every is not None:
-            return state.step % self._every == 0
-        return state.t >= self._last + self._interval * (1 - 1e-9)
+            return step % self._every == 0
+        return intervals(t, self._interval) > self._passed
 
-    def wrote(self, state: State) -> None:
-        # the grid of intervals, not the time of the frame: late frames must not push the others back
-        self._last = math.floor(state.t / self._interval * (1 + 1e-9)) * self._interval
+    def wrote(self, t: float) -> None:
+        """A frame was written at time t, s. A late one does not push back the others, which are at whole intervals."""
+        if self._every is None:
+            self._passed = intervals(t, self._interval)

@@ -17,13 +17,13 @@ import numpy.typing as npt
 from ..errors import InputError
 from .pictures.body import is_crack, without_dust
 from .pictures.colouring import rgb
-from .pictures.shots import Shot, find_frames, load, study_of
+from .pictures.shots import CLOSE, Shot, film_interval, find_frames, load, study_of
 from .pictures.skins import Skin, skin_of
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 FORMATS = ("ply", "obj", "glb", "usd")
-USD_RATE = 24.0  # frames a second of its time
+USD_RATE = 24.0  # pictures a second, which its time codes do not depend on
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,16 @@ def export(
     target = target or folder / "export"
     skin = skin_of(look or study_of(folder).get("output", {}).get("look", "plain"))
     frames = ((number, pieces_of(shots[number], dust)) for number in chosen)
+    times = [shot.t for shot in shots]
     name = folder.resolve().name
     target.mkdir(parents=True, exist_ok=True)
     if kind == "usd":
-        return [_usd(target / f"{name}.usdc", frames, skin)]
+        return [_usd(target / f"{name}.usdc", frames, skin, times)]
     write = {"ply": _ply, "obj": _obj, "glb": _glb}[kind]
     made = []
     for number, pieces in frames:
         made.append(target / f"{name}_{number:06d}.{kind}")
-        write(made[-1], pieces, skin)
+        write(made[-1], pieces, skin, times[number])
     return made
 
 
@@ -119,14 +120,15 @@ def _together(pieces: list[Piece]) -> Piece:
     return Piece("body", points, np.concatenate(triangles), crack)
 
 
-def _ply(path: Path, pieces: list[Piece], skin: Skin) -> None:
-    """One surface; double precision."""
-    path.write_bytes(_mesh(_together(pieces), skin).export(file_type="ply", vertex_normal=False))
+def _ply(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
+    """One surface; double precision. Its time, s, is a comment."""
+    head, data = _mesh(_together(pieces), skin).export(file_type="ply", vertex_normal=False).split(b"\nelement", 1)
+    path.write_bytes(head + f"\ncomment t = {t:.9g} s\nelement".encode() + data)
 
 
-def _obj(path: Path, pieces: list[Piece], skin: Skin) -> None:
+def _obj(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
     """An object a piece: OBJ has no colours of faces, so groups say what is skin and what inside."""
-    lines, first = ["# m"], 1
+    lines, first = ["# m", f"# t = {t:.9g} s"], 1
     for piece in pieces:
         lines.append(f"o {piece.name}")
         lines += ["v {:.9g} {:.9g} {:.9g}".format(*point) for point in piece.points]
@@ -137,10 +139,11 @@ def _obj(path: Path, pieces: list[Piece], skin: Skin) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _glb(path: Path, pieces: list[Piece], skin: Skin) -> None:
-    """A node a piece, at its middle: in single precision small pieces far away keep their shape. GLB has y upwards."""
+def _glb(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
+    """A node a piece, at its middle: in single precision small pieces far away keep their shape. GLB has y upwards; the
+    time, s, is in the extras of the scene."""
     trimesh = _needed("trimesh", "trimesh")
-    scene = trimesh.Scene()
+    scene = trimesh.Scene(metadata={"time": t})
     upright = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
     for piece in pieces:
         middle = (piece.points.min(axis=0) + piece.points.max(axis=0)) / 2
@@ -150,14 +153,20 @@ def _glb(path: Path, pieces: list[Piece], skin: Skin) -> None:
     path.write_bytes(scene.export(file_type="glb"))
 
 
-def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin) -> Path:
-    """One mesh whose points and triangles are of their time, in m, z upwards; `piece` of each triangle beside them."""
+def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, times: list[float]) -> Path:
+    """One mesh whose points and triangles are of their time, in m, z upwards; `piece` of each triangle beside them.
+
+    `times`: s of all frames of the run. A time code is the time between two of them, so that programs that show a code
+    a picture show every frame; timeCodesPerSecond says how many of these are a second.
+    """
     Usd, UsdGeom, Sdf, Vt = (_needed(f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "Sdf", "Vt"))
     stage = Usd.Stage.CreateNew(str(path)) if not path.exists() else Usd.Stage.Open(str(path))
     stage.GetRootLayer().Clear()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(USD_RATE)
+    interval = film_interval(times)
+    stage.SetTimeCodesPerSecond(1 / interval)
+    stage.SetFramesPerSecond(USD_RATE)
     mesh = UsdGeom.Mesh.Define(stage, "/body")
     stage.SetDefaultPrim(mesh.GetPrim())
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
@@ -173,15 +182,16 @@ def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin) -> P
         (mesh.CreateFaceVertexIndicesAttr(), lambda one: Vt.IntArray.FromNumpy(one.triangles.astype(np.int32).ravel())),
         (colour, lambda one: Vt.Vec3fArray.FromNumpy(_colours(one, skin)[:, :3].astype(np.float32) / 255)),
     ]
-    numbers = []
+    codes = []
     for number, pieces in frames:
-        numbers.append(number)
+        code = times[number] / interval
+        codes.append(round(code) if abs(code - round(code)) < CLOSE else code)
         one = _together(pieces)
         for attribute, values in attributes:
-            attribute.Set(values(one), number)
+            attribute.Set(values(one), codes[-1])
         of = np.repeat([int(each.name.split("_")[1]) for each in pieces], [len(each.triangles) for each in pieces])
-        piece_of.Set(Vt.IntArray.FromNumpy(of.astype(np.int32)), number)
-    stage.SetStartTimeCode(numbers[0])
-    stage.SetEndTimeCode(numbers[-1])
+        piece_of.Set(Vt.IntArray.FromNumpy(of.astype(np.int32)), codes[-1])
+    stage.SetStartTimeCode(codes[0])
+    stage.SetEndTimeCode(codes[-1])
     stage.GetRootLayer().Save()
     return path

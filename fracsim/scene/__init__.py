@@ -102,7 +102,8 @@ def scene_on(
     flow = flow_of(study, balance)
     breaking = breaking_of(study, balance)
     solver = Solver(balance, study.solver) if scheme.implicit else None
-    stepper = make_stepper(balance, study.time, flow, breaking or Unbreakable(balance, flow), solver)
+    breaks, frames = breaking or Unbreakable(balance, flow), study.frame_interval
+    stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
     ways = {each.name: each.moved for each in obstacles(study, domain.dim) if each.moved is not None}
     probes = Probes(balance, _probes(study, domain), ways=ways, thickness=study.thickness)
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
@@ -113,11 +114,13 @@ def make_scheme(timing: Time) -> Scheme:
     return timing.kind(**timing.parameters)
 
 
-def make_stepper(balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None) -> Stepper:
-    """What steps a balance of this scheme."""
+def make_stepper(
+    balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None, frames: float = 0.0
+) -> Stepper:
+    """What steps a balance of this scheme; `frames`: s between times at which steps end, 0: they need not."""
     smallest, course = timing.smallest or timing.shortest / 1024, step_course(timing)
     sizes = StepSizes(
-        timing.longest, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course
+        timing.longest, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course, frames
     )  # fmt: skip
     if solver is None:
         from ..stepping.explicit import ExplicitStepper

@@ -39,16 +39,16 @@ class ExplicitStepper(BalanceStepper):
         self._a, self._b = rayleigh(balance)
 
     def _size(self, state: State) -> float:
-        """The study's step, the stable one or what is left to the end, whichever is least (collective)."""
+        """The study's step, the stable one or what is left to the end or a frame, whichever is least (collective)."""
         assert state.frequencies is not None
         squares = damaged_frequencies(self.balance.stress, state.frequencies, self._of_edges())
         fastest = self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)
         added = sum(term.frequency() for term in self.balance.terms)
         highest = float(np.sqrt(max(fastest + added, KINK * added)))
         stable = SAFETY * stable_step(highest, self._a, self._b)
-        left = self.sizes.end - state.t
-        # equal steps to the end rather than a sliver: rounding up never exceeds the bound
+        # equal steps to the end or the next frame rather than a sliver: rounding up never exceeds the bound
         dt = min(state.dt, stable, self.sizes.at(state.t))
+        left = min(self.sizes.end - state.t, self.sizes.to_frame(state.t, dt))
         return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
 
     def _of_edges(self) -> EdgeFrequencies | None:

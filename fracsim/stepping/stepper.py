@@ -29,6 +29,8 @@ from .state import State
 
 Values = npt.NDArray[np.float64]
 
+SAME = 1e-6  # of a step: times that are so close are the same
+PASSED = 1e-5  # of an interval between frames: before its end by so much it has passed
 EASY_STEPS = 4  # steps in a row without trouble before a halved step is doubled again
 
 
@@ -54,10 +56,16 @@ class StepReport:
     seconds: float
 
 
+def intervals(t: float, interval: float) -> int:
+    """How many whole intervals (s) have passed at time t (s)."""
+    return math.floor(t / interval + PASSED)
+
+
 @dataclass(frozen=True)
 class StepSizes:
     """Sizes of steps, s: the largest, the end of the run, the smallest; `adapt`: halve a step that fails; `breaking`:
-    the longest in which edges may break; `course`: the largest at a time, where it is not the same all the time."""
+    the longest in which edges may break; `course`: the largest at a time, where it is not the same all the time;
+    `frames`: of the intervals whose ends are ends of steps, too, where steps are no longer; 0: of none."""
 
     step: float
     end: float
@@ -65,6 +73,13 @@ class StepSizes:
     adapt: bool = True
     breaking: float = math.inf
     course: Tabulated | None = None
+    frames: float = 0.0
+
+    def to_frame(self, t: float, dt: float) -> float:
+        """From time t (s) to the next frame; inf where steps of dt (s) need not end there."""
+        if self.frames < dt * (1 - SAME):
+            return math.inf
+        return (intervals(t, self.frames) + 1) * self.frames - t
 
     def at(self, t: float) -> float:
         """The largest step from time t (s) on: steps end where the course has a corner, or one would leap over it."""
@@ -260,9 +275,14 @@ class BalanceStepper:
             self.balance.recall(terms)
 
     def _size(self, state: State) -> float:
-        """The step to take: no further than the end, and no sliver left over before it."""
+        """The step to take: no further than the end or the next frame, and no sliver left over before it."""
         left, dt = self.sizes.end - state.t, min(state.dt, self.sizes.at(state.t))
-        return left if left < dt * (1 + 1e-9) else dt
+        if left < dt * (1 + 1e-9):
+            return left
+        left = self.sizes.to_frame(state.t, dt)
+        if abs(left - dt) <= SAME * dt or left >= 2 * dt * (1 - SAME):
+            return dt
+        return left if left < dt else left / 2
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
         """Solve the step: the balance is left at what was found, whether that is a solution or not."""

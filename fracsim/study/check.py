@@ -307,6 +307,7 @@ def _description(study: Study, anatomy: Anatomy, near: list[str]) -> Iterator[st
         yield f"contact     {of}, friction {study.contact.friction:g}; {price}"
         yield f"            its surface has {anatomy.surface()}, {_MORE}"
     yield from steps_of(study, anatomy.dim, anatomy.h, anatomy.mesh)
+    yield from _frames(study)
     if (until := study.time.until) is not None:
         yield f"            ends where the force on {study.watched} has fallen by {until.drop:.0%} from its peak"
     if study.material.energy == "linear" and turned(study, anatomy.dim, _least_side(anatomy)) > MUCH:
@@ -344,6 +345,19 @@ def _rigid_description(study: Study, anatomy: Anatomy) -> Iterator[str]:
     restitution = contact.restitution or 0.0
     yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, a blow lasts {lasting}"
     yield f"time        rigid, {study.time.end / study.time.longest:.0f} steps of {study.time.longest:g} s"
+    yield from _frames(study)
+
+
+def _frames(study: Study) -> Iterator[str]:
+    """How far apart frames are."""
+    every, interval = study.output.every, study.frame_interval
+    if every is not None:
+        yield f"            a frame every {f'{every} steps' if every > 1 else 'step'}"
+        return
+    steps = round(interval / study.time.longest) if study.time.constant else 0
+    yield f"            a frame every {interval:g} s" + (f", {steps} step{'s'[: steps != 1]}" if steps else "")
+    for note in study.frame_notes:
+        yield f"            note: {note}"
 
 
 # Measured of boxes of 25,000 and 207,000 tetrahedra, of which nothing touched anything: two obstacles and a body alone.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -46,6 +47,11 @@ class Timing(Table):
     def shortest(self) -> float:
         """The shortest step that a study asks for, s."""
         return min(self.step.value) if isinstance(self.step, TimeTable) else self.step
+
+    @property
+    def constant(self) -> bool:
+        """Whether all steps are equal, but for those that fail or break edges; explicit ones are as the body allows."""
+        return not isinstance(self.step, TimeTable) and (self.kind.implicit or self.scheme == "rigid")
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -121,6 +127,47 @@ class Probe(Table):
     def quantity(self) -> Literal["displacement", "reaction"]:
         """What is recorded."""
         return self.record or ("displacement" if self.point is not None else "reaction")
+
+
+FRAMES = 50  # of a run whose study says neither every nor interval
+FEWEST_FRAMES, MOST_FRAMES = 34, 75  # where steps are constant, so that the last one comes in time if it can
+
+
+def frame_interval(timing: Timing, output: Output) -> float:
+    """Simulated time between two frames, s; 0 where they are counted in steps (output.every).
+
+    A whole number of steps where these are constant: frames are evenly spaced, and a film of them does not stutter. An
+    interval shorter than a step is left as it is, for steps that are shortened.
+    """
+    if output.every is not None:
+        return 0.0
+    wanted = output.interval or timing.end / FRAMES
+    step = timing.longest
+    if not timing.constant:
+        return wanted
+    if output.interval is None:
+        return _steps_between(math.ceil(timing.end / step * (1 - 1e-9))) * step
+    return round(wanted / step) * step if wanted > step else wanted
+
+
+def frame_notes(timing: Timing, output: Output) -> list[str]:
+    """What is to be said where frames are not as far apart as the study asks."""
+    interval = frame_interval(timing, output)
+    if output.interval is None or abs(interval - output.interval) <= 1e-6 * interval:
+        return []
+    steps = round(interval / timing.longest)
+    return [
+        f"output.interval = {output.interval:g} s is no multiple of time.step = {timing.longest:g} s: "
+        f"there is a frame every {interval:g} s, {steps} step{'s'[: steps != 1]}, so that they are evenly spaced"
+    ]
+
+
+def _steps_between(steps: int) -> int:
+    """Steps between two of about FRAMES frames of so many steps; a divisor of them, if there is one."""
+    if steps > 100 * FRAMES:  # what the last frame is early by cannot be seen
+        return round(steps / FRAMES)
+    candidates = range(math.ceil(steps / MOST_FRAMES), max(1, steps // FEWEST_FRAMES) + 1)
+    return min(candidates, key=lambda count: (steps % count > 0, abs(math.log(steps / count / FRAMES))))
 
 
 FIELDS = (

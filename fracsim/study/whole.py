@@ -12,7 +12,7 @@ from .loading import Boundary, Initial, Load
 from .materials import filled
 from .moving import Body, check_rigid, of_rigid
 from .order import check_order
-from .running import FRACTURE_FIELDS, Output, Probe, Time
+from .running import FRACTURE_FIELDS, Output, Probe, Time, frame_interval, frame_notes
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
 from .touching import Contact, Obstacle
 from .values import Later, Table
@@ -269,6 +269,16 @@ class Study(Table):
     def thickness(self) -> float:
         """m, of a 2D body out of its plane: what forces and energies per metre are multiplied with."""
         return self.material.thickness or 1.0
+
+    @property
+    def frame_interval(self) -> float:
+        """Simulated time between two frames, s; 0 where they are counted in steps."""
+        return frame_interval(self.time, self.output)
+
+    @property
+    def frame_notes(self) -> list[str]:
+        """What is to be said where frames are not as far apart as the study asks."""
+        return frame_notes(self.time, self.output)
 
     @property
     def at_rest(self) -> bool:

@@ -17,7 +17,7 @@ from .camera import scope_of, union
 from .colouring import merged
 from .look import Look
 from .screen import display
-from .shots import Shot, find_frames, study_of
+from .shots import Shot, find_frames, study_of, times_shown
 from .stage import Stage, range_of
 
 Pixels = npt.NDArray[np.uint8]
@@ -37,7 +37,7 @@ def render(
     fps: int = FPS,
 ) -> Path:
     """Draw one frame as a PNG, or all of them as a GIF, an MP4 or, where `target` has no suffix, PNGs in a folder;
-    returns what was written.
+    returns what was written. Pictures of a film are evenly spaced in simulated time, those in a folder are the frames.
 
     Several folders: that frame of each, side by side.    `sheet`: so many frames of one folder, or which: "0,18,-1".
     """
@@ -53,6 +53,9 @@ def render(
         raise InputError(f"-o {target}: a sheet, or pictures of several runs, is a .png")
     else:
         shots = every[0]
+    film = target.suffix in FILMS
+    counts = times_shown([shot.t for shot in shots]) if film else np.ones(len(shots), int)
+    shots, counts = [shot for shot, count in zip(shots, counts, strict=True) if count], counts[counts > 0]
     single = target.suffix == ".png"
     if len(shots) > 1:
         look = replace(look, fine=look.fine and single)
@@ -64,7 +67,7 @@ def render(
         if single:
             _save(target, tiled(list(pictures)))
         else:
-            _film(target, pictures, fps)
+            _film(target, (each for each, n in zip(pictures, counts, strict=True) for _ in range(n)), fps)
     return target
 
 

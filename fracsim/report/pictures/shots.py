@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from ...errors import InputError
 from ...output.fields_file import read_values
@@ -16,6 +19,10 @@ from ...output.surface.collection import Entry, read_entries
 from ...output.surface.vtu import reorder_tensors
 
 KINDS = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # of cells, by their nodes
+
+
+LONGER = 4  # pictures of a film, at most, to a frame
+CLOSE = 1e-6  # of the time between two pictures: by so much they may be off
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,22 @@ def find_frames(folder: Path) -> list[Shot]:
     if not times:
         raise InputError(f"{h5} has no frame yet")
     return [Shot(t, h5, index) for index, t in enumerate(times)]
+
+
+def film_interval(times: Sequence[float]) -> float:
+    """Simulated time between two pictures of a film of frames at these times, s: the median of what lies between them,
+    or more where a film would have many more pictures than there are frames."""
+    if len(times) < 2:
+        return 1.0
+    return max(float(np.median(np.diff(times))), (times[-1] - times[0]) / (LONGER * len(times)))
+
+
+def times_shown(times: Sequence[float]) -> npt.NDArray[np.int64]:
+    """(frames,) how many pictures of a film show each frame: pictures are evenly spaced in simulated time, and show the
+    frame that is nearest."""
+    at, interval = np.asarray(times, float), film_interval(times)
+    pictures = at[0] + interval * np.arange(math.ceil((at[-1] - at[0]) / interval - CLOSE) + 1)
+    return np.bincount(np.searchsorted((at[1:] + at[:-1]) / 2, pictures - CLOSE * interval), minlength=len(at))
 
 
 def _of_surface(folder: Path, entries: list[Entry]) -> list[Shot]:
