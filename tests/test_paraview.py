@@ -102,3 +102,15 @@ def test_blocks_have_the_names_of_the_obstacles(tmp_path: Path) -> None:
     block = ("ExtractBlock", {"Selectors": ["/Root/hammer"]})
     found = shown(tmp_path / "out" / "surface.pvd", "OpenDataFile", tmp_path / "shown.json", block)
     assert found["blocks"] == ["body", "hammer", "table"] and found["cells"] > 100
+
+
+def test_the_age_of_cracks_has_a_range_and_no_holes(demo: Path, tmp_path: Path) -> None:
+    """From 0 on the skin to the oldest crack; an array of NaN has the range (1e299, -1e299), before anything breaks."""
+    ages = shown(demo / "surface.pvd", "OpenDataFile", tmp_path / "shown.json")["arrays"]["Cell"]["age"][""]
+    assert ages[0] == 0.0 and 0.1 < ages[1] < 0.45
+    threshold = ("Threshold", {"Scalars": ["CELLS", "age"], "LowerThreshold": 0.0, "UpperThreshold": 1.0})
+    whole, kept = (
+        shown(demo / "surface.pvd", "OpenDataFile", tmp_path / "kept.json", *filters)["cells"]
+        for filters in ((), (threshold,))
+    )
+    assert kept == whole  # no cell is left out, as those without a number would be

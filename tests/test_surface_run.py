@@ -52,6 +52,14 @@ def test_a_run_writes_its_surface(torn: Run) -> None:
     assert list(grid.field_data["origins"])[-1] == "crack" or "crack" in list(grid.field_data["origins"])
 
 
+def test_all_that_is_written_is_a_number(torn: Run) -> None:
+    """Of every frame of the surface, whole, torn and flat: viewers draw NaN in a colour of its own."""
+    for shot in find_frames(torn.folder):
+        grid = pyvista.read(shot.file)
+        for data in (grid.point_data, grid.cell_data):
+            assert not [name for name, values in data.items() if not np.isfinite(np.asarray(values)).all()]
+
+
 def test_mass_and_momentum_of_the_pieces(torn: Run) -> None:
     """Masses add up to rho V = 1000 * 0.25, and mass times velocity to the momentum sum(m v) of the nodes."""
     with (torn.folder / "pieces.csv").open(newline="") as file:

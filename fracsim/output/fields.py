@@ -83,7 +83,7 @@ class Frames:
             values *= chi.x.array[: self._domain.cell_count, None]
         if self._fracture is not None and name == "strain":
             values[self._fracture.graph.split] = 0.0  # nodes of several pieces have no strain in common
-        return np.nan_to_num(values)
+        return np.nan_to_num(values, posinf=0.0, neginf=0.0)  # of crushed cells, which count as none
 
 
 def _kinematics(stress: Stress) -> tuple[Energy, Expr, Expr | None]:

@@ -179,11 +179,12 @@ class Surface:
         return triangles, segments, cell, {name: values.astype(np.int32) for name, values in fixed.items()}
 
     def _ages(self, t: float, broken_at: Values | None) -> Values:
-        """s since the edge behind an element broke; NaN on the boundary and where it is not known."""
+        """s since the edge behind an element broke; 0 on the boundary and where it is not known: viewers draw what is
+        no number in a colour of its own."""
         edge = np.concatenate([np.full(len(self.split.fill), -1), self.split.edge])
-        age = np.full(len(edge), np.nan)
+        age = np.zeros(len(edge))
         if broken_at is not None:
-            age[edge >= 0] = t - broken_at[edge[edge >= 0]]
+            age[edge >= 0] = np.nan_to_num(t - broken_at[edge[edge >= 0]])
         return age
 
     def _check(self, t: float, u: Values, v: Values) -> None:

@@ -17,6 +17,7 @@ from ...errors import InputError
 from ...output.fields_file import read_values
 from ...output.surface.collection import Entry, read_entries
 from ...output.surface.vtu import reorder_tensors
+from .body import is_crack
 
 KINDS = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # of cells, by their nodes
 
@@ -94,6 +95,9 @@ def load(shot: Shot) -> Any:
     if shot.index < 0:
         grid = pyvista.read(shot.file)
         reorder_tensors(grid)
+        if "age" in grid.cell_data and "origin" in grid.cell_data:
+            # in a picture what is no crack has a colour of its own
+            grid.cell_data["age"] = np.where(is_crack(grid), grid.cell_data["age"], np.nan)
         return grid
     with h5py.File(shot.file) as file:
         frame = file["frames"][sorted(file["frames"])[shot.index]]
