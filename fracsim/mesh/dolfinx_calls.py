@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -256,7 +257,7 @@ def assemble_matrix(form: fem.Form, bcs: list[fem.DirichletBC] | None = None, di
     """A new matrix of a bilinear form; rows and columns of prescribed dofs are empty but for `diagonal`."""
     matrix = fem_petsc.assemble_matrix(form, bcs or [], diagonal)
     matrix.assemble()
-    return matrix
+    return _freed_with_its_name(matrix)
 
 
 def pattern_of(form: Any) -> SparsityPattern:
@@ -276,4 +277,12 @@ def block_csr(pattern: SparsityPattern) -> la.MatrixCSR:
 
 def create_matrix(comm: MPI.Comm, pattern: SparsityPattern) -> PETSc.Mat:
     """PETSc's matrix of a pattern, empty (collective)."""
-    return create_petsc_matrix(comm, pattern)
+    return _freed_with_its_name(create_petsc_matrix(comm, pattern))
+
+
+def _freed_with_its_name(matrix: PETSc.Mat) -> PETSc.Mat:
+    """The same matrix, which is freed when the last name for it is gone: DOLFINx 0.9 never drops the object of Python
+    that it gives a matrix out as."""
+    same = copy(matrix)
+    matrix.destroy()
+    return same

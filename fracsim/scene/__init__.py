@@ -29,6 +29,7 @@ from ..stepping.initial import initial_velocity
 from ..stepping.solver import Solver
 from ..stepping.state import State
 from ..stepping.stepper import Stepper, StepSizes
+from ..stepping.weakly import free_dropped
 from ..study import Study, Time
 from ..study.check import checked_mesh
 from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course
@@ -94,6 +95,7 @@ def scene_on(
 ) -> Scene:
     """The scene of a study on a mesh that is there; `material`: in place of the study's own; `stage`: as above."""
     stage("setting up the balance of forces (kernels are compiled the first time)")
+    free_dropped(domain.comm)
     scheme = make_scheme(study.time)
     balance = balance_of(study, domain, scheme, material or material_of(study, domain))
     if not scheme.inertia:

@@ -43,6 +43,7 @@ from .finest import Finest
 from .levels import Blocks, copied
 from .rows import Vector
 from .smoother import Effort, Level
+from .weakly import AppliedBy
 
 if TYPE_CHECKING:
     from ..mechanics.products import Products
@@ -94,7 +95,7 @@ class Cycle:
         self._b, self._x = (Vector(coarsest.nodes, coarsest.size) for _ in range(2))
         self._solver = body.getMGCoarseSolve()
         self._ends = self._solver.getOperators()[1].createVecs()
-        self.pc = PETSc.PC().createPython(self, comm=body.comm)
+        self.pc = PETSc.PC().createPython(AppliedBy(self.apply), comm=body.comm)
         self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
         self.thorough = len(self._levels) > 1 and self.converges_slowly()
         if self.thorough:

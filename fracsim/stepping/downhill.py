@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from ..mechanics.balance import Balance
 from .descent import Descent
 from .leaps import hold_back
+from .weakly import weakly
 
 
 class Way(NamedTuple):
@@ -49,8 +50,9 @@ class Downhill:
         """Makes the incremental potential of `balance`, which has one, the objective of `snes`."""
         self.snes, self._balance = snes, balance
         self.descent = descent = Descent(balance, snes)
-        snes.setObjective(lambda _, x: descent(x))
-        snes.setFunction(lambda _, x, b: descent.residual(x, b), balance.vector)
+        objective, residual = weakly(descent.__call__), weakly(descent.residual)
+        snes.setObjective(lambda _, x: objective(x))
+        snes.setFunction(lambda _, x, b: residual(x, b), balance.vector)
         self.made_positive(None)
 
     def made_positive(self, how: Way | None) -> None:

@@ -118,12 +118,13 @@ class Linear:
         if self.stiffness.is_incomplete:
             from .condensed import Condensed
 
-            parts, springs = (lambda: self.stiffness.low_rank), (lambda: self.stiffness.springs)
+            stiffness = self.stiffness
+            parts, springs = (lambda: stiffness.low_rank), (lambda: stiffness.springs)
             self.operator = self._condensed = Condensed(self.operator, parts, springs).matrix()
         self._know_rigid_motions()
 
     def _forget_condensed(self) -> None:
-        """Its context holds this object, and so it would stay for ever."""
+        """Give back the matrix that K is multiplied with where terms keep a part of K beside its entries."""
         if self._condensed is not None:
             self._condensed.destroy()
             self._condensed = None
@@ -140,8 +141,8 @@ class Linear:
             self._blocks.forget()
             self._blocks = self._products = None
         if self._by_blocks and worth_it(self.stiffness.matrix):
-            blocks = self.stiffness.in_blocks()
-            self._blocks = Blocks(self.stiffness.matrix, blocks, lambda: self.stiffness.pattern)
+            stiffness, blocks = self.stiffness, self.stiffness.in_blocks()
+            self._blocks = Blocks(stiffness.matrix, blocks, lambda: stiffness.pattern)
             self._products = self._blocks.matrix()
 
     def shrink(self) -> bool:

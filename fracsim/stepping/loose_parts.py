@@ -26,6 +26,7 @@ from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.parts import parts_of_nodes
 from ..mesh.ranks import total
+from .weakly import AppliedBy
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -46,7 +47,7 @@ class LooseParts:
         self._nodes, self._part, self._count = nodes, part, count
         self.pc = PETSc.PC().create(balance.domain.comm)
         self.pc.setType("python")
-        self.pc.setPythonContext(self)
+        self.pc.setPythonContext(AppliedBy(self.apply))
         self._rest = balance.vector.duplicate()
 
     def follow(self, tangent: PETSc.Mat) -> bool:

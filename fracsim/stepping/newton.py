@@ -15,6 +15,7 @@ from ..mechanics.balance import Balance
 from .linear import Linear, chosen_options
 from .petsc_options import Options, OptionSet, refusing
 from .stepper import Abandoned, SolveResult
+from .weakly import weakly
 
 if TYPE_CHECKING:
     from .downhill import Downhill
@@ -68,9 +69,9 @@ class Newton:
             self._options.remove()
             raise
         self._take_tangent()
-        snes.setConvergenceTest(self._converged)
+        snes.setConvergenceTest(weakly(self._converged))
         if balance.limits_steps:
-            snes.setLineSearchPreCheck(self._limit)
+            snes.setLineSearchPreCheck(weakly(self._limit))
             if balance.conservative:
                 from .downhill import Downhill
 
@@ -93,9 +94,9 @@ class Newton:
         down = Downhill(self.balance, snes)
         self._made.append(snes)
         self._take_tangent()
-        snes.setLineSearchPreCheck(self._limit)
+        snes.setLineSearchPreCheck(weakly(self._limit))
         snes.setFromOptions()
-        snes.setConvergenceTest(self._converged)
+        snes.setConvergenceTest(weakly(self._converged))
         return down
 
     @property
@@ -118,10 +119,10 @@ class Newton:
         """Linearise into the matrix that the balance has now."""
         linear = self.linear
         for snes in self._made:
-            snes.setJacobian(
-                lambda *_: linear.linearise(self.snes.getFunctionNorm(), self._last_little),
-                linear.operator, self.balance.stiffness.matrix,
-            )  # fmt: skip
+            snes.setJacobian(weakly(self._linearise), linear.operator, self.balance.stiffness.matrix)
+
+    def _linearise(self, *_: object) -> None:
+        self.linear.linearise(self.snes.getFunctionNorm(), self._last_little)
 
     @property
     def _smallness(self) -> float | None:

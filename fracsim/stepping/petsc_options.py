@@ -6,6 +6,7 @@ import ctypes
 import difflib
 import itertools
 from collections.abc import Callable
+from weakref import finalize
 
 from petsc4py import PETSc
 
@@ -30,11 +31,13 @@ _library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptio
 
 
 class OptionSet:
-    """The options of one SNES, in the database while it lives: multigrid reads its levels' at every set-up."""
+    """The options of one SNES, in the database while this object lives: multigrid reads its levels' at every set-up."""
 
     def __init__(self, options: Options) -> None:
         self.prefix = f"fracsim{next(_prefixes)}_"
         self._keys: list[str] = []
+        self._removal = finalize(self, _remove, self.prefix, self._keys)
+        self._removal.atexit = False  # PETSc has ended by then
         self.change(options)
 
     def change(self, options: Options) -> None:
@@ -42,7 +45,7 @@ class OptionSet:
         database = PETSc.Options()
         for key, value in options.items():
             database[self.prefix + key] = str(value).lower() if isinstance(value, bool) else str(value)
-        self._keys += [key for key in options if key not in self._keys]
+        self._keys.extend(key for key in options if key not in self._keys)
 
     def check(self, given: Options, set_up: Callable[[], None]) -> None:
         """InputError for an option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""
@@ -59,9 +62,13 @@ class OptionSet:
 
     def remove(self) -> None:
         """Take the options out of the database."""
-        database = PETSc.Options()
-        for key in self._keys:
-            database.delValue(self.prefix + key)
+        self._removal()
+
+
+def _remove(prefix: str, keys: list[str]) -> None:
+    database = PETSc.Options()
+    for key in keys:
+        database.delValue(prefix + key)
 
 
 def refusing(work: Callable[[], None]) -> None:
