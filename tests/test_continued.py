@@ -22,7 +22,10 @@ from support.ranks import run_on_ranks
 from support.scenes import make_study
 
 # seconds each: what they show of a scheme or a feature a shorter case shows of another
-SLOW = {"free-obstacles", "contact-of-pieces", "newmark", "branching", "grains", "ductile-implicit", "explicit-joined"}
+SLOW = {
+    "free-obstacles", "contact-of-pieces", "newmark", "branching", "grains", "ductile-implicit", "explicit-joined",
+    "quadratic", "explicit-quadratic",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
@@ -88,7 +91,7 @@ def test_rigid_bodies_go_on_the_same(tmp_path: Path, name: str) -> None:
 
     def begun(where: str, *, restart: bool = False) -> RigidRun:
         scene, interrupt = build_rigid_scene(data), Interrupt(MPI.COMM_SELF, None)
-        return RigidRun(scene, tmp_path / where, text, interrupt, frames=1.0, restart=restart)
+        return RigidRun(scene, tmp_path / where, text, interrupt, restart=restart)
 
     def numbers(run: RigidRun) -> dict[str, Any]:
         kept = {key: np.array(values) for key, values in run.scene.stepper.saved(run.state).items() if np.size(values)}

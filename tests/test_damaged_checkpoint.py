@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from cases import STRIP, changed, fracsim_here, write_study
+from cases import STRIP, changed, fracsim, fracsim_here, write_study
 from fracsim.errors import Exit
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
@@ -85,6 +85,17 @@ def test_numbers_that_could_be_are_refused_by_the_digest(stopped: Path, tmp_path
         file["chi"][...] = np.clip(0.5 * file["chi"][()], 0.0, 1.0)
 
     assert "damaged: its digest" in refused(stopped, tmp_path, lambda path: damaged.edit(path, later))
+
+
+@pytest.mark.ranks
+def test_on_two_ranks_there_is_one_message(stopped: Path, tmp_path: Path) -> None:
+    """Of what rank 0 sees, and of edges, for which all ranks look."""
+    for kind, said in (("chi above 1", "chi is not all from"), ("weakened no edges", "are none of the mesh")):
+        out = shutil.copytree(stopped / "out", tmp_path / kind)
+        damaged.resealed(out / "checkpoint" / "state.h5", damaged.EDITS[kind])
+        done = fracsim("run", stopped / "torn.toml", "-o", out, "--restart", ranks=2)
+        assert done.returncode == Exit.BAD_INPUT and done.stderr.count(said) == 1, done.stderr
+        assert done.stderr.count("fracsim: --restart: cannot read") == 1 and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])

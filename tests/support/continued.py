@@ -19,7 +19,7 @@ from mpi4py import MPI
 from fracsim.run import Run
 from fracsim.scene import build_scene
 
-from . import shattered, tearing, torn
+from . import quadratic, shattered, tearing, torn
 from .scenes import make_study
 
 Numbers = dict[str, npt.NDArray[Any]]
@@ -63,6 +63,23 @@ CASES: dict[str, tuple[dict[str, Any], int, tuple[int, ...]]] = {
     "branching": (tearing.RUNS["forked"], 16, (5, 13)),
     "brittle": (shattered.RUNS["averaged"], 5, (2, 3)),
     "grains": (shattered.RUNS["bias"], 4, (2,)),
+    # quadratic displacement, damped; contact that is made stiffer in the third step; steps as a table says, and
+    # shorter where edges break
+    "quadratic": (quadratic.RUNS["block"], 4, (2, 3)),
+    "explicit-quadratic": (quadratic.RUNS["plate"], 25, (9, 22)),
+    "stiffened": (
+        {"mesh": {}, "material": {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0},
+         "contact": {"stiffness": 3e-3, "friction": 0.2},
+         "boundary": [{"on": {"box": [[-1.0, -1.0], [0.01, 2.0]]}, "fix": "xy"},
+                      {"on": {"box": [[2.04, -1.0], [2.2, 2.0]]}, "velocity": [-0.6, 0.0]}],
+         "time": {"scheme": "backward-euler", "step": 0.05, "end": 0.5}}, 6, (4,),
+    ),
+    "retaken": (
+        torn.RUNS["plate"] | {
+            "time": {"scheme": "newmark", "step": {"time": [0.0, 0.1, 0.3], "value": [0.08, 0.05, 0.03]}, "end": 5.0,
+                     "breaking_step": 0.01},
+        }, 16, (3, 9),
+    ),
     # without inertia, where the next guess is extrapolated: a strength, energy, cracks that hold on
     "quasi-static": (torn.RUNS["ties"], 6, (2, 4)),
     "quasi-static-energy": (tearing.RUNS["notched"], 5, (1, 3)),
@@ -92,6 +109,11 @@ def differences(comm: MPI.Intracomm, name: str, folder: Path) -> list[str]:
     all go on from alike.
     """
     tables, steps, stops = CASES[name]
+    if not tables["mesh"]:
+        from test_itself import two_blocks
+
+        folder.mkdir(exist_ok=True)
+        tables = tables | {"mesh": {"file": comm.bcast(two_blocks(folder, 2, 0.05) if comm.rank == 0 else "")}}
     explicit, found = tables["time"]["scheme"] == "explicit", []
 
     def begun(where: str, *, restart: bool = False) -> Run:

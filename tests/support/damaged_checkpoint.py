@@ -134,7 +134,7 @@ EDITS: dict[str, Edit] = {
     "weakened out of range": at("weakened", 10**6), "weakened negative": at("weakened", -3),
     "weakened permuted": array("weakened", lambda keys: keys[::-1]),
     "weakened twice": array("weakened", lambda keys: np.concatenate([keys[:1], keys[:-1]])),
-    "weakened no edges": array("weakened", lambda keys: np.column_stack([keys[:, 0] * 0, 20 + np.arange(len(keys))])),
+    "weakened no edges": array("weakened", lambda keys: np.column_stack([keys[:, 0] * 0, 8 + np.arange(len(keys))])),
     "weakened short": array("weakened", lambda keys: keys[:-1]),
     "weakened of real numbers": array("weakened", lambda keys: keys.astype(float)),
     "integrity negative": at("integrity", -1.0), "integrity whole": at("integrity", 1.0),
