@@ -24,7 +24,9 @@ from fracsim.output.interrupt import Interrupt
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study import Study
+from support.quadratic import RUNS as QUADRATIC
 from support.scenes import make_study
+from support.shattered import RUNS as SHATTERED
 from support.tearing import RUNS as TEARING
 from support.torn import RUNS as TORN
 
@@ -48,6 +50,15 @@ STRIPS: dict[str, Data] = {
 OTHERS: dict[str, Data] = {
     "contact": TORN["struck"] | {"time": {"scheme": "backward-euler", "step": 0.05, "end": 0.15}, "solver": SOLVER},
     "energy": TEARING["notched"],
+}
+
+
+# with contact, ties, brittle surfaces, cohesive cracks, cracks that close, quadratic cells, ...
+EVERY: dict[str, Data] = {
+    f"{kind} {name}": tables
+    for kind, runs in {"torn": TORN, "tearing": TEARING, "shattered": SHATTERED, "quadratic": QUADRATIC}.items()
+    for name, tables in runs.items()
+    if make_study(**tables).time.scheme != "explicit"
 }
 
 
@@ -91,34 +102,45 @@ class Asked:
         self.count, self.number = 0, number
 
 
-@pytest.mark.parametrize("name", [*STRIPS, *OTHERS])
-def test_a_long_step_is_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Between two Newton iterations, in several steps and in several passes of one: the checkpoint is of the start of
-    the step, and the run goes on from it as if it had never been stopped."""
-    data = study(STRIPS[name]) if name in STRIPS else make_study(**OTHERS[name] | {"output": {"picture": False}})
-    asked = Asked(monkeypatch)
+def run_fresh(data: Study, folder: Path, *, restart: bool = False) -> None:
+    scene = build_scene(MPI.COMM_SELF, data)
+    try:
+        Run(scene, folder, restart=restart)()
+    finally:
+        scene.destroy()
 
-    def run(folder: Path, *, restart: bool = False) -> int:
-        asked.count = 0
-        scene = build_scene(MPI.COMM_SELF, data)
-        try:
-            Run(scene, folder, restart=restart)()
-        finally:
-            scene.destroy()
-        return asked.count
 
-    asks = run(tmp_path / "whole")
-    assert asks > 3 and columns(tmp_path / "whole")["step"][-1] > 1
-    for number in (asks // 3, asks):
-        folder = tmp_path / str(number)
+def assert_abandoned_steps_are_lost_alone(data: Study, folder: Path, asked: Asked, shares: tuple[float, ...]) -> None:
+    """A run that is stopped inside a step, after such shares of all that its steps ask, goes on from the start of the
+    step as if it had never been stopped."""
+    asked.begin()
+    run_fresh(data, folder / "whole")
+    asks = asked.count
+    assert asks > 1
+    for number in {max(1, int(share * asks)) for share in shares}:
         asked.begin(number)
         with pytest.raises(
             Stopped, match=r"stopped by signal SIGTERM at .*; the step that was under way begins anew\. Ch"
         ):
-            run(folder)
+            run_fresh(data, folder / str(number))
         asked.begin()
-        run(folder, restart=True)
-        assert_same(folder, tmp_path / "whole")
+        run_fresh(data, folder / str(number), restart=True)
+        assert_same(folder / str(number), folder / "whole")
+
+
+@pytest.mark.parametrize("name", [*STRIPS, *OTHERS])
+def test_a_long_step_is_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Between two Newton iterations, in several steps and in several passes of one."""
+    data = study(STRIPS[name]) if name in STRIPS else make_study(**OTHERS[name] | {"output": {"picture": False}})
+    assert_abandoned_steps_are_lost_alone(data, tmp_path, Asked(monkeypatch), (0.3, 1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERY)
+def test_a_step_of_any_study_is_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    tables = EVERY[name] | {"output": {"picture": False, "surface": False}}
+    data = make_study(**{"solver": SOLVER} | tables)
+    assert_abandoned_steps_are_lost_alone(data, tmp_path, Asked(monkeypatch), (0.5,))
 
 
 RIGID: Data = {
