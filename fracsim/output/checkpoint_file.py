@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -94,6 +95,8 @@ def seal(path: Path) -> None:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     with path.open("ab") as file:
         file.write(MARK + digest.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())  # before it takes the place of the last good one, which a loss of power would take
 
 
 def fingerprint(mesh: MeshData | None) -> str:
@@ -112,26 +115,41 @@ def fingerprint(mesh: MeshData | None) -> str:
 
 
 def read_notes(folder: Path) -> Notes:
-    """The notes of a checkpoint (rank 0). InputError where there is none that can be read."""
-    return read_stored(folder).notes
+    """The notes of a checkpoint that is as it was written (rank 0). InputError where there is none."""
+    path = _there(folder)
+    with _refusing(path):
+        _check_seal(path)
+        with hdf5_there(path) as file:
+            return _notes(file)
 
 
 def read_stored(folder: Path) -> Stored:
     """All that a checkpoint holds (rank 0). InputError where there is none, or one that is not as it was written."""
-    path = checkpoint_path(folder)
-    if not path.is_file():
-        raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
+    path = _there(folder)
     with _refusing(path):
         _check_seal(path)
         with hdf5_there(path) as file:
             arrays = {name: _array(file, name) for name in file if name != "notes"}
             clock = {name: _number(name, value) for name, value in file.attrs.items() if name != "mesh"}
-            mesh = str(file.attrs["mesh"])
-            study, monitors = (_text(file, f"notes/{name}") for name in _NOTES)
-        notes = Notes(study, json.loads(monitors))
-        notes.values()
+            mesh, notes = str(file.attrs["mesh"]), _notes(file)
         _check_clock(clock)
     return Stored(path, arrays, clock, mesh, notes)
+
+
+def _there(folder: Path) -> Path:
+    """Where the checkpoint is. InputError where there is none."""
+    path = checkpoint_path(folder)
+    if not path.is_file():
+        raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
+    return path
+
+
+def _notes(file: Any) -> Notes:
+    """The notes, which are TOML and JSON."""
+    study, monitors = (_text(file, f"notes/{name}") for name in _NOTES)
+    notes = Notes(study, json.loads(monitors))
+    notes.values()
+    return notes
 
 
 def check_mesh(stored: Stored, mesh: MeshData | None) -> None:
