@@ -1,17 +1,21 @@
-"""Files that a user names, and files that those name: which of them may be opened.
+"""Files that a user names, and files that those name: which of them may be opened, and how files are written.
 
 A named pipe would be waited for without end, and a device or a link within a file leads to data that is not the
 user's. So a file is read where it is a plain one; what it names where it is a plain one in the same folder; HDF5 where
-all of it is in the file itself.
+all of it is in the file itself. What is written is a new file: a link at its place is replaced, not followed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import stat
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -21,6 +25,7 @@ _KINDS = (
     (stat.S_ISBLK, "a device"),
 )
 MISSING = "does not exist"
+NEW = ".new"  # ends the name of a file that is not whole yet
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -35,6 +40,26 @@ def wrong_with(path: str | PathLike[str]) -> str:
     if stat.S_ISREG(mode):
         return ""
     return f"is {next((kind for is_kind, kind in _KINDS if is_kind(mode)), 'something else')}, not a file"
+
+
+class NotAFile(OSError):
+    """What has the name of a file is something else."""
+
+    def __init__(self, path: Path, wrong: str) -> None:
+        """`wrong`: as of `wrong_with`."""
+        super().__init__(errno.EPERM, wrong, str(path))
+
+    def __str__(self) -> str:
+        return f"{self.filename} {self.strerror}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return NotAFile, (Path(self.filename), self.strerror)
+
+
+def check_readable(path: Path) -> None:
+    """NotAFile where a folder, a pipe or a device has the name of a file to be read; nothing where there is none."""
+    if (wrong := wrong_with(path)) not in ("", MISSING):
+        raise NotAFile(path, wrong)
 
 
 def wrong_beside(path: Path, name: str) -> str:
@@ -76,3 +101,49 @@ def data_elsewhere(file: Any) -> str:
                 seen.add(address)
                 todo.append(entry)
     return ""
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def check_replaceable(path: Path) -> None:
+    """NotAFile where a folder, a pipe or a device has the name of a file to be written."""
+    if not path.is_symlink():
+        check_readable(path)
+
+
+def create(path: Path) -> BinaryIO:
+    """A new file, to be written, in place of the file, link or pipe that has its name. Raises OSError."""
+    if path.is_dir() and not path.is_symlink():
+        raise NotAFile(path, "is a folder, not a file")
+    path.unlink(missing_ok=True)
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), "wb")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A new file beside `path` that takes its place once it is whole; where that fails the old file stays. For one
+    process at a time. Raises OSError."""
+    check_replaceable(path)
+    new = path.with_name(path.name + NEW)
+    create(new).close()
+    try:
+        yield new
+        os.replace(new, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def replacing_all(path: Path) -> Iterator[Path]:
+    """The same name in a new folder beside `path`: all files that are made there come to lie beside `path`, once they
+    are whole. For programs that go by the ending of a name, or make several files of it. Raises OSError."""
+    check_replaceable(path)
+    with TemporaryDirectory(prefix=f".{path.name[:50]}-", dir=path.parent) as folder:
+        yield Path(folder) / path.name
+        for made in sorted(Path(folder).iterdir()):
+            check_replaceable(path.parent / made.name)
+        for made in sorted(Path(folder).iterdir()):
+            os.replace(made, path.parent / made.name)

@@ -22,8 +22,9 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.data import MeshData
+from ..meshes.plain_files import replacing
 from .own_files import CHECKPOINT
-from .writing import ROOM, hdf5_file, hdf5_there, replacing
+from .writing import ROOM, hdf5_file, hdf5_there
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.data import MeshData
-from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text, replacing
+from ..meshes.plain_files import data_elsewhere, replacing
+from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text
 
 Values = npt.NDArray[np.float64]
 TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # of a symmetric tensor in VTK's order, as ParaView names it
@@ -70,7 +71,8 @@ class FieldsFile:
         kept = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
         with hdf5_there(self.h5) as file:
             earlier = any(_has_earlier_order(data) for name in kept for data in file["frames"][name].values())
-        if earlier or len(kept) < len(times):
+        shared = self.h5.stat().st_nlink > 1  # a backup by hard links stays as it is
+        if earlier or shared or len(kept) < len(times):
             self._keep(kept)
         with hdf5_there(self.h5) as file:
             return "".join(self._again(name, file["frames"][name]) for name in kept)
@@ -139,6 +141,20 @@ class FieldsFile:
             f'<DataItem Dimensions="{dimensions}" NumberType="{number}" Precision="{precision}" Format="HDF">'
             f"{self.h5.name}:/{path}</DataItem>"
         )
+
+
+def check_whole(h5: Path) -> None:
+    """InputError where a fields.h5 that is to be appended to is a link, or has data in other files."""
+    wrong = "is a link, not a file" if h5.is_symlink() else ""
+    if not wrong:
+        try:
+            with hdf5_there(h5) as file:
+                if name := data_elsewhere(file):
+                    wrong = f"has the data of '{name}' in another file"
+        except (OSError, RuntimeError):
+            return  # read_times says what is wrong
+    if wrong:
+        raise InputError(f"--restart: {h5} {wrong}; move it away to go on without its frames")
 
 
 def read_times(h5: Path) -> dict[str, float]:

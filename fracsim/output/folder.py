@@ -16,9 +16,9 @@ from .. import __version__
 from ..errors import InputError
 from ..stepping.stepper import intervals
 from .checkpoint_file import checkpoint_path, read_notes
-from .fields_file import read_times
+from .fields_file import check_whole, read_times
 from .history import read_earlier
-from .own_files import STUDY, check_not_resumable, check_owner, clear
+from .own_files import STUDY, check_not_resumable, check_owner, check_plain, clear
 from .same_study import check_same_study
 from .writing import reason, replace_text
 
@@ -37,6 +37,7 @@ def check_folder(
     `study`: as it would stand in study.toml; `overwrite`: a run that may go on may be thrown away; `inputs`: files
     that the study is read from; `completed` gives an earlier version's study the defaults of keys that it did not know.
     """
+    check_plain(folder)
     if restart:
         then = completed(read_notes(folder).values())
         check_same_study(checkpoint_path(folder), then, tomllib.loads(study))
@@ -60,8 +61,9 @@ def make_folder(folder: Path, study: str, *, restart: bool) -> None:
 def check_readable(folder: Path, columns: list[str], step: int) -> None:
     """InputError where what a run has written so far cannot be continued; changes nothing (rank 0)."""
     read_earlier(folder / "history.csv", columns, step)
-    if (folder / "fields.h5").exists():
-        read_times(folder / "fields.h5")
+    if (h5 := folder / "fields.h5").exists():
+        check_whole(h5)
+        read_times(h5)
     check_text(folder)
 
 

@@ -23,7 +23,7 @@ from ..mesh.ranks import total
 from ..meshes.words import AXES
 from ..stepping.state import State
 from ..stepping.stepper import StepReport
-from .writing import replace_text, write_all, written
+from .writing import open_to_append, replace_text, write_all, written
 
 COLUMNS = (
     "step", "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",
@@ -148,7 +148,7 @@ class History:
         if not earlier.readable:
             self.notes.append(f"it is {set_aside(self._path)} from here on, and {self._path.name} begins anew")
         replace_text(self._path, "".join(map(_line, [self.columns, *earlier.rows])))
-        return self._path.open("ab", buffering=0)
+        return open_to_append(self._path)
 
     def append(
         self, state: State, report: StepReport, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]

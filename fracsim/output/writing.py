@@ -14,22 +14,9 @@ from mpi4py import MPI
 
 from ..errors import CannotWrite
 from ..mesh.ranks import on_root
-from .own_files import NEW
+from ..meshes.plain_files import MISSING, NotAFile, replacing, wrong_with
 
 ROOM = 6 << 10  # bytes that HDF5 may need beside the values of one array, most of it for an attribute that is text
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that takes its place once it is whole; where that fails the old file stays."""
-    new = path.with_name(path.name + NEW)
-    try:
-        yield new
-        os.replace(new, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            new.unlink(missing_ok=True)
-        raise
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -52,13 +39,15 @@ def written[T](comm: MPI.Comm, path: Path, work: Callable[[], T]) -> T | None:
 
 def reason(error: Exception) -> str:
     """Why a file could not be written, in the words of the system."""
+    if isinstance(error, NotAFile):
+        return str(error.strerror)
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)
 
 
 def append(path: Path, text: bytes, over: int = 0) -> None:
     """Write `text` in place of the last `over` bytes; where that fails (OSError) the file is as it was."""
-    with path.open("r+b", buffering=0) as file:
+    with open(path, "r+b", buffering=0, opener=_no_link) as file:
         at = file.seek(-over, os.SEEK_END)
         tail = file.read()
         file.seek(at)
@@ -69,6 +58,15 @@ def append(path: Path, text: bytes, over: int = 0) -> None:
             file.write(tail)
             file.truncate(at + over)
             raise
+
+
+def open_to_append(path: Path) -> RawIOBase:
+    """A plain file, to be written at its end. Raises OSError."""
+    return open(path, "ab", buffering=0, opener=_no_link)
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def write_all(file: RawIOBase, text: bytes) -> None:
@@ -93,6 +91,8 @@ def hdf5_file(path: Path, size: int, *, begin: bool = False) -> Iterator[Any]:
     """
     import h5py
 
+    if (wrong := "is a link, not a file" if path.is_symlink() else wrong_with(path)) not in ("", MISSING):
+        raise NotAFile(path, wrong)
     try:
         if begin:
             h5py.File(path, "w").close()

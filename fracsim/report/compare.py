@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..meshes.plain_files import check_readable
 from .content import Cell, Picture, Plot, Section, Series, Table
 from .pareto import pareto_front
 from .runs import PHASES, RunData, Values, differing
@@ -177,6 +178,7 @@ def pictures(runs: list[RunData]) -> list[Section]:
 def read_reference(path: Path) -> Reference:
     """A CSV with a header: the x column first, then one or more y columns. InputError where it is not that."""
     try:
+        check_readable(path)
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = [row for row in csv.reader(file) if row]
         table = np.array(rows, float)

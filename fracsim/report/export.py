@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
+from ..meshes.plain_files import replacing_all
 from .pictures.body import is_crack, without_dust
 from .pictures.colouring import rgb
 from .pictures.shots import CLOSE, Shot, film_interval, find_frames, load, study_of
@@ -53,6 +54,8 @@ def export(
     if frame is not None and not -len(shots) <= frame < len(shots):
         raise InputError(f"--frame {frame}: {folder} has {len(shots)} frames, counted from 0 (-1 is the last)")
     chosen = list(range(len(shots))) if frame is None else [frame % len(shots)]
+    if target is None and (folder / "export").is_symlink():
+        raise InputError(f"{folder / 'export'} is a link: name the folder for the files with -o")
     target = target or folder / "export"
     skin = skin_of(look or study_of(folder).get("output", {}).get("look", "plain"))
     frames = ((number, pieces_of(shots[number], dust)) for number in chosen)
@@ -60,12 +63,15 @@ def export(
     name = folder.resolve().name
     target.mkdir(parents=True, exist_ok=True)
     if kind == "usd":
-        return [_usd(target / f"{name}.usdc", frames, skin, times)]
+        with replacing_all(target / f"{name}.usdc") as new:
+            _usd(new, frames, skin, times)
+        return [target / f"{name}.usdc"]
     write = {"ply": _ply, "obj": _obj, "glb": _glb}[kind]
     made = []
     for number, pieces in frames:
         made.append(target / f"{name}_{number:06d}.{kind}")
-        write(made[-1], pieces, skin, times[number])
+        with replacing_all(made[-1]) as new:
+            write(new, pieces, skin, times[number])
     return made
 
 
@@ -153,15 +159,14 @@ def _glb(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
     path.write_bytes(scene.export(file_type="glb"))
 
 
-def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, times: list[float]) -> Path:
+def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, times: list[float]) -> None:
     """One mesh whose points and triangles are of their time, in m, z upwards; `piece` of each triangle beside them.
 
     `times`: s of all frames of the run. A time code is the time between two of them, so that programs that show a code
     a picture show every frame; timeCodesPerSecond says how many of these are a second.
     """
     Usd, UsdGeom, Sdf, Vt = (_needed(f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "Sdf", "Vt"))
-    stage = Usd.Stage.CreateNew(str(path)) if not path.exists() else Usd.Stage.Open(str(path))
-    stage.GetRootLayer().Clear()
+    stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     interval = film_interval(times)
@@ -194,4 +199,3 @@ def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, time
     stage.SetStartTimeCode(codes[0])
     stage.SetEndTimeCode(codes[-1])
     stage.GetRootLayer().Save()
-    return path

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..meshes.plain_files import check_replaceable, replacing_all
 from .content import Cell, Picture, Section, Table
 from .plots import draw
 
@@ -40,10 +41,16 @@ def write_page(
         title=title, subtitle=subtitle, sections=made, about=about, shown=len(made) if shown is None else shown
     )
     try:
+        check_replaceable(target)
+        if csvs.is_symlink():
+            raise InputError(
+                f"-o {target}: the folder {csvs} for its tables is a link; delete it, or give another name"
+            )
         csvs.mkdir(parents=True, exist_ok=True)
         for table in (table for section in sections for table in section.tables):
             write_csv(csvs / f"{table.name}.csv", table)
-        target.write_text(text, encoding="utf-8")
+        with replacing_all(target) as new:
+            new.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"-o {target}: cannot write there: {error.strerror}") from None
     return target
@@ -51,7 +58,7 @@ def write_page(
 
 def write_csv(path: Path, table: Table) -> None:
     """All digits of a table."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing_all(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(table.columns)
         writer.writerows([["" if cell is None else cell for cell in row] for row in table.rows])

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
+from ..meshes.plain_files import check_readable
 
 Values = npt.NDArray[np.float64]
 PHASES = ("setup", "solve", "plasticity", "fracture", "energies", "output")
@@ -123,6 +124,8 @@ def _names(folders: list[Path]) -> list[str]:
 def read_run(folder: Path, name: str) -> RunData:
     """Read one run. InputError where its files are not what a run writes."""
     try:
+        for each in ("study.toml", "history.csv", "summary.json"):
+            check_readable(folder / each)
         study = tomllib.loads((folder / "study.toml").read_text(encoding="utf-8"))
         history = _read_history(folder / "history.csv")
         path = folder / "summary.json"

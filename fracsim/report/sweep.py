@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped
+from ..meshes.plain_files import create, replacing_all
 from ..output.lock import FolderLock, holder
 from ..output.own_files import check_owner, resumable
 from ..study.check import check_study
@@ -231,6 +232,7 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
     # what is there may be overwritten: _check_folder has looked
     log, work = case.folder / "log.txt", command(study, case, ranks, "restart" if state == "begun" else "overwrite")
+    create(log).close()
     with log.open("w") as file, _Forwarding() as forwarding:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
         process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True, env=_environment())
@@ -294,12 +296,10 @@ def collect(cases: list[Case], outcomes: dict[str, str], out: Path) -> None:
         rows.append({"case": case.folder.name, **case.values, "outcome": outcomes.get(case.folder.name, "not run yet")})
         rows[-1] |= figures
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    part = out / f"sweep.csv.{os.getpid()}"
-    with part.open("w", newline="") as file:
+    with replacing_all(out / "sweep.csv") as new, new.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)
-    part.replace(out / "sweep.csv")
 
 
 def _figures(case: Case) -> dict[str, Any]:

@@ -7,10 +7,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...errors import InputError
+from ...meshes.plain_files import check_readable
+from ..own_files import FRAME
+
 _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
 _TAIL = "  </Collection>\n</VTKFile>\n"
 _ENTRY = re.compile(r'timestep="([^"]+)"(?: part="(\d+)" name="([^"]+)")? file="([^"]+)"')
 BODY = "body"
+FRAMES = "surface/"  # where files lie
 
 
 @dataclass(frozen=True)
@@ -40,8 +45,12 @@ def _line(entry: Entry, blocks: bool) -> str:
 
 
 def read_entries(pvd: Path) -> list[Entry]:
-    """All that is shown."""
+    """All that is shown. InputError where it names what no run writes: VTK would read any file, by its ending."""
+    check_readable(pvd)
     found = _ENTRY.findall(pvd.read_text())
+    for *_, file in found:
+        if not (file.startswith(FRAMES) and FRAME.fullmatch(file.removeprefix(FRAMES))):
+            raise InputError(f"{pvd} names the file {file}, which no run of fracsim writes")
     return [Entry(float(t), file, int(part or 0), name or BODY) for t, part, name, file in found]
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ...meshes.plain_files import create, replacing
 from ..fields_file import EARLIER_TENSOR, TENSOR, from_earlier, padded
-from ..writing import replacing
 
 if TYPE_CHECKING:
     from .frame import Frame
@@ -38,7 +38,8 @@ def write_vtu(path: Path, grid: Any) -> None:
     if not writer.Write():
         raise OSError("VTK cannot write it")
     made = writer.GetOutputString()  # bytes, where they are no text
-    path.write_bytes(made if isinstance(made, bytes) else made.encode())
+    with create(path) as file:
+        file.write(made if isinstance(made, bytes) else made.encode())
 
 
 def _array(values: npt.NDArray[np.generic], name: str = "") -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
+from ...meshes.plain_files import check_replaceable, replacing_all
 from .camera import scope_of, union
 from .colouring import merged
 from .look import Look
@@ -46,6 +46,8 @@ def render(
     look.direction()
     if target.suffix not in ("", ".png", *FILMS):
         raise InputError(f"-o {target}: pictures are .png, films .gif or .mp4, and a name without a suffix is a folder")
+    if target.suffix:
+        check_replaceable(target)  # before anything is drawn
     every = [find_frames(each) for each in folders]
     if target.suffix == ".png":
         shots = chosen_of(every, folders, frame, sheet)
@@ -122,20 +124,14 @@ def _save(target: Path, pixels: Pixels) -> None:
     """Write a PNG in one go: a run may draw the same one, and someone may look at it."""
     from PIL import Image
 
-    part = target.with_name(f"{target.name}.{os.getpid()}")
-    try:
-        with part.open("xb") as file:
-            Image.fromarray(pixels).save(file, "PNG", optimize=True)
-        part.replace(target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with replacing_all(target) as new:
+        Image.fromarray(pixels).save(new, "PNG", optimize=True)
 
 
 def _film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
     """All pictures, as the name says."""
     if target.suffix:
-        with _writer(target, fps) as append:
+        with replacing_all(target) as new, _writer(new, fps) as append:
             for each in pictures:
                 append(each)
         return
@@ -155,7 +151,9 @@ class _writer:
             try:
                 import imageio_ffmpeg  # noqa: F401
             except ImportError:
-                message = f"-o {target}: films in MP4 need imageio-ffmpeg (pip install imageio-ffmpeg); .gif does not"
+                message = (
+                    f"-o {target.name}: films in MP4 need imageio-ffmpeg (pip install imageio-ffmpeg); .gif does not"
+                )
                 raise InputError(message) from None
             how = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2}
         self._file = imageio.v2.get_writer(str(target), **how)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
+from ...meshes.plain_files import check_readable, data_elsewhere
 from ...output.fields_file import read_values
 from ...output.surface.collection import Entry, read_entries
 from ...output.surface.vtu import reorder_tensors
@@ -45,6 +46,8 @@ class Shot:
 def find_frames(folder: Path) -> list[Shot]:
     """Frames of surface.pvd, or else of fields.h5. InputError where there are none."""
     pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
+    check_readable(pvd)
+    check_readable(h5)
     if pvd.exists():
         shots = _of_surface(folder, read_entries(pvd))
         if shots:
@@ -52,6 +55,8 @@ def find_frames(folder: Path) -> list[Shot]:
     if not h5.exists():
         raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
     with h5py.File(h5) as file:
+        if name := data_elsewhere(file):
+            raise InputError(f"{h5} has the data of '{name}' in another file, which no run of fracsim does")
         times = [float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])]
     if not times:
         raise InputError(f"{h5} has no frame yet")
@@ -92,6 +97,8 @@ def load(shot: Shot) -> Any:
     """The frame as a grid of displaced points with its fields."""
     import pyvista
 
+    for path in (shot.file, *shot.beside):
+        check_readable(path)
     if shot.index < 0:
         grid = pyvista.read(shot.file)
         reorder_tensors(grid)
@@ -112,6 +119,7 @@ def load(shot: Shot) -> Any:
 def study_of(folder: Path) -> dict[str, Any]:
     """What study.toml says, as it stands there; nothing where there is none."""
     try:
+        check_readable(folder / "study.toml")
         return tomllib.loads((folder / "study.toml").read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         return {}
