@@ -317,9 +317,15 @@ def test_a_step_from_an_earlier_state_is_the_same_step() -> None:
     assert first["contact_it_y"] != 0 and first["spin_it_z"] != 0
 
 
-def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+DOOR = ball(name="door", at=[3.0, 0.4], hinge={"point": [2.8, 0.4]}, spin=[2.0])
+LIFT = ball(name="lift", at=[5.0, 0.5], guide="y", velocity=[0.0, 1.0])
+
+
+@pytest.mark.parametrize("others", [[], [DOOR, LIFT]], ids=["alone", "beside a door and a lift"])
+def test_a_restart_goes_on_as_the_run_would_have(others: list[dict[str, Any]], tmp_path: Path) -> None:
     """Stopped in the middle of the blow: the same columns of history.csv, but for what the solver leaves."""
-    going, _, again = going_stopped_resumed(STRUCK, tmp_path, 3, 2)
+    study = STRUCK | {"obstacle": [*STRUCK["obstacle"], *others]}
+    going, _, again = going_stopped_resumed(study, tmp_path, 3, 2)
     assert told(again.scene) == pytest.approx(told(going.scene), rel=1e-9, abs=1e-9)
     assert again.state.dissipated == pytest.approx(going.state.dissipated, rel=1e-9)
     assert told(going.scene)["contact_it_y"] != 0

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ...meshes.words import AXES
-from .free_obstacle import Flight, FreeObstacle
+from .free_obstacle import Flight, FreeObstacle, rows_of
 from .obstacles import Obstacles
 from .placed import Placed
 
@@ -70,7 +70,7 @@ class Flights(Obstacles):
 
     def saved(self) -> dict[str, Values]:
         """With rows of how obstacles move (collective)."""
-        return super().saved() | {"flights": np.array([each.flight.flat() for each in self.free.values()])}
+        return super().saved() | {"flights": rows_of(each.flight for each in self.free.values())}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
@@ -96,6 +97,13 @@ class Flight:
 
     def like(self, numbers: Values) -> Flight:
         """The flight whose `flat` gave these numbers, of the same obstacle."""
-        d, k = self.pose.dim, len(self.momentum)
-        centre, rotation, momentum, force, turned = np.split(numbers, np.cumsum([d, d * d, k, k]))
+        d, k, r = self.pose.dim, len(self.momentum), len(self.turned)
+        centre, rotation, momentum, force, turned, _ = np.split(numbers, np.cumsum([d, d * d, k, k, r]))
         return Flight(Pose(centre, rotation.reshape(d, d)), momentum, force, turned)
+
+
+def rows_of(flights: Iterable[Flight]) -> Values:
+    """(n, m) the numbers of flights, a row each; shorter rows, as of what turns about a hinge, end with zeros."""
+    rows = [flight.flat() for flight in flights]
+    longest = max(map(len, rows), default=0)
+    return np.array([np.pad(row, (0, longest - len(row))) for row in rows])

@@ -24,7 +24,7 @@ from ..barrier import Barrier
 from ..course import Going
 from ..crowd import Law
 from ..flights import columns_of
-from ..free_obstacle import Flight, FreeObstacle
+from ..free_obstacle import Flight, FreeObstacle, rows_of
 from ..obstacle import Obstacle
 from ..placed import Placed
 from ..pose import Pose
@@ -304,7 +304,7 @@ class FreeSolids(Solids):
 
     def saved(self) -> dict[str, Values]:
         """With rows of how solids move (collective)."""
-        return super().saved() | {"flights": np.array([each.flight.flat() for each in self.free.values()])}
+        return super().saved() | {"flights": rows_of(each.flight for each in self.free.values())}
 
     def restore(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
