@@ -9,6 +9,7 @@ import numpy as np
 
 from .components import components
 from .data import Indices, MeshData, MeshError, Points
+from .parameters import LONGEST, SHORTEST
 from .topology import Floats, Mask, distinct_rows, edges_of, facets_of, oriented, signed_measures
 from .words import middle_of
 
@@ -99,12 +100,14 @@ def _check_numbers(rows: Indices, nodes: int, what: str) -> None:
 def _check_coordinates(mesh: MeshData) -> None:
     used = np.zeros(len(mesh.points), bool)
     used[mesh.cells] = True
-    wrong = np.flatnonzero(used & ~np.isfinite(mesh.points).all(axis=1))
+    wrong = np.flatnonzero(used & ~(np.abs(mesh.points) <= LONGEST).all(axis=1))
     if len(wrong):
         raise MeshError(
-            f"{len(wrong)} nodes have coordinates that are not finite numbers: node {_some(wrong)}, the first at "
-            f"{mesh.points[wrong[0]].tolist()}; export the mesh again."
+            f"{len(wrong)} nodes have coordinates that are not finite numbers of at most {LONGEST:g} m: "
+            f"node {_some(wrong)}, the first at {mesh.points[wrong[0]].tolist()}; export the mesh again."
         )
+    if used.any() and (size := float(np.ptp(mesh.points[used], axis=0).max())) < SHORTEST:
+        raise MeshError(f"The body is {size:g} m large, and {SHORTEST:g} m or more is needed; export the mesh again.")
 
 
 def _check_flat(mesh: MeshData) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from .data import MeshData, MeshError
 
 # A tetrahedral mesh of this size needs some 50 GB before anything is solved: surely a slip of units.
 MOST_CELLS = 200_000_000
+SHORTEST, LONGEST = 1e-30, 1e30  # m
 
 
 class Builder(Protocol):
@@ -39,7 +42,9 @@ def positive(builder: str, **values: float) -> None:
     """Raise MeshError unless every value is a positive finite number."""
     for name, value in values.items():
         if not (is_number(value) and value > 0):
-            raise MeshError(f"{builder}: {name} = {value!r} must be a positive number (metres).")
+            raise MeshError(f"{builder}: {name} = {value!r} must be a positive number (metres), at most {LONGEST:g}.")
+        if value < SHORTEST:
+            raise MeshError(f"{builder}: {name} = {value!r} m is out of reach; take {SHORTEST:g} m or more.")
 
 
 def not_negative(builder: str, **values: float) -> None:
@@ -70,5 +75,18 @@ def affordable(builder: str, h: float, cells: float, hint: str = "Lengths are in
         )
 
 
+def check_extent(points: npt.NDArray[np.float64], what: str) -> None:
+    """Raise MeshError where coordinates (n, d) are no numbers, or a body is out of reach of squares and cubes."""
+    wrong = np.flatnonzero(~(np.abs(points) <= LONGEST).all(axis=1))
+    if len(wrong):
+        raise MeshError(
+            f"{what} has {len(wrong)} points whose coordinates are not finite numbers of at most {LONGEST:g} m, the "
+            f"first is point {wrong[0]} at {points[wrong[0]].tolist()}; export it again, or mend its scale."
+        )
+    if len(points) and (size := float(np.ptp(points, axis=0).max())) < SHORTEST:
+        raise MeshError(f"{what} is {size:g} m large, and {SHORTEST:g} m or more is needed; mend its scale.")
+
+
 def is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
+    """Whether it is one that lengths may have: finite, and far from where squares and cubes overflow."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST

@@ -71,6 +71,8 @@ def _inside_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Value
 
 def _candidates(x: Values, nodes: Ints, cells: Ints) -> tuple[Ints, Ints]:
     """Pairs (node, number of a cell) no farther apart than the cell's corners are from its centre."""
+    if not len(cells):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
     corners = x[cells]
     centre = corners.mean(axis=1)
     radius = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))

@@ -58,7 +58,7 @@ class OnPlane:
     within: float | None = None
 
     def __post_init__(self) -> None:
-        if not any(self.normal):
+        if not np.linalg.norm(self.normal) > 0:  # squares of less than 1e-154 are nothing
             raise InputError(f"normal = {list(self.normal)}: a normal must not be zero")
 
     def __str__(self) -> str:

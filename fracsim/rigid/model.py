@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +17,19 @@ from .bodies import Bodies
 from .planes import Planes
 from .primitives import Primitive
 from .tumbling import orientation
+
+_warned: set[str] = set()
+
+
+def _warn(text: str) -> None:
+    """Tell a warning of MuJoCo once; by itself it writes them into MUJOCO_LOG.TXT of the working folder."""
+    known = text.partition(" at DOF")[0]
+    if known not in _warned:
+        _warned.add(known)
+        print(f"fracsim: note: MuJoCo: {known}", file=sys.stderr)
+
+
+mujoco.set_mju_user_warning(_warn)
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

@@ -63,19 +63,22 @@ static void turned(const double *turn, const double *inverse, const double *mome
     squared(halfway, after);
 }
 
-/* The turns (n, 9) of n bodies after times (n,), each in as many parts as it turns by `most` in, rad. */
-void tumbled(int64_t n, const double *turn, const double *inverse, const double *momentum, const double *time,
-             int64_t rounds, double same, double most, double *after)
+/* The turns (n, 9) of n bodies after times (n,), each in as many parts as it turns by `most` in, rad. Returns 1 where
+   one turns by more than `limit`, rad, or by no number: nothing is found then; else 0. */
+int64_t tumbled(int64_t n, const double *turn, const double *inverse, const double *momentum, const double *time,
+                int64_t rounds, double same, double most, double limit, double *after)
 {
     for (int64_t each = 0; each < n; each++, turn += 9, inverse += 9, momentum += 3, time++, after += 9) {
         double spin[3];
         rotated(turn, inverse, momentum, spin);
         double angle = fabs(*time) * sqrt(spin[0] * spin[0] + spin[1] * spin[1] + spin[2] * spin[2]);
+        if (!(angle <= limit)) return 1;
         int64_t parts = angle > most ? (int64_t)ceil(angle / most) : 1;
         turned(turn, inverse, momentum, *time / parts, rounds, same, after);
         for (int64_t part = 1; part < parts; part++)
             turned(after, inverse, momentum, *time / parts, rounds, same, after);
     }
+    return 0;
 }
 
 /* R T R^T v of n bodies. */

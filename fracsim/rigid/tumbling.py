@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ..errors import NotConverged
 from ..mesh.compiled import at, library
 
 Values = npt.NDArray[np.float64]
@@ -22,18 +23,23 @@ Values = npt.NDArray[np.float64]
 SOURCE = Path(__file__).with_suffix(".c")
 ROUNDS = 30
 PART = 0.2  # rad
+LIMIT = 1e4  # rad
 SAME = 1e-14  # change of the turn in a step, rad, that is none
 
 
 def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Values:
     """(n, 3, 3) rotations after times dt (n,) s, from those before and angular momenta (n, 3), N m s.
 
-    `inverse`: (n, 3, 3) of the inertia in the axes of the bodies, 1 / (kg m^2).
+    `inverse`: (n, 3, 3) of the inertia in the axes of the bodies, 1 / (kg m^2). NotConverged where one turns by more
+    than LIMIT.
     """
     given = [np.ascontiguousarray(each) for each in (turn, inverse, momentum, dt)]
     after: Values = np.empty(turn.shape)
-    how = c_int64(ROUNDS), c_double(SAME), c_double(PART)
-    library(SOURCE).tumbled(c_int64(len(turn)), *map(at, given), *how, at(after))
+    how = c_int64(ROUNDS), c_double(SAME), c_double(PART), c_double(LIMIT)
+    if library(SOURCE).tumbled(c_int64(len(turn)), *map(at, given), *how, at(after)):
+        raise NotConverged(
+            f"A body turns by more than {LIMIT:g} rad in a step: speeds and spins are too high for time.step"
+        )
     return after
 
 

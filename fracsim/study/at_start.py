@@ -109,12 +109,20 @@ def _corners(lower: Values, upper: Values) -> Values:
 def _check_free(entries: list[Placing], placed: list[Placed | None]) -> None:
     """InputError where an obstacle that moves freely overlaps another one; those from files are left to the run."""
     shapes = [(number, each, at) for number, (each, at) in enumerate(zip(entries, placed, strict=True)) if at]
-    among = pairs([_Named(each.name, each.loose is not None) for _, each, _ in shapes])  # type: ignore[misc]
+    every = pairs([_Named(each.name, each.loose is not None) for _, each, _ in shapes])  # type: ignore[misc]
+    boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in every}
+    among = [(a, b) for a, b in every if not shapes[b][2].beyond(boxes[a]) > 0]
     for a, b, deep in overlaps([at for _, _, at in shapes], among):
         raise InputError(
             f"obstacle.{shapes[a][0]}: {shapes[a][1].name} moves freely and overlaps {shapes[b][1].name} at the start, "
             f"by {max(0.0, deep):.4g} m; move it away or make it smaller"
         )
+
+
+def _box(placed: Placed) -> tuple[Values, Values]:
+    """Corners (d,) of a box around an obstacle, m."""
+    points = placed.pose.points_to_space(placed.shape.outline()[0])
+    return points.min(axis=0), points.max(axis=0)
 
 
 class _Named:

@@ -6,14 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from .values import Finite, Flag, NonNegative, Positive, Strength, Table, Vector
+from .values import Finite, Flag, NonNegative, Positive, Seed, Strength, Table, Unbounded, Vector
 
 
 class Heterogeneity(Table):
     """Scatter of the strength from edge to edge, Weibull-distributed with mean 1; the same at any number of ranks."""
 
     modulus: Annotated[Finite, Field(ge=0.1)]  # Weibull's m: 5 scatters like stone, 50 hardly at all
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
 
 
 class Fibre(Table):
@@ -96,7 +96,7 @@ class Plasticity(Table):
 
     yield_stress: Strength  # Pa, of the Cauchy stress
     measure: Literal["von-mises", "frobenius"] = "von-mises"  # what is compared with it; the latter counts pressure too
-    flow_rate: Annotated[float, Field(gt=0, strict=True)] = float("inf")  # 1/s; inf: independent of the rate
+    flow_rate: Unbounded = float("inf")  # 1/s; inf: independent of the rate
     hardening: Finite = 0.0  # K in Pa: what yield_stress gains with accumulated plastic strain; < 0 softens
     # what a step is solved with: the flow of the step before; its own; none, flow follows it (small steps)
     update: Literal["extrapolated", "implicit", "staggered"] = "extrapolated"
@@ -105,8 +105,8 @@ class Plasticity(Table):
 class Grains(Table):
     """Grain boundaries: regions of seeded points p_i by least k_i |x - p_i|, the same at any number of ranks."""
 
-    count: Annotated[int, Field(ge=2, strict=True)]
-    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+    count: Annotated[int, Field(ge=2, le=1_000_000, strict=True)]
+    seed: Seed = 0
     spread: Annotated[Finite, Field(ge=0, lt=1)] = 0.0  # k_i from 1 - spread to 1 + spread; 0: all grains alike
     mode: Literal["replace", "bias"] = "replace"  # a surface frees a grain; or runs along the boundaries nearest to it
 
@@ -117,7 +117,7 @@ class Brittle(Table):
     surfaces: Annotated[int, Field(ge=1, strict=True)]  # most of the run, of each rigid body: more, more debris
     spacing: Positive | None = None  # m between places where surfaces start; default: about two mesh edges
     shape: Literal["planar", "curved"] = "planar"  # curved: turns with the principal direction
-    seed: Annotated[int, Field(ge=0, strict=True)] = 0  # of the direction where several principal stresses are equal
+    seed: Seed = 0  # of the direction where several principal stresses are equal
     per_pass: Annotated[int, Field(ge=1, strict=True)] | None = None  # most that start in one pass; default: no limit
     grains: Grains | None = None
 

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..mesh.bodies import bodies_of, not_held
 from ..mesh.names import check_group, check_regions
 from ..mesh.places import Group, Place
-from ..meshes.data import MeshData
+from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import MOST_CELLS as CELLS
 from ..meshes.topology import boundary_facets, edges_of, signed_measures
 from ..meshes.words import AXES, format_point
@@ -102,8 +102,10 @@ def _words_of(study: Study, surface: ClosedSurface | None) -> Anatomy | None:
     """What a builder says of itself, or a surface that is not filled yet. None where the mesh has to be read."""
     builder = find_builder(study.mesh)
     if builder is not None:
-        lower, upper = builder.bounds()
-        count = builder.cells_estimate()
+        try:
+            (lower, upper), count = builder.bounds(), builder.cells_estimate()
+        except MeshError as error:
+            raise InputError(f"mesh: {error}") from None
         size, facets = f"about {count:,} cells", partial(_at_least, count, len(lower))
         h = _finest(builder)
         return Anatomy(len(lower), builder.groups, builder.regions, tuple(lower), tuple(upper), count, size, h, facets)

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from ..errors import InputError
 from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
-from ..meshes.parameters import is_number
+from ..meshes.parameters import SHORTEST, check_extent, is_number
 from ..meshes.plain_files import MISSING, wrong_with
 from . import Mesh
 from .explain import explain, unknown_key
@@ -92,7 +92,7 @@ def _check_source(mesh: Mesh) -> None:
     for name, meaning in BESIDE[key].items():
         value: Any = mesh.parameters.get(name)
         whole = name != "seed" or isinstance(value, int)
-        if (name in mesh.parameters or name in NEEDED) and not (is_number(value) and value > 0 and whole):
+        if (name in mesh.parameters or name in NEEDED) and not (is_number(value) and value >= SHORTEST and whole):
             raise InputError(f"mesh.{name} = {value}: {meaning}")
 
 
@@ -172,7 +172,10 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
 def _scaled(data: MeshData, mesh: Mesh) -> MeshData:
     """A mesh from file in metres: after its check, which tells coordinates of single precision by their bits."""
     scale = float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
-    return data if scale == 1 else dataclasses.replace(data, points=data.points * scale)
+    if scale == 1:
+        return data
+    check_extent(data.points * scale, f"the mesh, with mesh.scale = {scale:g},")
+    return dataclasses.replace(data, points=data.points * scale)
 
 
 def _filled(mesh: Mesh, surface: ClosedSurface) -> MeshData:

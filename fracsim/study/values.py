@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,11 +16,29 @@ from pydantic_core.core_schema import no_info_plain_validator_function
 
 # Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
 # No Field() in here: it is shared by all keys of the type, and the default of one would become that of the others.
-Finite = Annotated[float, Strict(), AllowInfNan(False)]
-Positive = Annotated[Finite, Gt(0)]
+LARGEST, SMALLEST = 1e50, 1e-50  # of what is given, whatever its unit: products of a few stay within double precision
+
+
+def _not_too_large(value: float) -> float:
+    if abs(value) > LARGEST and not math.isinf(value):  # inf: where it is allowed
+        raise ValueError(f"{value:g} is out of reach; allowed are {-LARGEST:g} to {LARGEST:g}")
+    return value
+
+
+def _not_too_small(value: float) -> float:
+    if 0 < value < SMALLEST:
+        raise ValueError(f"{value:g} is out of reach; allowed are {SMALLEST:g} to {LARGEST:g}")
+    return value
+
+
+Finite = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_not_too_large)]
+Positive = Annotated[Finite, Gt(0), AfterValidator(_not_too_small)]
 NonNegative = Annotated[Finite, Ge(0)]
-Strength = Annotated[float, Strict(), Gt(0)]  # Pa; inf never breaks
+# inf, too: never breaks, never flows, flows at once
+Unbounded = Annotated[float, Strict(), Gt(0), AfterValidator(_not_too_small), AfterValidator(_not_too_large)]
+Strength = Unbounded  # Pa
 Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
+Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
 

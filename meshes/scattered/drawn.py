@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
-from ..parameters import affordable, positive
+from ..parameters import affordable, check_extent, positive
 from ..plain_files import wrong_with
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
@@ -80,6 +80,7 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
     if not loops or min(map(len, loops)) < 3:
         raise MeshError(f"outline file '{path}': a polygon needs three corners or more, a line `x, y` each.")
     corners = [scale * np.array([corner[:2] for corner in loop]) for loop in loops]
+    check_extent(np.concatenate(corners), f"outline file '{path}'")
     start, end = np.concatenate(corners), np.concatenate([np.roll(each, -1, axis=0) for each in corners])
     return Drawn(start, end, tuple(corner[2] for loop in loops for corner in loop))
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..components import components
 from ..contents import Block
 from ..data import Indices, MeshError, Points
+from ..parameters import LONGEST, SHORTEST
 from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
@@ -142,9 +143,14 @@ def _check_points(points: Points, triangles: Indices, source: str) -> None:
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise MeshError(f"{source} names points that do not exist (there are {len(points)}); it is damaged.")
     used = np.unique(triangles)
-    wrong = used[~np.isfinite(points[used]).all(axis=1)]
+    wrong = used[~(np.abs(points[used]) <= LONGEST).all(axis=1)]
     if len(wrong):
-        raise MeshError(f"{source} has {len(wrong)} points that are not finite numbers, the first is point {wrong[0]}.")
+        raise MeshError(
+            f"{source} has {len(wrong)} points that are not finite numbers of at most {LONGEST:g} m, the first is "
+            f"point {wrong[0]}."
+        )
+    if (size := float(np.ptp(points[used], axis=0).max())) < SHORTEST:
+        raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed.")
 
 
 def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:

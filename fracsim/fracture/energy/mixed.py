@@ -54,6 +54,8 @@ def near_tip(places: Values, mu: Values, kappa: Values) -> Values:
     2 mu (u_x + i u_y) = kappa phi - z conj(phi') - conj(psi), phi' = (K_I - i K_II) / 2 (2 pi z)^1/2 (Muskhelishvili).
     """
     z = places[:, 0] + 1j * places[:, 1]
+    elsewhere = z != 0  # a tip in the very middle of a cell: what is infinite there is left out
+    z = np.where(elsewhere, z, 1.0)
     root = 1 / (2 * np.sqrt(2 * np.pi * z))
     both = []
     for K in (1.0, -1.0j):
@@ -63,7 +65,7 @@ def near_tip(places: Values, mu: Values, kappa: Values) -> Values:
         by_conj = -z * np.conj(second) - np.conj(mirrored - first - z * second)
         by_x, by_y = by_z + by_conj, 1j * (by_z - by_conj)
         both.append(np.stack([by_x.real, by_y.real, by_x.imag, by_y.imag], axis=1).reshape(-1, 2, 2))
-    return np.asarray(np.stack(both, axis=1) / (2 * mu)[:, None, None, None])
+    return np.asarray(np.stack(both, axis=1) * (elsewhere / (2 * mu))[:, None, None, None])
 
 
 def shares(around: Around) -> Values:

@@ -21,7 +21,7 @@ def least_over_shares(Q: Values, slope: Values, share: Values) -> Values:
     ends, across = np.einsum("kcc->kc", Q), Q[:, first, last]
     fall = across - ends[:, first] + b[:, last] - b[:, first]
     bent = ends[:, first] + ends[:, last] - 2 * across
-    t = np.clip(-fall / bent, 0.0, 1.0)
+    t = np.clip(np.divide(-fall, bent, out=np.zeros_like(fall), where=bent > 0), 0.0, 1.0)
     value = ends[:, first] / 2 + b[:, first] + t * (fall + t * bent / 2)
     best, every = value.argmin(axis=1), np.arange(len(value))
     least = np.zeros_like(share)

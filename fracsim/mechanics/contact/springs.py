@@ -55,7 +55,7 @@ class Springs:
             slip[place[known]] += self.slip[known]
         slip = tangential(normal, slip)
         pull = stiffness * np.linalg.norm(slip, axis=1)
-        share = np.minimum(1.0, most / np.maximum(pull, np.finfo(float).tiny))
+        share = np.divide(most, pull, out=np.ones(len(pull)), where=pull > most)
         return Springs(points, share[:, None] * slip, stiffness)
 
     def lost(self, before: Springs, moved: Values) -> float:
