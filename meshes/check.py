@@ -103,8 +103,8 @@ def _check_coordinates(mesh: MeshData) -> None:
     wrong = np.flatnonzero(used & ~(np.abs(mesh.points) <= LONGEST).all(axis=1))
     if len(wrong):
         raise MeshError(
-            f"{len(wrong)} nodes have coordinates that are not finite numbers of at most {LONGEST:g} m: "
-            f"node {_some(wrong)}, the first at {mesh.points[wrong[0]].tolist()}; export the mesh again."
+            f"{len(wrong)} nodes have coordinates that are not finite numbers: node {_some(wrong)}, "
+            f"the first at {mesh.points[wrong[0]].tolist()} (at most {LONGEST:g} m is allowed); export the mesh again."
         )
     if used.any() and (size := float(np.ptp(mesh.points[used], axis=0).max())) < SHORTEST:
         raise MeshError(f"The body is {size:g} m large, and {SHORTEST:g} m or more is needed; export the mesh again.")

@@ -50,7 +50,7 @@ def _within_reach(time: float) -> float:
     return time
 
 
-Seconds = Annotated[Positive, AfterValidator(_within_reach)]
+Seconds = Annotated[float, Strict(), AllowInfNan(False), Gt(0), AfterValidator(_within_reach)]
 
 
 def _kind(value: Any) -> str:
