@@ -49,7 +49,7 @@ class Stones:
         not_negative("stones", spread=self.spread)
         require(1 <= self.count <= MOST, f"stones: count = {self.count!r} must be from 1 to {MOST:,}.")
         within = min(self.aside) >= 1 and max(self.aside) <= MOST
-        require(within, f"stones: aside = {list(self.aside)} must be two numbers from 1 to {MOST:,}.")
+        require(within, f"stones: aside = {list(self.aside)} must be two numbers of 1 or more, at most {MOST:,}.")
         require(self.spread <= 0.5, f"stones: spread = {self.spread!r} must be at most 0.5: corners would turn in.")
         require(self.seed >= 0, f"stones: seed = {self.seed!r} must be 0 or more.")
 
