@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-from .errors import Exit, FracsimError, InputError, NotConverged, Stopped
+from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
     begin_process,
@@ -78,9 +78,9 @@ def run(
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
         print(
-            f"{summary['title']}: {summary['steps']} steps to t = {summary['time']:g} s in {summary['wall']:.1f} s on "
-            f"{summary['ranks']} rank{'s'[: summary['ranks'] > 1]}; {summary['broken_edges']} broken edges, "
-            f"{summary['pieces']} piece{'s'[: summary['pieces'] != 1]}{_dust(summary)}. Results in {folder}"
+            f"{one_line(summary['title'])}: {summary['steps']} steps to t = {summary['time']:g} s in "
+            f"{summary['wall']:.1f} s on {summary['ranks']} rank{'s'[: summary['ranks'] > 1]}; "
+            f"{summary['broken_edges']} broken edges, {summary['pieces']} piece{'s'[: summary['pieces'] != 1]}{_dust(summary)}. Results in {folder}"
         )
 
 
@@ -99,9 +99,9 @@ def check(study: StudyPath, set_: Set = _NONE) -> None:
     from .study.file import load_study
 
     loaded = load_study(study, set_)
-    print(loaded.title)
+    print(one_line(loaded.title))
     for line in check_study(loaded):
-        print("  " + line)
+        print("  " + one_line(line))
 
 
 @app.command()
@@ -120,9 +120,9 @@ def mesh(
 
     data = build_mesh(load_study(study, set_).mesh)
     for note in data.notes:
-        print(f"note: {note}")
+        print(f"note: {one_line(note)}")
     for name, value in (mesh_quality(data) | preferred(data)).items():
-        print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {value}")
+        print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {one_line(str(value))}")
     save_mesh(data, out)
     print(f"saved in {out}")
 
@@ -261,7 +261,10 @@ def _tell_of_runs(folders: list[Path]) -> None:
 
     for folder in folders:
         if words := holder(folder):
-            print(f"fracsim: note: a run goes on in {folder} ({words}); shown is what it has written", file=sys.stderr)
+            print(
+                f"fracsim: note: a run goes on in {folder} ({one_line(words)}); shown is what it has written",
+                file=sys.stderr,
+            )
 
 
 def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Study:

@@ -25,6 +25,13 @@ class Exit(IntEnum):
     CANNOT_WRITE = 5
 
 
+def one_line(text: str) -> str:
+    """A text of a user's file as a terminal may have it: one line of at most LONGEST characters, without control
+    characters."""
+    line = text if text.isprintable() else "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+
+
 class FracsimError(Exception):
     """The message says what is wrong, where, what is allowed and what to do. Raised on all ranks alike."""
 
@@ -32,8 +39,7 @@ class FracsimError(Exception):
 
     def __init__(self, message: str) -> None:
         """`message` becomes one line of bearable length: values of a file may hold line breaks, or a million digits."""
-        line = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in message)
-        super().__init__(line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}")
+        super().__init__(one_line(message))
 
 
 class InputError(FracsimError):

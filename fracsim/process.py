@@ -27,6 +27,9 @@ from .errors import STOP_SIGNALS, Exit, InputError
 DOLFINX = "0.9"
 INTERRUPTED = 130  # as typer and shells report SIGINT
 _READER_GONE = (errno.EPIPE, errno.EIO)  # EIO: of a terminal that was closed
+# control characters but for tabs and ends of lines, and those that turn the direction of writing
+_CONTROLS = {*range(0x20), *range(0x7F, 0xA0), 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)}
+_ESCAPES = {code: ascii(chr(code))[1:-1] for code in _CONTROLS - {*map(ord, "\t\n\r")}}
 _FIRST_RANK_SPEAKS = 0.3  # s that other ranks wait before they end: the launcher ends all ranks with the first
 
 
@@ -71,7 +74,11 @@ def _open_stream(stream: TextIO | None, number: int, dropped: tuple[int, ...] | 
 
 
 class _Stream(io.TextIOWrapper):
-    """A standard stream whose text is dropped once it cannot be written: a command whose reader has gone goes on."""
+    """A standard stream whose text is dropped once it cannot be written: a command whose reader has gone goes on.
+
+    Control characters are written as escapes: a terminal would obey those in a name or title of a file, and in what a
+    traceback or a library says of one.
+    """
 
     def __init__(self, stream: io.TextIOWrapper, number: int, dropped: tuple[int, ...] | None) -> None:
         """`number`: of its descriptor; `dropped`: numbers of errors after which text is dropped; None: all."""
@@ -82,7 +89,8 @@ class _Stream(io.TextIOWrapper):
     def write(self, text: str) -> int:
         """Write text; returns its length."""
         try:
-            return super().write(text)
+            super().write(text if text.isprintable() else text.translate(_ESCAPES))
+            return len(text)
         except OSError as error:
             self._drop(error)
             return len(text)

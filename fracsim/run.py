@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from .errors import CannotWrite, NotConverged, Stopped
+from .errors import CannotWrite, NotConverged, Stopped, one_line
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
 from .output.checkpoint import read_checkpoint, write_checkpoint
@@ -440,4 +440,4 @@ def _draw(folder: Path) -> None:
 
         render(folder)
     except (ImportError, OSError, RuntimeError) as error:
-        print(f"fracsim: no picture drawn: {error}", file=sys.stderr)
+        print(f"fracsim: no picture drawn: {one_line(str(error))}", file=sys.stderr)

@@ -11,6 +11,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from ..errors import one_line
 from ..mesh.ranks import total
 from ..stepping.stepper import Stepper
 from .writing import replace_text, written
@@ -83,7 +84,7 @@ def write_summary(comm: MPI.Comm, folder: Path, summary: dict[str, Any]) -> None
 def say(comm: MPI.Comm, notes: list[str]) -> None:
     """Tell the user, once."""
     for note in notes if comm.rank == 0 else ():
-        print(f"fracsim: note: {note}", file=sys.stderr)
+        print(f"fracsim: note: {one_line(note)}", file=sys.stderr)
 
 
 def _peak_memory() -> float:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped
+from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import create, replacing_all
 from ..output.lock import FolderLock, holder
 from ..output.own_files import check_owner, resumable
@@ -71,7 +71,7 @@ def _run_all(study: str, cases: list[tuple[Case, str]], out: Path, ranks: int) -
     for number, (case, text) in enumerate(cases, 1):
         print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
         outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
-        print(outcome, flush=True)
+        print(one_line(outcome), flush=True)
         collect([each for each, _ in cases], outcomes, out)
         if outcome.startswith("interrupted"):
             raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from .values import NonNegative, Poisson, Positive, Strength, Table
+from .values import LONGEST_REGION, NonNegative, Poisson, Positive, Strength, Table
 
 SOURCES = ("builder", "file", "surface", "outline", "shell")
 
@@ -81,6 +81,17 @@ class Material(Elastic):
         regions = {key: value for key, value in data.items() if isinstance(value, dict)}
         rest = {key: value for key, value in data.items() if key not in regions}
         return rest | ({"regions": regions} if regions else {})
+
+    @field_validator("regions")
+    @classmethod
+    def _names_are_short(cls, regions: dict[str, Region]) -> dict[str, Region]:
+        for name in regions:
+            if len(name) > LONGEST_REGION or not name.isprintable():
+                raise ValueError(
+                    f"the name of a region has {LONGEST_REGION} letters or fewer, and no control characters; this one "
+                    f'has not: "{name}"'
+                )
+        return regions
 
     @model_validator(mode="after")
     def _plane_stress_needs_a_form(self) -> Material:

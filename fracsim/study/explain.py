@@ -22,6 +22,7 @@ _WORDS = {
     "model_attributes_type": "must be a table",
     "model_type": "must be a table",
     "path_type": "must be a text in quotes",
+    "string_too_long": "must have {max_length} letters or fewer",
     "string_type": "must be a text in quotes",
     "too_long": "must have {max_length} or fewer entries",
     "too_short": "must have {min_length} or more entries",

@@ -10,7 +10,7 @@ from pydantic import Discriminator, Field, Tag, create_model, field_validator, m
 
 from ..forms.schemes import SCHEMES, Scheme
 from .loading import Where
-from .values import Finite, Flag, InTime, NonNegative, Positive, Seconds, Table, TimeTable, Vector
+from .values import Finite, Flag, InTime, Name, NonNegative, Positive, Seconds, Table, TimeTable, Vector
 
 
 class Until(Table):
@@ -110,7 +110,7 @@ else:
 class Probe(Table):
     """[[probe]]: what history.csv records at a point (nearest node) or over a group."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9-]*$")]
+    name: Name
     point: Vector | None = None  # m, reference configuration
     on: Where | None = None
     record: Literal["displacement", "reaction"] | None = None  # default: reaction over a group, displacement at a point

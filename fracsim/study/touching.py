@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .values import Finite, Flag, InTime, NonNegative, Positive, Table, TimeTable, Vector
+from .values import Finite, Flag, InTime, Name, NonNegative, Positive, Table, TimeTable, Vector
 
 # shape -> (keys that it needs, keys that it may have)
 OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -34,7 +34,7 @@ class Hinge(Table):
 class Obstacle(Table):
     """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity; free where it has a mass."""
 
-    name: Annotated[str, Field(pattern="^[A-Za-z][A-Za-z0-9-]*$")]
+    name: Name
     shape: Literal["plane", "sphere", "capsule", "cylinder", "box", "mesh"]
     at: Vector  # its centre, a point of the plane, or where the file has its origin, at t = 0, m
     normal: Vector | None = None  # of a plane, out of the half space behind it

@@ -11,7 +11,17 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 os.environ.setdefault("PYDANTIC_SKIP_VALIDATING_CORE_SCHEMAS", "1")
 
 from annotated_types import Ge, Gt, Len, Lt
-from pydantic import AfterValidator, AllowInfNan, BaseModel, ConfigDict, Discriminator, Strict, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Strict,
+    StringConstraints,
+    Tag,
+    model_validator,
+)
 from pydantic_core.core_schema import no_info_plain_validator_function
 
 # Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
@@ -41,6 +51,10 @@ Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
 Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
+LONGEST_NAME = 64  # letters: names of files have 255, with what stands around a name
+# of obstacles and probes: part of names of files, columns and arrays
+Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=LONGEST_NAME)]
+LONGEST_REGION = 100  # letters of the name of a region, which programs that make meshes choose
 
 
 def _within_reach(time: float) -> float:
