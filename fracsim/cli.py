@@ -77,10 +77,11 @@ def run(
     how = {"restart": restart, "overwrite": overwrite}
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
+        ranks, pieces = summary["ranks"], summary["pieces"]
         print(
             f"{one_line(summary['title'])}: {summary['steps']} steps to t = {summary['time']:g} s in "
-            f"{summary['wall']:.1f} s on {summary['ranks']} rank{'s'[: summary['ranks'] > 1]}; "
-            f"{summary['broken_edges']} broken edges, {summary['pieces']} piece{'s'[: summary['pieces'] != 1]}{_dust(summary)}. Results in {folder}"
+            f"{summary['wall']:.1f} s on {ranks} rank{'s'[: ranks > 1]}; {summary['broken_edges']} broken edges, "
+            f"{pieces} piece{'s'[: pieces != 1]}{_dust(summary)}. Results in {folder}"
         )
 
 
