@@ -133,7 +133,7 @@ OTHERS: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("kind", OTHERS)
+@pytest.mark.parametrize("kind", ["pipe", *(pytest.param(kind, marks=pytest.mark.slow) for kind in [*OTHERS][1:])])
 def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path, kind: str) -> None:
     """At any name of a file of a run, by a run, a restart, a sweep, a picture, a report and an export."""
     out, make, said = tmp_path / "cases" / "end-0.01", *OTHERS[kind]
@@ -257,7 +257,7 @@ def written(target: Path) -> list[tuple[tuple[str | Path, ...], list[str]]]:
     ]
 
 
-@pytest.mark.parametrize("number", range(9))
+@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4)), 5, 6, 7, 8])
 def test_commands_replace_links(tmp_path: Path, torn: Path, number: int) -> None:
     """Of files named with -o, and of others beside them; what they write is what they write elsewhere."""
     out = tmp_path / "target"
@@ -278,7 +278,7 @@ def test_commands_replace_links(tmp_path: Path, torn: Path, number: int) -> None
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("number", [0, 1, 2, 3, 5, 6, 7, 8])
+@pytest.mark.parametrize("number", [0, 1, 2, 5, 8, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 6, 7))])
 def test_commands_refuse_what_is_no_file(tmp_path: Path, torn: Path, number: int) -> None:
     out = tmp_path / "target"
     out.mkdir()

@@ -84,13 +84,18 @@ def test_a_killed_run_leaves_no_lock(tmp_path: Path) -> None:
     assert not (tmp_path / LOCK).exists()
 
 
-@pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
+@pytest.mark.parametrize("kind", ["link", "hard link", "folder", "pipe"])
 def test_a_lock_file_is_a_plain_file(tmp_path: Path, kind: str) -> None:
     """What lies under its name is left as it is."""
     path, precious, out = tmp_path / "out" / LOCK, tmp_path / "precious", tmp_path / "out"
     precious.write_text("mine")
     out.mkdir()
-    {"link": lambda: path.symlink_to(precious), "folder": path.mkdir, "pipe": lambda: os.mkfifo(path)}[kind]()
+    {
+        "link": lambda: path.symlink_to(precious),
+        "hard link": lambda: os.link(precious, path),
+        "folder": path.mkdir,
+        "pipe": lambda: os.mkfifo(path),
+    }[kind]()
     done = fracsim("run", write_study(tmp_path / "bar.toml", BAR), "-o", out)
     assert done.returncode == Exit.BAD_INPUT and f"{LOCK} is not a plain file" in done.stderr
     assert precious.read_text() == "mine" and sorted(each.name for each in out.iterdir()) == [LOCK]

@@ -168,7 +168,7 @@ def _opened(path: Path, name: Path) -> int:
         if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise
         descriptor = -1
-    if descriptor < 0 or not stat.S_ISREG(os.fstat(descriptor).st_mode):
+    if descriptor < 0 or not stat.S_ISREG(os.fstat(descriptor).st_mode) or os.fstat(descriptor).st_nlink > 1:
         if descriptor >= 0:
             os.close(descriptor)
         raise InputError(f"--out {name}: {path} is not a plain file (a link?); delete it, or give another folder")
