@@ -121,8 +121,8 @@ def _study(name: str, chance: random.Random) -> Data:
 
 
 def mutated(data: bytes, chance: random.Random) -> bytes:
-    """A file, changed in one to three places."""
-    for _ in range(chance.choice((1, 1, 2, 3))):
+    """A file, changed in one to five places."""
+    for _ in range(chance.choice((1, 2, 3, 5))):
         data = _changed(data, chance)
     return data
 
@@ -134,7 +134,7 @@ def _changed(data: bytes, chance: random.Random) -> bytes:
     size = min(chance.choice((1, 4, 64, 1000)), len(data) - at)
     numbers = [each.span() for each in re.finditer(rb"[-+0-9.eE]+", data[:200_000])] if chance.random() < 0.5 else []
     if numbers:
-        begin, end = chance.choice(numbers)
+        begin, end = chance.choice(numbers[: chance.choice((20, len(numbers)))])  # sizes stand at the head
         return data[:begin] + chance.choice(NUMBERS) + data[end:]
     lines = data.split(b"\n")
     match chance.randrange(8):
