@@ -20,7 +20,7 @@ FULL = {
     "disks": 20,
     "pairs": 10,
     "links": 60,
-    "checkpoints": 150,
+    "checkpoints": 200,
     "meshes": 300,
     "studies": 4000,
 }

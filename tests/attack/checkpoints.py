@@ -1,4 +1,7 @@
-"""Damaged checkpoints: --restart ends with exit 2 and the name of the file, and the folder stays as it is."""
+"""Damaged checkpoints: --restart ends with exit 2 and the name of the file, and the folder stays as it is.
+
+Every fourth is given the digest of what it says now: it is refused in the same way, or runs, and is no traceback.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import hashlib
 import os
 import random
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from fracsim.errors import Exit
 from .corpus import RUNS, contents, history, write
 from .trial import Wrong, call, expect
 
+MARK = b"\nfracsim checkpoint, SHA-256 "
 KINDS = ("gone", "link", "short", "long", "type", "number", "number", "order", "swapped", "group", "other")
 STATE = Path("checkpoint") / "state.h5"
 _STOPPED: dict[str, Path] = {}
@@ -39,29 +44,59 @@ def prepare(folder: Path) -> None:
 def attack(number: int, chance: random.Random, place: Path) -> str:
     """One checkpoint."""
     os.chdir(place)
+    forged = number % 4 == 3
     name = chance.choice(sorted(_STOPPED))
     study, out = _STOPPED[name] / "study.toml", place / "out"
     good = content_of(_STOPPED[name] / "out" / STATE)
-    expect(isinstance(good, dict), f"a good one {good}")
+    expect(good != "cannot be read", "a good one cannot be read")
     for _ in range(100):
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(_STOPPED[name] / "out", out)
-        how = damaged(out / STATE, chance, _STOPPED)
+        how = _content(out / STATE, chance, _STOPPED) if forged else damaged(out / STATE, chance, _STOPPED)
         if content_of(out / STATE) != good:  # else nothing that counts has changed
             break
+    if forged:
+        _seal(out / STATE)
     before = contents(out)
     done = call("run", study, "-o", out, "--restart", "--wall-limit", 30)
     try:
+        if forged and "link" not in how:
+            done.expect(Exit.DONE, Exit.BAD_INPUT, Exit.NOT_CONVERGED, Exit.STOPPED)
+            if done.code != Exit.BAD_INPUT:
+                return "forged, and runs"
         done.expect(Exit.BAD_INPUT)
         expect("state.h5" in done.said, f"the file is not named: {done.said[-500:]}")
         expect(contents(out) == before, f"the folder was changed: {done.said[-300:]}")
     except Wrong as wrong:
-        raise Wrong(f"{name}, {how}: {wrong}") from None
-    return f"{how.split()[0]} refused"
+        raise Wrong(f"{name}, {'forged, ' * forged}{how}: {wrong}") from None
+    return f"{'forged' if forged else how.split()[0]} refused"
+
+
+def _seal(path: Path) -> None:
+    """Put the digest of a file at its end, as a program would that knows how."""
+    data = path.read_bytes()
+    begin = data.rfind(MARK)
+    if begin >= 0 and len(data) - begin <= len(MARK) + 65:
+        data = data[:begin]
+    path.write_bytes(data + MARK + hashlib.sha256(data).hexdigest().encode() + b"\n")
 
 
 def content_of(path: Path) -> Any:
-    """All that an HDF5 file says: kinds, types, shapes, numbers and attributes by name, read by h5py alone."""
+    """All that an HDF5 file says, read by h5py alone; HDF5 hangs on some damage, and crashes on other."""
+    reader, writer = os.pipe()
+    if (child := os.fork()) == 0:
+        signal.alarm(5)
+        os.write(writer, hashlib.sha256(repr(_content_of(path)).encode()).hexdigest().encode())
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        said = file.read()
+    _, status = os.waitpid(child, 0)
+    return said if status == 0 else "cannot be read"
+
+
+def _content_of(path: Path) -> Any:
+    """Kinds, types, shapes, numbers and attributes by name."""
     try:
         with h5py.File(path) as file:
             found: dict[str, Any] = {}
