@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -81,7 +82,8 @@ def _gmsh_version(path: Path) -> int:
             "$MeshFormat. Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`."
         )
     _, found, rest = head.partition(b"$MeshFormat")
-    return int(rest.split(maxsplit=1)[0].split(b".")[0]) if found and rest.split(maxsplit=1)[0][:1].isdigit() else 0
+    number = re.match(rb"\s*(\d{1,3})(\.\d*)?\s", rest) if found else None
+    return int(number[1]) if number else 0
 
 
 # --- Gmsh's .msh, version 4 -----------------------------------------------------------------------------------------

@@ -236,3 +236,11 @@ def test_coordinates_that_are_no_numbers_reach_the_check(tmp_path: Path) -> None
     mesh.write(tmp_path / "nan.vtu")
     with pytest.raises(MeshError, match="1 nodes have coordinates that are not finite numbers: node 3"):
         check_mesh(read_mesh(tmp_path / "nan.vtu"))
+
+
+@pytest.mark.parametrize("version", ["1e999", "x", "-4.1", "4" * 30])
+def test_a_version_that_is_no_number(tmp_path: Path, version: str) -> None:
+    """Of Gmsh's own format: a message."""
+    (tmp_path / "part.msh").write_text(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n")
+    with pytest.raises(MeshError, match=r"part.msh' could not be read"):
+        read_mesh(tmp_path / "part.msh")

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 60.0  # s, after which a command is taken to hang: a busy machine, and kernels to compile
+PATIENCE = 90.0  # s, after which a command is taken to hang: a busy machine, and kernels to compile
 MEMORY = 8 << 30  # bytes of address space of a process of a trial
 AT_ONCE = 2
 
