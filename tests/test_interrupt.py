@@ -195,6 +195,7 @@ def test_the_wall_limit_abandons_a_long_step(tmp_path: Path, monkeypatch: pytest
 def test_signals_that_end_a_run(tmp_path: Path, number: signal.Signals) -> None:
     """Each in its second step, with a checkpoint; what the process did at it before is as it was."""
     scene = build_scene(MPI.COMM_SELF, study(BAR))
+    inherited = signal.signal(number, signal.SIG_DFL)  # a shell may have had it ignored, in the background
     run, before = Run(scene, tmp_path), signal.getsignal(number)
     advance, count = scene.stepper.advance, iter(range(1, 100))
 
@@ -207,6 +208,7 @@ def test_signals_that_end_a_run(tmp_path: Path, number: signal.Signals) -> None:
     with pytest.raises(Stopped, match=rf"stopped by signal {number.name} at t = 0\.02 s after 2 steps\. Checkpoint: "):
         run()
     assert signal.getsignal(number) is before
+    signal.signal(number, inherited)
 
 
 # --- processes ------------------------------------------------------------------------------------------------------

@@ -65,7 +65,8 @@ def expected_stress(energy: str, dim: int, F: Values) -> Values:
     """The same of the homogeneous deformation; in plane strain that of the embedded F."""
     solid = np.eye(3)
     solid[:dim, :dim] = F
-    return law_of(ENERGIES[energy](MU, LAMBDA), 3).cauchy(solid)[np.triu_indices(3)]
+    stress = law_of(ENERGIES[energy](MU, LAMBDA), 3).cauchy(solid)
+    return np.array([stress[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))])
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -89,7 +90,7 @@ def test_static_patch_in_plane_stress() -> None:
     np.testing.assert_allclose(state.u.reshape(X.shape), X @ GRADIENT[2].T, atol=TOLERANCE)
     stress = stress_of(scene, state)
     np.testing.assert_allclose(stress, np.tile(stress[0], (len(stress), 1)), atol=TOLERANCE * YOUNG)
-    assert not stress[:, [2, 4, 5]].any()
+    assert not stress[:, [2, 4, 5]].any()  # zz, yz, xz
 
 
 @pytest.mark.parametrize("dim", (2, 3))

@@ -22,7 +22,7 @@ SPEAKS = "open({!r}, 'w').close()\n"
 def fracsim(folder: Path, *arguments: str, ranks: int = 0, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command, called in a folder."""
     whole = command(*arguments, ranks=ranks)
-    known = os.environ | environment
+    known = os.environ | {"FRACSIM_PROGRESS": "off"} | environment  # a slow machine tells how far a run is
     return subprocess.run(whole, cwd=folder, env=known, capture_output=True, text=True, timeout=100, check=False)
 
 
