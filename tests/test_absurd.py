@@ -117,6 +117,12 @@ def test_what_once_went_wrong(name: str, tmp_path: Path, monkeypatch: pytest.Mon
     assert {path.name for path in tmp_path.iterdir()} <= {"out"}
 
 
+def test_a_spin_of_an_obstacle_is_bounded_as_well() -> None:
+    """Its rotation was no number then, and the end PETSc's traceback."""
+    with pytest.raises(InputError, match=r"obstacle\.1\.spin turns it by 1e\+27 rad in a step of 0\.001 s; at most"):
+        validate(mutated(BASES["bar"], ("obstacle", 1, "spin", 0), 1e30), "test.toml")
+
+
 def test_a_spin_beyond_what_is_followed_is_one_message() -> None:
     with pytest.raises(
         InputError, match=r"body\.0\.spin turns it by 2e\+06 rad in a step of 0\.002 s; at most 1000 rad"

@@ -72,12 +72,6 @@ def check_rigid(study: Study) -> None:
         raise ValueError('with time.scheme = "rigid" a body has one density: remove density from regions of [material]')
     if study.fracture is not None and study.brittle is None:
         raise ValueError('[fracture] with time.scheme = "rigid" needs [brittle]: stiff bodies break along surfaces')
-    for number, body in enumerate(study.body):
-        if (turned := max(map(abs, body.spin)) * study.time.longest) > MOST_TURN:
-            raise ValueError(
-                f"body.{number}.spin turns it by {turned:.3g} rad in a step of {study.time.longest:g} s; at most "
-                f"{MOST_TURN:g} rad are followed: give a slower spin or a shorter time.step"
-            )
     _check_denting(study)
     if study.load is not None and study.load.body_force is not None:
         raise ValueError('load.body_force is not for time.scheme = "rigid": give gravity')

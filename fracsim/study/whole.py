@@ -10,7 +10,7 @@ from .body import Damping, Material, Mesh
 from .breaking import Brittle, Crack, Fracture, Plasticity
 from .loading import Boundary, Initial, Load
 from .materials import filled
-from .moving import Body, check_rigid, of_rigid
+from .moving import MOST_TURN, Body, check_rigid, of_rigid
 from .order import check_order
 from .running import FRACTURE_FIELDS, Output, Probe, Time, frame_interval, frame_notes
 from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
@@ -233,6 +233,18 @@ class Study(Table):
                 f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
                 'choose time.scheme = "backward-euler", or drive it by displacement'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _spins_are_followed(self) -> Study:
+        spins = [(f"body.{number}", each.spin) for number, each in enumerate(self.body)]
+        spins += [(f"obstacle.{number}", each.spin) for number, each in enumerate(self.obstacle) if each.spin]
+        for key, spin in spins:
+            if (turned := max(map(abs, spin)) * self.time.longest) > MOST_TURN:
+                raise ValueError(
+                    f"{key}.spin turns it by {turned:.3g} rad in a step of {self.time.longest:g} s; at most "
+                    f"{MOST_TURN:g} rad are followed: give a slower spin or a shorter time.step"
+                )
         return self
 
     @model_validator(mode="after")
