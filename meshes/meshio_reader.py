@@ -14,6 +14,15 @@ from .plain_files import data_elsewhere, is_hdf5, wrong_beside
 
 # as meshio takes it for the keyword: stars do not count
 _INCLUDE = re.compile(r"^[ \t*]*i\**n\**c\**l\**u\**d\**e[ \t*]*(?:,.*)?$", re.IGNORECASE | re.MULTILINE)
+# endings whose readers wait for more where a file has been cut off: meshio's name of the format, and whether it is text
+_WAITING = {
+    ".dat": ("tecplot", True),
+    ".tec": ("tecplot", True),
+    ".off": ("off", True),
+    ".mdpa": ("mdpa", False),
+    ".ply": ("ply", False),
+}
+MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
 MOST_INCLUDES = 1000  # files of an Abaqus deck
 
 
@@ -27,10 +36,17 @@ def meshio_mesh(path: Path) -> Any:
     if ending == ".inp":
         _check_includes(path)
     elif ending in (".ele", ".node"):
-        _check(path, path.stem + {".ele": ".node", ".node": ".ele"}[path.suffix.lower()])
+        other = path.stem + {".ele": ".node", ".node": ".ele"}[ending]
+        _check(path, other)
+        _check_begun(path)
+        _check_begun(path.parent / other)
     elif ending == ".msh" and not _begins_as_gmsh(path):
         with _Ending(path.open("rb", buffering=0)) as file:
             return meshio.ansys.read(file)
+    elif ending in _WAITING:
+        with _Ending(path.open("rb", buffering=0)) as file:
+            kind, text = _WAITING[ending]
+            return meshio.read(io.TextIOWrapper(file) if text else file, kind)
     elif is_hdf5(path):
         _check_hdf5(path, path)
     return meshio.read(path)
@@ -103,18 +119,29 @@ def _begins_as_gmsh(path: Path) -> bool:
 
 
 class _Ending(io.BufferedReader):
-    """A file that ends with an error where it is read beyond its end twice: meshio's reader of Fluent goes on."""
+    """A file that ends with an error where it is read beyond its end again and again: readers of meshio's wait there
+    for what does not come, where a file has been cut off."""
 
-    _ended = False
+    _beyond = 0
 
     def _checked(self, data: bytes) -> bytes:
-        if not data and self._ended:
+        self._beyond = 0 if data else self._beyond + 1
+        if self._beyond > MOST_BEYOND:
             raise EOFError("it ends in the middle of a section")
-        self._ended = not data
         return data
 
     def read(self, size: int | None = -1, /) -> bytes:
         return self._checked(super().read(size))
 
+    def read1(self, size: int = -1, /) -> bytes:
+        return self._checked(super().read1(size))
+
     def readline(self, size: int | None = -1, /) -> bytes:
         return self._checked(super().readline(size))
+
+
+def _check_begun(path: Path) -> None:
+    """MeshError for a file of TetGen without numbers, of which meshio waits for the first line."""
+    with path.open(errors="replace") as file:
+        if not any(line.strip() and not line.strip().startswith("#") for line in file):
+            raise MeshError(f"Mesh file '{path}' could not be read: it holds no numbers.")
