@@ -250,7 +250,7 @@ def test_klein_bottle_is_refused() -> None:
 def test_points_that_are_no_numbers_are_named() -> None:
     points, triangles = cube()
     points[3, 0] = np.nan
-    with pytest.raises(MeshError, match="S has 1 points that are not finite numbers of at most .*, the first is point 3"):
+    with pytest.raises(MeshError, match=r"S has 1 points that are not finite numbers of .*, the first is point 3"):
         closed_surface(points, triangles, "S")
 
 
