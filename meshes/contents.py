@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .cell_cutting import PLURALS, oriented_parts, tetrahedra_of, triangles_of
 from .data import Indices, MeshData, MeshError, Points
-from .topology import boundary_facets, distinct_rows, facets_where
+from .topology import Mask, boundary_facets, distinct_rows, facets_where
 
-CORNERS = {"line": 2, "triangle": 3, "tetra": 4}
-LAGRANGE = {"VTK_LAGRANGE_CURVE": "line", "VTK_LAGRANGE_TRIANGLE": "triangle", "VTK_LAGRANGE_TETRAHEDRON": "tetra"}
+CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
+LAGRANGE = {
+    "VTK_LAGRANGE_CURVE": "line",
+    "VTK_LAGRANGE_TRIANGLE": "triangle",
+    "VTK_LAGRANGE_QUADRILATERAL": "quad",
+    "VTK_LAGRANGE_TETRAHEDRON": "tetra",
+    "VTK_LAGRANGE_HEXAHEDRON": "hexahedron",
+    "VTK_LAGRANGE_WEDGE": "wedge",
+    "VTK_LAGRANGE_PYRAMID": "pyramid",
+}
 DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "polygon": 2}  # every other kind is a solid
+MAX_LOST_SHARE = 0.1  # of a file's nodes that may be in no cell
+MAX_LOST_NODES = 3  # that may be in no cell of a small file: reference points, centres of arcs
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,20 @@ class Block:
     def corners(self) -> Indices:
         return self.nodes[:, : CORNERS[self.shape]]
 
+    def cut(self, points: Points | None, source: str) -> tuple[Block, Indices | None]:
+        """The block cut into simplices, and the cell of each; None where the block is of simplices.
+
+        Args:
+            points: of the mesh, where the cells are of its dimension; facets are cut without them.
+            source: begins the message of a MeshError.
+        """
+        if self.shape not in PLURALS or len(self.nodes) == 0:
+            return self, None
+        parts, owner = triangles_of(self.corners) if self.dim == 2 else tetrahedra_of(self.shape, self.corners)
+        if points is not None:
+            parts = oriented_parts(self.shape, self.corners, parts, owner, points, source)
+        return Block("triangle" if self.dim == 2 else "tetra", parts), owner
+
 
 @dataclass(frozen=True)
 class Contents:
@@ -63,24 +88,30 @@ class Contents:
     def simplices(self, source: str) -> MeshData:
         """The tetrahedra, or where there are none the triangles of a plane mesh; sets as facet groups and regions.
 
+        Hexahedra, wedges, pyramids and quadrilaterals are cut into simplices (see cell_cutting). Nodes in the middle of
+        edges, faces and cells are left out; nodes without any cell are kept for `check` to tell.
+
         Raises:
-            MeshError: no cells, or cells of the highest dimension that are no simplices, or a surface in space;
-                `source` names the file in the message.
+            MeshError: no cells, or cells of the highest dimension that cannot be cut into simplices, or a surface in
+                space; `source` names the file in the message.
         """
         solids = [block.dim for block in self.blocks if len(block.nodes)]
         dim = max(solids, default=0)
         if dim < 2:
             raise MeshError(f"{source} holds no triangles or tetrahedra ({self._census(range(4))}).")
         self._refuse_other_shapes(source, dim)
+        self._refuse_lost_nodes(source)
         points, notes = self._flattened(source) if dim == 2 else (self.points, ())
-        mine = [i for i, block in enumerate(self.blocks) if block.dim == dim and len(block.nodes)]
-        below = [i for i, block in enumerate(self.blocks) if block.shape == ("line" if dim == 2 else "triangle")]
-        cells = np.concatenate([self.blocks[i].corners for i in mine])
-        regions = self._cell_sets(mine)
+        cut, cut_notes = self._cut(points, dim, source)
+        mine = [i for i, block in enumerate(cut.blocks) if block.dim == dim and len(block.nodes)]
+        below = [i for i, block in enumerate(cut.blocks) if block.shape == ("line" if dim == 2 else "triangle")]
+        cells = np.concatenate([cut.blocks[i].corners for i in mine])
+        regions = cut._cell_sets(mine)
         if self.copies:
             cells, regions = _each_once(cells, regions)
-        groups = self._facet_sets(below) | self._node_groups(cells, len(points))
-        return MeshData(points, cells, groups, regions, self.notes + notes + self._order_note(mine))
+        groups = cut._facet_sets(below) | cut._node_groups(cells, len(points))
+        mesh = MeshData(points, cells, groups, regions, self.notes + notes + self._order_note(dim) + cut_notes)
+        return _without(mesh, self._middle_nodes())
 
     def _census(self, dims: range) -> str:
         """For example "12 hexahedron, 4 tetra"."""
@@ -91,12 +122,55 @@ class Contents:
         return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no cells at all"
 
     def _refuse_other_shapes(self, source: str, dim: int) -> None:
-        allowed = "triangle" if dim == 2 else "tetra"
-        if any(block.dim == dim and block.shape != allowed and len(block.nodes) for block in self.blocks):
+        if any(block.dim == dim and block.shape not in CORNERS and len(block.nodes) for block in self.blocks):
+            allowed = "triangles and quadrilaterals" if dim == 2 else "tetrahedra, hexahedra, wedges and pyramids"
             raise MeshError(
-                f"{source} holds {self._census(range(dim, dim + 1))}; only {allowed} cells can be used. Cut the others "
-                f"into simplices, or mesh the body with {'triangles' if dim == 2 else 'tetrahedra'} only."
+                f"{source} holds {self._census(range(dim, dim + 1))}; only {allowed} can be used. Cut the others into "
+                f"simplices, or mesh the body with {'triangles' if dim == 2 else 'tetrahedra'} only."
             )
+
+    def _refuse_lost_nodes(self, source: str) -> None:
+        """MeshError where many nodes are in no cell of any kind: cells are missing."""
+        lost = int(np.count_nonzero(~self._nodes_of([block.nodes for block in self.blocks])))
+        if lost > max(MAX_LOST_NODES, MAX_LOST_SHARE * len(self.points)):
+            raise MeshError(
+                f"{source} holds {len(self.points)} nodes, and {lost} of them belong to no cell: it has lost cells "
+                "(damaged, or written in part only?). Export the mesh again, with all its cells and no other nodes."
+            )
+
+    def _middle_nodes(self) -> Mask:
+        """(n,) whether each node is in cells, but the corner of none."""
+        used = [block.nodes for block in self.blocks if block.shape in CORNERS]
+        corners = [block.corners for block in self.blocks if block.shape in CORNERS]
+        return self._nodes_of(used) & ~self._nodes_of(corners)
+
+    def _nodes_of(self, rows: list[Indices]) -> Mask:
+        """(n,) whether each node is named in one of the rows."""
+        named = np.zeros(len(self.points), bool)
+        for numbers in rows:
+            named[numbers[(numbers >= 0) & (numbers < len(named))]] = True
+        return named
+
+    def _cut(self, points: Points, dim: int, source: str) -> tuple[Contents, tuple[str, ...]]:
+        """The same with simplices in place of all other cells, the sets following them, and notes."""
+        if not any(block.shape in PLURALS for block in self.blocks):
+            return self, ()
+        pairs = [block.cut(points if block.dim == dim else None, source) for block in self.blocks]
+        sets = {
+            name: [
+                part if owner is None else np.flatnonzero(np.isin(owner, part)).astype(np.int64)
+                for part, (_, owner) in zip(parts, pairs, strict=True)
+            ]
+            for name, parts in self.sets.items()
+        }
+        blocks = [block for block, _ in pairs]
+        notes = []
+        for level, made in ((dim, "tetrahedra" if dim == 3 else "triangles"), (dim - 1, "triangles")):
+            cut = [i for i, block in enumerate(self.blocks) if block.shape in PLURALS and block.dim == level]
+            if parts := sum(len(blocks[i].nodes) for i in cut):
+                where = "" if level == dim else " of the surface"
+                notes.append(f"{_counted([self.blocks[i] for i in cut])}{where} were cut into {parts} {made}.")
+        return replace(self, blocks=blocks, sets=sets), tuple(notes)
 
     def _flattened(self, source: str) -> tuple[Points, tuple[str, ...]]:
         """The points of a plane mesh without their third coordinate."""
@@ -116,8 +190,8 @@ class Contents:
         note = f"The plane mesh lies at z = {level:.6g} m; z is left out." if abs(level) > 1e-6 * size else ""
         return np.ascontiguousarray(self.points[:, :2]), (note,) if note else ()
 
-    def _order_note(self, mine: list[int]) -> tuple[str, ...]:
-        curved = sum(len(self.blocks[i].nodes) for i in mine if self.blocks[i].kind != self.blocks[i].shape)
+    def _order_note(self, dim: int) -> tuple[str, ...]:
+        curved = sum(len(block.nodes) for block in self.blocks if block.dim == dim and block.kind != block.shape)
         if not curved:
             return ()
         return (f"{curved} cells are of second or higher order; only their corner nodes are kept (straight edges).",)
@@ -152,6 +226,22 @@ class Contents:
             if len(facets) and name not in self.sets:
                 groups[name] = facets
         return groups
+
+
+def _counted(blocks: list[Block]) -> str:
+    """For example "12 hexahedra and 4 wedges"."""
+    counts = {shape: sum(len(block.nodes) for block in blocks if block.shape == shape) for shape in PLURALS}
+    words = [f"{count} {PLURALS[shape]}" for shape, count in counts.items() if count]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
+
+def _without(mesh: MeshData, nodes: Mask) -> MeshData:
+    """The mesh without some nodes that neither its cells nor its groups have."""
+    if not nodes.any() or any(rows.max(initial=-1) >= len(nodes) for rows in (mesh.cells, *mesh.facet_groups.values())):
+        return mesh  # or `check` refuses its numbers
+    number = np.cumsum(~nodes) - 1
+    groups = {name: number[facets] for name, facets in mesh.facet_groups.items()}
+    return replace(mesh, points=mesh.points[~nodes], cells=number[mesh.cells], facet_groups=groups)
 
 
 def _each_once(cells: Indices, regions: dict[str, Indices]) -> tuple[Indices, dict[str, Indices]]:

@@ -139,7 +139,6 @@ def test_second_order_cells_become_straight(tmp_path: Path, kind: str, dim: int)
     np.testing.assert_array_equal(read.points, mesh.points)
     assert read.notes == (
         f"{len(cells)} cells are of second or higher order; only their corner nodes are kept (straight edges).",
-        f"{len(distinct)} of {len(points)} nodes belong to no cell and were removed.",
     )
 
 
@@ -180,9 +179,10 @@ def test_surface_in_space_is_pointed_to_fill(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cells", "message"),
     [
-        ([("hexahedron", [[0, 1, 3, 2, 4, 5, 7, 6]])], "holds 1 hexahedron; only tetra cells can be used"),
-        ([("tetra", [[0, 1, 2, 4]]), ("pyramid", [[0, 1, 3, 2, 7]])], "holds 1 tetra, 1 pyramid; only tetra"),
-        ([("quad", [[0, 1, 3, 2]]), ("triangle", [[0, 1, 3]])], "holds 1 quad, 1 triangle; only triangle"),
+        (
+            [("polygon", [[0, 1, 3, 2, 4, 5, 7, 6]]), ("triangle", [[0, 1, 3]])],
+            "holds 1 polygon, 1 triangle; only triangles and quadrilaterals can be used",
+        ),
         ([("line", [[0, 1], [1, 3]])], r"holds no triangles or tetrahedra \(2 line\)"),
     ],
 )
@@ -244,3 +244,41 @@ def test_a_version_that_is_no_number(tmp_path: Path, version: str) -> None:
     (tmp_path / "part.msh").write_text(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n")
     with pytest.raises(MeshError, match=r"part.msh' could not be read"):
         read_mesh(tmp_path / "part.msh")
+
+
+# --- files that have lost cells -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["tetra", "tetra10"])
+def test_file_that_has_lost_cells_is_refused(tmp_path: Path, kind: str) -> None:
+    from fracsim.meshes.gmsh_session import session
+
+    path = tmp_path / "part.msh"
+    with session() as gmsh:
+        gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+        gmsh.model.occ.synchronize()
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.3)
+        gmsh.model.mesh.generate(3)
+        gmsh.model.mesh.setOrder(2 if kind == "tetra10" else 1)
+        gmsh.write(str(path))
+    mesh = meshio.read(path)
+    cells = mesh.cells_dict[kind]
+    for share, refused in ((1.0, False), (0.4, True)):
+        meshio.Mesh(mesh.points, [(kind, cells[: int(share * len(cells))])]).write(tmp_path / "cut.vtu")
+        if not refused:
+            assert not any("belong to no cell" in note for note in check_mesh(read_mesh(tmp_path / "cut.vtu")).notes)
+            continue
+        lost = len(mesh.points) - len(np.unique(cells[: int(share * len(cells))]))
+        with pytest.raises(MeshError, match=rf"holds {len(mesh.points)} nodes, and {lost} of them belong to no cell"):
+            read_mesh(tmp_path / "cut.vtu")
+
+
+def test_few_nodes_without_a_cell_are_counted(tmp_path: Path) -> None:
+    """A reference point, and corners of the geometry that hold a cell of their own."""
+    mesh = sample(3)
+    points = np.concatenate([mesh.points, np.full((12, 3), 9.0)])
+    blocks = [("tetra", mesh.cells), ("vertex", len(mesh.points) + np.arange(10)[:, None])]
+    meshio.Mesh(points, blocks).write(tmp_path / "part.vtu")
+    read = check_mesh(read_mesh(tmp_path / "part.vtu"))
+    np.testing.assert_array_equal(read.points, mesh.points)
+    assert read.notes == (f"12 of {len(points)} nodes belong to no cell and were removed.",)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..cell_cutting import triangles_of
 from ..components import components
 from ..contents import Block
 from ..data import Indices, MeshError, Points
@@ -108,7 +109,7 @@ def _triangles(block: Block) -> Indices:
     if block.shape == "triangle":
         return block.corners
     if block.shape == "quad":
-        return block.nodes[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+        return triangles_of(block.corners)[0]
     if block.dim == 2 and len(block.nodes):
         raise MeshError(f"The surface has {len(block.nodes)} faces of kind {block.kind}; cut them into triangles.")
     return np.zeros((0, 3), np.int64)
