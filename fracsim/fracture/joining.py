@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.around import CellsAround
 from ..mesh.edges import EdgeGraph
-from ..mesh.ranks import total
+from ..mesh.ranks import allgather, total
 from ..mesh.simplices import is_split
 from ..meshes.components import components
 from .edge_stress import Simplices
@@ -74,7 +74,7 @@ class Joining:
         keys, ends = graph.edge_keys(at), graph.edge_nodes[at]
         swapped = graph.domain.node_input[ends[:, 0]] != keys[:, 0]
         ends[swapped] = ends[swapped, ::-1]
-        parts = graph.domain.comm.allgather((keys, load, without[ends], self._held[ends]))
+        parts = allgather(graph.domain.comm, (keys, load, without[ends], self._held[ends]))
         return graph.flags_of_keys(_forest(*(np.concatenate(each) for each in zip(*parts, strict=True))))
 
     def _loads(self, edges: Ints, without: Flags, stress: Values) -> Values:

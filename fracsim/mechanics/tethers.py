@@ -24,7 +24,7 @@ from mpi4py import MPI
 
 from ..mesh.around import CellsAround
 from ..mesh.domain import Domain
-from ..mesh.ranks import total
+from ..mesh.ranks import allgather, total
 from ..mesh.simplices import is_split, local_edges
 from ..meshes.components import components
 from .coupling import Coupling
@@ -118,7 +118,7 @@ class Tethers(Term):
         links, own = self._links(pattern, without)
         if not total(domain.comm, len(own) + len(self.ties.cell))[0]:
             return
-        links, nodes = (np.unique(np.concatenate(domain.comm.allgather(each)), axis=0) for each in (links, own))
+        links, nodes = (np.unique(np.concatenate(allgather(domain.comm, each)), axis=0) for each in (links, own))
         stays = np.isin(self.ties.nodes[:, 0], nodes) & self._is_whole(self.ties.cell)
         self._lost += self._stored(~stays)
         kept = self.ties.some(stays)
@@ -151,7 +151,7 @@ class Tethers(Term):
         cells, corner = np.nonzero((of >= 0) & ~is_split(d)[self._pattern][:, None])
         x = domain.nodes + self._u.x.array.reshape(-1, d)
         mine = of[cells, corner], domain.cell_input[cells], number[cells], x[domain.cell_nodes[cells]]
-        groups, cell, corners, places = (np.concatenate(each) for each in zip(*domain.comm.allgather(mine)))  # noqa: B905
+        groups, cell, corners, places = (np.concatenate(each) for each in zip(*allgather(domain.comm, mine)))  # noqa: B905
         row, column = np.nonzero(group[np.searchsorted(every, new)][:, None] == groups)  # (node, cell) that may be
         weights = _barycentric(self._at(new)[row], places[column])
         size = np.where(np.isfinite(weights).all(axis=1), np.abs(weights).sum(axis=1), np.inf)

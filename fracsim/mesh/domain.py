@@ -19,7 +19,7 @@ from ..meshes.words import format_point
 from .dolfinx_calls import KeptCell, coordinate_element, create_mesh, facets_of_nodes
 from .names import check_group
 from .places import Group, InBox, OnPlane, Place
-from .ranks import Gather, GatherSome, total
+from .ranks import Gather, GatherSome, bcast, total
 from .simplices import local_edges
 
 if TYPE_CHECKING:
@@ -319,7 +319,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
     if data is not None:
         bounds = data.points.min(axis=0), data.points.max(axis=0)
         head = (data.dim, list(data.facet_groups), _region_index(data), list(data.regions), *bounds)
-    dim, groups, region, region_names, lower, upper = comm.bcast(head)
+    dim, groups, region, region_names, lower, upper = bcast(comm, head)
     middles = _middles(comm, data) if order == 2 else None
     mesh = create_mesh(comm, *_drawn(data, middles, dim))
     mesh.topology.create_entities(dim - 1)

@@ -14,7 +14,7 @@ from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
 from .incidence import Incidence
-from .ranks import total
+from .ranks import allgather, gather, total
 from .simplices import intact_edges, is_split, local_edges
 
 
@@ -126,10 +126,10 @@ class EdgeGraph:
         if self.domain.comm.size == 1:
             return values
         of = of or self.index_map
-        every, first = self.domain.comm.allgather(values[of.size_local :]), of.local_range[0]
+        every, first = allgather(self.domain.comm, values[of.size_local :]), of.local_range[0]
         result = la.vector(of, 1, np.float64)
         result.array[:] = values
-        for ghosts, ghost_values in zip(self.domain.comm.allgather(of.ghosts), every, strict=True):
+        for ghosts, ghost_values in zip(allgather(self.domain.comm, of.ghosts), every, strict=True):
             own = (ghosts >= first) & (ghosts < first + of.size_local)
             np.minimum.at(result.array, ghosts[own] - first, ghost_values[own])
         result.scatter_forward()
@@ -195,7 +195,7 @@ class EdgeGraph:
         self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         own = np.flatnonzero(flags[: self.edge_count])
-        parts = self.domain.comm.gather((self.edge_keys(own), values[own]))
+        parts = gather(self.domain.comm, (self.edge_keys(own), values[own]))
         if parts is None:
             return None
         keys, rows = (np.concatenate(each) for each in zip(*parts, strict=True))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
+
+from .ranks import allgather, exchanged
 
 Values = npt.NDArray[np.float64]
 
@@ -22,7 +22,7 @@ class Halo:
         d = centroids.shape[1]
         empty = np.full((2, d), np.inf) * [[1], [-1]]
         box = np.array([centroids.min(axis=0), centroids.max(axis=0)]) if len(centroids) else empty
-        boxes = comm.allgather(box)
+        boxes = allgather(comm, box)
         for rank, (low, high) in enumerate(boxes):
             if rank != comm.rank:
                 close = np.all((centroids >= low - distance) & (centroids <= high + distance), axis=1)
@@ -37,10 +37,5 @@ class Halo:
         """(cells, n) rows -> (cells + halo, n) rows."""
         if self.comm.size == 1:
             return values
-        width = values.shape[1]
         send = np.ascontiguousarray(values[self._rows], float)
-        arrived = np.empty((int(self._received.sum()), width))
-        here: Any = (send, self._sent * width)
-        there: Any = (arrived, self._received * width)
-        self.comm.Alltoallv(here, there)
-        return np.concatenate([values, arrived])
+        return np.concatenate([values, exchanged(self.comm, send, self._sent, self._received)])

@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from ..meshes.data import MeshData
 from ..meshes.topology import edges_of
+from .ranks import bcast
 from .simplices import local_edges
 
 Ints = npt.NDArray[np.int64]
@@ -63,5 +64,5 @@ def middles_of(comm: MPI.Comm, data: MeshData | None) -> Middles:
     if data is not None:
         low, high = edges_of(data.cells).T
         made = Middles(len(data.points), low * len(data.points) + high, data.middles is not None)
-    result: Middles = comm.bcast(made)
+    result: Middles = bcast(comm, made)
     return result

@@ -8,7 +8,7 @@ from dolfinx import la
 
 from ..meshes.components import components
 from .domain import Domain
-from .ranks import offset
+from .ranks import allgather, offset
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -53,7 +53,7 @@ def _joined(domain: Domain, cells: Ints, part: Ints, count: int, size: Ints, low
     label.scatter_forward()
     links = np.stack([mine, label.array[facets.size_local :]], axis=1)
     links = np.concatenate(comm.allgather(links[(links >= 0).all(axis=1)]))
-    sizes, lowests = (np.concatenate(comm.allgather(each)) for each in (size, lowest))
+    sizes, lowests = (np.concatenate(allgather(comm, each)) for each in (size, lowest))
     total, joined = components(links, len(sizes))
     least = np.full(total, np.iinfo(np.int64).max)
     np.minimum.at(least, joined, lowests)
@@ -69,7 +69,7 @@ def _largest(domain: Domain, cells: Ints, number: Ints) -> Ints:
     np.minimum.at(lowest, nodes.reshape(-1), np.repeat(number, nodes.shape[1]))
     if domain.comm.size > 1:
         names = domain.space.dofmap.index_map.ghosts
-        ghosts, numbers = (np.concatenate(domain.comm.allgather(each)) for each in (names, lowest[owned:]))
+        ghosts, numbers = (np.concatenate(allgather(domain.comm, each)) for each in (names, lowest[owned:]))
         here = ghosts - domain.space.dofmap.index_map.local_range[0]
         mine = (here >= 0) & (here < owned)
         np.minimum.at(lowest, here[mine], numbers[mine])

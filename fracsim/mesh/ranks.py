@@ -5,7 +5,8 @@ from __future__ import annotations
 import pickle
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
 
 def from_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T:
     """Run `work` on rank 0 and give its result to every rank; what it raises is raised on every rank."""
-    result: T = comm.bcast(on_root(comm, work))
+    result: T = bcast(comm, on_root(comm, work))
     return result
 
 
@@ -134,13 +135,128 @@ def largest[Number: (int, float)](comm: MPI.Intracomm, value: Number) -> Number:
 
 def joined(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Rows of all ranks, those of the lowest first."""
-    return rows if comm.size == 1 else np.concatenate(comm.allgather(rows))
+    return rows if comm.size == 1 else np.concatenate(allgather(comm, rows))
 
 
 def offset(comm: MPI.Intracomm, count: int) -> int:
     """Sum of `count` over the lower ranks."""
     before = comm.exscan(count)
     return int(before or 0)
+
+
+# --- of any size ----------------------------------------------------------------------------------------------------
+#
+# MPI before version 4 counts elements and places in 32 bits, mpi4py's own functions for Python objects in bytes. Rows
+# of an array, or blocks of what is pickled, are counted here instead, by a type of MPI for each size of them.
+
+BLOCK = 256  # bytes: pickled objects of 550 GB on all ranks together
+
+
+@cache
+def _bytes(count: int) -> MPI.Datatype:
+    """MPI's type of so many bytes side by side."""
+    return MPI.BYTE.Create_contiguous(count).Commit()
+
+
+def _width(rows: npt.NDArray[Any]) -> int:
+    return int(np.prod(rows.shape[1:], dtype=int)) * rows.itemsize
+
+
+def _flat(rows: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    return rows.view(np.uint8).reshape(-1) if rows.size else np.empty(0, np.uint8)
+
+
+def _sent(rows: npt.NDArray[Any]) -> Any:
+    """Contiguous rows as a message."""
+    return _flat(rows), len(rows) if rows.size else 0, _bytes(_width(rows))
+
+
+def _received(rows: npt.NDArray[Any], counts: Sequence[int] | npt.NDArray[np.int64]) -> Any:
+    """Contiguous rows as messages of, or to, all ranks, so many (ranks,) for each."""
+    return _flat(rows), (list(counts) if rows.size else [0] * len(counts), None), _bytes(_width(rows))
+
+
+def exchanged(
+    comm: MPI.Comm,
+    rows: npt.NDArray[Any],
+    sent: Sequence[int] | npt.NDArray[np.int64],
+    received: Sequence[int] | npt.NDArray[np.int64],
+) -> npt.NDArray[Any]:
+    """(n, ...) contiguous rows, so many (ranks,) `sent` to each rank in turn -> the rows `received` (collective)."""
+    arrived = np.empty((int(sum(received)), *rows.shape[1:]), rows.dtype)
+    comm.Alltoallv(_received(rows, sent), _received(arrived, received))
+    return arrived
+
+
+def _packed(value: object) -> npt.NDArray[np.uint8]:
+    """(blocks, BLOCK)."""
+    data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+    blocks: npt.NDArray[np.uint8] = np.zeros((-(-len(data) // BLOCK), BLOCK), np.uint8)
+    blocks.reshape(-1)[: len(data)] = np.frombuffer(data, np.uint8)
+    return blocks
+
+
+def _unpacked(blocks: npt.NDArray[np.uint8], counts: Sequence[int] | npt.NDArray[np.int64]) -> list[Any]:
+    """Of each rank."""
+    return [pickle.loads(part.reshape(-1).data) for part in np.split(blocks, np.cumsum(counts)[:-1])]
+
+
+def _counts(comm: MPI.Comm, count: int) -> npt.NDArray[np.int64]:
+    every = np.empty(comm.size, np.int64)
+    comm.Allgather(np.array([count], np.int64), every)
+    return every
+
+
+def allgather[T](comm: MPI.Comm, value: T) -> list[T]:
+    """The objects of all ranks, on all of them (collective)."""
+    if comm.size == 1:
+        return [value]
+    blocks = _packed(value)
+    counts = _counts(comm, len(blocks))
+    arrived = np.empty((int(counts.sum()), BLOCK), np.uint8)
+    comm.Allgatherv(_sent(blocks), _received(arrived, counts))
+    return _unpacked(arrived, counts)
+
+
+def gather[T](comm: MPI.Comm, value: T) -> list[T] | None:
+    """The objects of all ranks on rank 0, None elsewhere (collective)."""
+    if comm.size == 1:
+        return [value]
+    blocks = _packed(value)
+    counts = _counts(comm, len(blocks))
+    if comm.rank:
+        comm.Gatherv(_sent(blocks), None)
+        return None
+    arrived = np.empty((int(counts.sum()), BLOCK), np.uint8)
+    comm.Gatherv(_sent(blocks), _received(arrived, counts))
+    return _unpacked(arrived, counts)
+
+
+def alltoall[T](comm: MPI.Comm, values: Sequence[T]) -> list[T]:
+    """An object for each rank -> one from each (collective)."""
+    if comm.size == 1:
+        return list(values)
+    packed = [_packed(each) for each in values]
+    sent, received = np.array([len(each) for each in packed], np.int64), np.empty(comm.size, np.int64)
+    comm.Alltoall(sent, received)
+    return _unpacked(exchanged(comm, np.concatenate(packed), sent, received), received)
+
+
+def bcast(comm: MPI.Comm, value: Any) -> Any:
+    """The object of rank 0 on every rank (collective)."""
+    if comm.size == 1:
+        return value
+    count = np.zeros(1, np.int64)
+    blocks = _packed(value) if comm.rank == 0 else np.empty((0, BLOCK), np.uint8)
+    count[0] = len(blocks)
+    comm.Bcast(count)
+    if comm.rank:
+        blocks = np.empty((int(count[0]), BLOCK), np.uint8)  # type: ignore[assignment,unused-ignore]
+    comm.Bcast(_sent(blocks))
+    return value if comm.rank == 0 else _unpacked(blocks, count)[0]
+
+
+# --- in the order of the input mesh ---------------------------------------------------------------------------------
 
 
 class Gather:
@@ -154,7 +270,7 @@ class Gather:
         """`input_index`: (n,) index in the input mesh of each entity this rank owns."""
         self.comm = comm
         self.count = len(input_index)
-        pieces = comm.gather(np.ascontiguousarray(input_index))
+        pieces = gather(comm, np.ascontiguousarray(input_index))
         self._counts = [len(piece) for piece in pieces] if pieces is not None else None
         self._order = np.concatenate(pieces) if pieces is not None else None
 
@@ -168,25 +284,28 @@ class Gather:
         return self._gather(rows)
 
     def _gather(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
-        width = int(np.prod(rows.shape[1:], dtype=int)) * rows.itemsize
-        send = rows.view(np.uint8).reshape(-1) if rows.size else np.empty(0, np.uint8)
+        send = _sent(rows)
         if self._counts is None or self._order is None:
             self.comm.Gatherv(send, None)
             return None
-        raw = np.empty(sum(self._counts) * width, np.uint8)
-        sizes: Any = [count * width for count in self._counts]
-        self.comm.Gatherv(send, (raw, sizes))
-        arrived = raw.view(rows.dtype).reshape((-1, *rows.shape[1:]))
+        arrived = np.empty((sum(self._counts), *rows.shape[1:]), rows.dtype)
+        self.comm.Gatherv(send, _received(arrived, self._counts))
         result = np.empty_like(arrived)
         result[self._order] = arrived
         return result
 
     def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
         """(N, ...) rows in input order on rank 0 -> the (n, ...) rows this rank owns."""
-        parts = None
-        if self._counts is not None and self._order is not None and values is not None:
-            parts = np.split(values[self._order], np.cumsum(self._counts)[:-1])
-        result: npt.NDArray[Any] = self.comm.scatter(parts)
+        if self.comm.size == 1:
+            assert values is not None and self._order is not None
+            return np.asarray(values[self._order])
+        kind = None if values is None else (values.dtype.str, values.shape[1:])
+        dtype, tail = self.comm.bcast(kind)
+        result = np.empty((self.count, *tail), dtype)
+        if self._counts is None or self._order is None or values is None:
+            self.comm.Scatterv(None, _sent(result))
+        else:
+            self.comm.Scatterv(_received(values[self._order], self._counts), _sent(result))
         return result
 
 

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from ..errors import InputError, NotConverged
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from ..mesh.ranks import Gather, on_root, total
+from ..mesh.ranks import Gather, bcast, on_root, total
 from ..stepping.state import State
 from .checkpoint_file import (
     LARGEST,
@@ -151,7 +151,7 @@ def read_checkpoint(
         small: dict[str, Any] = {name: arrays.get(name) for name in _ON_EVERY_RANK}
         small |= {name: values for name, values in arrays.items() if name.startswith(_TERMS)}
         head = stored.clock, list(arrays), small
-    clock, names, small = comm.bcast(head)
+    clock, names, small = bcast(comm, head)
 
     def scattered(gather: Gather, name: str) -> npt.NDArray[Any]:
         return gather.scatter(arrays.get(name))

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ..mesh.ranks import gather
 from .breakable import Opened
 from .copies import Copies
 from .waiting import lend, tell, told
@@ -115,7 +116,7 @@ def serve(comm: MPI.Comm, make: Callable[[Any], Copies]) -> None:
                 bodies.restore(message.saved)
             bodies.take(message.news)
         except Exception as error:  # told instead of what was found: rank 0 waits for it
-            comm.gather(error)
+            gather(comm, error)
         else:
             _gathered(comm, bodies, message.strikes)
 
@@ -127,7 +128,7 @@ def _gathered(comm: MPI.Comm, bodies: Copies, strikes: list[Strike]) -> list[Any
         result = [opened_by(bodies, each) for each in strikes[comm.rank :: comm.size]]
     except Exception as error:
         result = error
-    return comm.gather(result)
+    return gather(comm, result)
 
 
 def opened_by(bodies: Copies, strike: Strike) -> Opened:

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.parts import parts_of_nodes
-from ..mesh.ranks import total
+from ..mesh.ranks import allgather, total
 from .weakly import AppliedBy
 
 Values = npt.NDArray[np.float64]
@@ -160,6 +160,6 @@ def _summed(comm: MPI.Comm, part: csr_matrix) -> csr_matrix:
     if comm.size == 1:
         return csr_matrix(part)
     entries = part.tocoo()
-    rows, columns, values = zip(*comm.allgather((entries.row, entries.col, entries.data)), strict=True)
+    rows, columns, values = zip(*allgather(comm, (entries.row, entries.col, entries.data)), strict=True)
     every = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return csr_matrix(every, shape=part.shape)

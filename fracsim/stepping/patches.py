@@ -29,7 +29,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
 from ..mechanics.stiffness import adds_entries
 from ..mechanics.term import Term
-from ..mesh.ranks import total
+from ..mesh.ranks import allgather, total
 from .descent import ROUND_OFF
 from .trust import of_each, trusted_step
 
@@ -97,7 +97,7 @@ class Patches:
         if len(own) > most:
             own = own[np.argpartition(-squares[own], most)[: most + 1]]
         of_all = total(comm, np.sum(squares))[0]
-        names, parts = map(np.concatenate, zip(*comm.allgather((self._names[own], squares[own])), strict=True))
+        names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[own], squares[own])), strict=True))
         falling = np.sort(parts)[::-1][:most]
         held = np.cumsum(falling)
         if not len(held) or held[-1] < LEAST_HELD * of_all:
@@ -111,12 +111,12 @@ class Patches:
         comm, dead = domain.comm, balance.stress.stressless
         alive = np.ones(domain.cell_count, bool) if dead is None else ~dead
         touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
-        chosen = self._flags(np.concatenate([*comm.allgather(self._names[touched]), nodes]))
+        chosen = self._flags(np.concatenate([*allgather(comm, self._names[touched]), nodes]))
         cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
         own = np.flatnonzero(chosen[: domain.node_count])
         inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
         rows = (each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free))
-        given = comm.allgather((self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
+        given = allgather(comm, (self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
         names, inertia, r, free, corners = map(np.concatenate, zip(*given, strict=True))
         order = np.argsort(names)
         names, here = names[order], np.flatnonzero(chosen)
@@ -189,7 +189,7 @@ class _Region:
     def look(self, w: Values) -> _Look:
         """The patches there (collective)."""
         self.put(w)
-        found = self._comm.allgather(self._energy(self._cells))
+        found = allgather(self._comm, self._energy(self._cells))
         energy, forces, stiffness = map(np.concatenate, zip(*found, strict=True))
         linear, inside = self._inertia * w + self._ties @ w, self._at >= 0
         work = ((linear / 2 + self._constant) * w).sum(axis=1)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
-from ...mesh.ranks import from_root, total
+from ...mesh.ranks import from_root, gather, total
 from ...mesh.simplices import local_edges
 from ..criterion import Average, CarriedStress, Edges
 from ..strength import Strength
@@ -61,7 +61,7 @@ class BrittleSurfaces:
         load = self._overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
         if not total(self._domain.comm, len(load.cell))[0]:
             return none
-        parts = self._domain.comm.gather(load)
+        parts = gather(self._domain.comm, load)
         field = self._field(self._carried.everywhere(carried, active)) if self._rules.curved else None
         broken = self._graph.broken_keys()
         opened: Opened = from_root(self._domain.comm, lambda: self._open(parts, broken, field))

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ...mesh.ranks import alltoall
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -27,7 +29,7 @@ class Asked:
             return
         self._order = np.argsort(rank, kind="stable")
         here = [index[rank == each] for each in range(comm.size)]
-        there = comm.alltoall(here)
+        there = alltoall(comm, here)
         self.own = np.unique(np.concatenate(there))
         self._send = [np.searchsorted(self.own, each) for each in there]
 
@@ -38,7 +40,7 @@ class Asked:
             return list(fields)
         tails = [each.shape[1:] for each in fields]
         rows = np.concatenate([each.reshape(len(each), prod(tail)).T for each, tail in zip(fields, tails, strict=True)])
-        arrived = np.concatenate(self._comm.alltoall([rows[:, each] for each in self._send]), axis=1)
+        arrived = np.concatenate(alltoall(self._comm, [rows[:, each] for each in self._send]), axis=1)
         result = np.empty_like(arrived)
         result[:, self._order] = arrived
         parts = np.split(result, np.cumsum([prod(tail) for tail in tails])[:-1])

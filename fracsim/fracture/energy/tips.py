@@ -18,7 +18,7 @@ from ...forms.waves import rayleigh_speed
 from ...mechanics.material import PerCell
 from ...mechanics.stress import Stress
 from ...mesh.edges import EdgeGraph
-from ...mesh.ranks import total
+from ...mesh.ranks import allgather, total
 from ...mesh.simplices import local_edges
 from ..brittle.principal import directions, largest, material_normals, tensors, upper_bound
 from ..criterion import Edges
@@ -298,7 +298,7 @@ class CrackTips:
         if not total(comm, len(rank))[0]:
             self._idle = True
             return list(proposals)
-        parts = comm.allgather(rank)
+        parts = allgather(comm, rank)
         every = np.concatenate(parts)
         left = list(np.lexsort(every[:, 2::-1].T))
         keep = np.zeros(len(every), bool)

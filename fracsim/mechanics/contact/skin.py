@@ -14,6 +14,7 @@ from mpi4py import MPI
 from scipy.sparse import bsr_matrix, csr_matrix, kron
 
 from ...mesh.domain import Domain
+from ...mesh.ranks import gather
 from ...mesh.split.identity import found_again
 from ...mesh.split.local import Following, LocalSurface
 from ...mesh.split.places import Places
@@ -253,7 +254,7 @@ class Skin:
         rows = self._surface.identity()[which]
         of = at.copies[which]
         known = np.column_stack([rows, at.share[of], self.area[of] == 0])
-        gathered = self.comm.gather(known)
+        gathered = gather(self.comm, known)
         return np.concatenate(gathered) if gathered is not None else known
 
     def restore(self, rows: Values) -> None:
@@ -267,7 +268,7 @@ class Skin:
 
     def saved_cut(self) -> Values:
         """Rows of the corners of facets that are left out, on rank 0 (collective)."""
-        gathered = self.comm.gather(self._named(self._cut))
+        gathered = gather(self.comm, self._named(self._cut))
         return np.concatenate(gathered) if gathered is not None else np.empty((0, 2 * self._domain.dim + 1))
 
     def restore_cut(self, rows: Values) -> None:
