@@ -304,6 +304,12 @@ NO_DATA: list[tuple[Data, str]] = [
     ({"ksp_rtol": "1e-3 -pc_type lu"}, NO_TARGET),
     ({"ksp_rtol": "1e-3\n-pc_type"}, NO_TARGET),
     ({"ksp_rtol": "1e-3\n"}, NO_TARGET),
+    # values that PETSc fails with
+    ({"ksp_rtol": 0.0}, "above 0 and below 1"),
+    ({"ksp_rtol": 0}, "above 0 and below 1"),
+    ({"ksp_rtol": float("nan")}, "above 0 and below 1"),
+    ({"ksp_rtol": "-1"}, "above 0 and below 1"),
+    ({"pc_type": "fieldsplit"}, "choose another"),
     # keys that are no name of an option
     ({"-ksp_rtol": 1e-3}, "no - before it"),
     ({"ksp_rtol\n": 1e-3}, "a letter first"),
@@ -322,6 +328,15 @@ def test_options_that_are_no_data_are_refused(options: Data, message: str) -> No
     key = next(iter(options)).replace("\n", "\\n")
     assert f"solver.{key[:57]}" in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("kind", ["bddc", "composite", "galerkin", "lsc"])
+def test_preconditioners_that_need_more_are_one_message(kind: str, tmp_path: Path) -> None:
+    """PETSc refuses them as it sets them up, in the first step."""
+    path = write_study(tmp_path / "bar.toml", BAR, solver={"pc_type": kind})
+    result = fracsim("run", path, "-o", tmp_path / "out")
+    assert result.returncode == 2
+    assert f"pc_type = {kind}" in result.stderr and "Traceback" not in result.stderr
 
 
 def test_a_refused_option_runs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import difflib
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -78,6 +79,24 @@ def refusing(work: Callable[[], None]) -> None:
     except PETSc.Error as error:
         message = str(error).splitlines()[-1].split("] ", 1)[-1]
         raise InputError(f"[solver]: PETSc refuses an option: {message}") from None
+
+
+@contextmanager
+def blamed_on(given: Options) -> Iterator[None]:
+    """What PETSc refuses only once it solves becomes an InputError, where the study has given options."""
+    try:
+        yield
+    except PETSc.Error as error:
+        cause: BaseException | None = error
+        while isinstance(cause, PETSc.Error):
+            error, cause = cause, cause.__cause__
+        if cause is not None or not given:  # one of our own, raised in a callback
+            raise
+        message = str(error).splitlines()[-1].split("] ", 1)[-1]
+        options = ", ".join(f"{key} = {value}" for key, value in given.items())
+        raise InputError(
+            f"[solver]: PETSc cannot solve with {options}: {message}; leave out what it does not go with"
+        ) from None
 
 
 def _is_used(name: str) -> bool:

@@ -16,7 +16,7 @@ from .choice import Choice
 from .downhill import EXACT, POSITIVE
 from .factors import SOONER_THAN_GMRES
 from .newton import Newton
-from .petsc_options import Options
+from .petsc_options import Options, blamed_on
 from .preconditioner import Due
 from .stepper import SolveResult
 
@@ -71,7 +71,11 @@ class Solver:
 
     def solve(self, guess: Values) -> SolveResult:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution (choice).
-        Raises Abandoned (heed)."""
+        Raises Abandoned (heed), and InputError where PETSc cannot solve with the options of the study."""
+        with blamed_on(self._given):
+            return self._solve(guess)
+
+    def _solve(self, guess: Values) -> SolveResult:
         choice = self._choice
         if choice.begins_with_factors() and choice.trusts(result := self._attempt_directly(guess)):
             return result
@@ -95,8 +99,9 @@ class Solver:
 
     def linear_response(self, force: Values) -> Values:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u (Linear.response)."""
-        self._newton.shrink()
-        return self.linear.response(force, directly=bool(self._choice.left))
+        with blamed_on(self._given):
+            self._newton.shrink()
+            return self.linear.response(force, directly=bool(self._choice.left))
 
     def damage_changed(self, broke: int | None = None) -> None:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows)."""

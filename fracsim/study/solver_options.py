@@ -43,7 +43,12 @@ Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
 def refuse_what_is_no_data(options: Options) -> None:
     """ValueError that names the first option which would load code or name a file."""
     for key, value in options.items():
-        if wrong := _wrong_key(key) or _wrong_value(str(value)):
+        if (
+            wrong := _wrong_key(key)
+            or _wrong_value(str(value))
+            or _wrong_kind(key, str(value))
+            or _wrong_share(key, value)
+        ):
             raise ValueError(f"solver.{_short(key)} = {_short(json.dumps(value))}: {wrong}")
 
 
@@ -64,6 +69,23 @@ def _wrong_key(key: str) -> str:
     if _KEY_WORDS & set(key.lower().split("_")):
         return "options of [solver] neither load code nor read or write files; remove it"
     return ""
+
+
+def _wrong_kind(key: str, text: str) -> str:
+    """Of a preconditioner in which PETSc crashes where nothing is known of its fields."""
+    wrong = key.endswith("pc_type") and text == "fieldsplit"
+    return (
+        "fieldsplit needs fields, and there is one; choose another, for example gamg, hypre, ilu or lu" if wrong else ""
+    )
+
+
+def _wrong_share(key: str, value: bool | int | float | str) -> str:
+    """Of a tolerance that a Krylov method is to reach: none gets to 0."""
+    try:
+        inside = isinstance(value, bool) or 0 < float(value) < 1
+    except ValueError:
+        inside = False
+    return "" if key != "ksp_rtol" or inside else "a share of the residual, above 0 and below 1, for example 1e-6"
 
 
 def _wrong_value(text: str) -> str:
