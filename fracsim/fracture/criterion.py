@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edges import EdgeGraph
-from ..mesh.ranks import total
+from ..mesh.ranks import allgather, total
 from .edge_stress import Simplices, greatest_pull
 from .strength import Strength
 
@@ -134,7 +134,7 @@ class OverloadedEdges:
     def _strongest(self, edges: Edges, load: Values, most: int) -> tuple[Edges, Values]:
         """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
         keys = self._graph.edge_keys(edges.astype(np.int64))
-        every = np.concatenate(self._graph.domain.comm.allgather(np.column_stack([keys, -load])))
+        every = np.concatenate(allgather(self._graph.domain.comm, np.column_stack([keys, -load])))
         order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
         _, first = np.unique(every[order, :2], axis=0, return_index=True)
         chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)

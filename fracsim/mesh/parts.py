@@ -52,7 +52,7 @@ def _joined(domain: Domain, cells: Ints, part: Ints, count: int, size: Ints, low
     mine = label.array[facets.size_local :].copy()
     label.scatter_forward()
     links = np.stack([mine, label.array[facets.size_local :]], axis=1)
-    links = np.concatenate(comm.allgather(links[(links >= 0).all(axis=1)]))
+    links = np.concatenate(allgather(comm, links[(links >= 0).all(axis=1)]))
     sizes, lowests = (np.concatenate(allgather(comm, each)) for each in (size, lowest))
     total, joined = components(links, len(sizes))
     least = np.full(total, np.iinfo(np.int64).max)

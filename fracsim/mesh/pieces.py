@@ -11,7 +11,7 @@ from dolfinx import la
 from ..meshes.components import components
 from .domain import Domain
 from .edges import EdgeGraph
-from .ranks import offset
+from .ranks import allgather, offset
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ def find_pieces(graph: EdgeGraph) -> Pieces:
     label = local + first
     ghosts = slice(domain.node_count, None)
     links = np.stack([label[ghosts], _owners_label(domain, label)[ghosts]], axis=1)
-    every = np.concatenate(domain.comm.allgather(np.unique(links, axis=0)))
+    every = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
     lowest = np.full(local_count, np.iinfo(np.int64).max)
     np.minimum.at(lowest, local, domain.node_input)
-    lowest = np.concatenate(domain.comm.allgather(lowest))
+    lowest = np.concatenate(allgather(domain.comm, lowest))
     count, joined = components(every, len(lowest))
     least = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(least, joined, lowest)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ...mesh.ranks import allgather
 from ..brittle.principal import largest, tensors
 from ..criterion import Edges
 from ..energy.along import LEAST
@@ -72,7 +73,7 @@ class CohesiveTips(CrackTips):
         load = np.round(self._greatest(mean, weak) / self._strength_of(weak), DIGITS)
         centres = self.sight.centres[weak]
         rank = self._ranked(1, load, centres, centres, self._h[weak])
-        every = np.concatenate(self._domain.comm.allgather(rank[load >= 1]))
+        every = np.concatenate(allgather(self._domain.comm, rank[load >= 1]))
         first = every[np.lexsort(every[:, 2::-1].T)][:1]
         chosen = (rank == first).all(axis=1) if len(first) else np.zeros(len(weak), bool)
         return Proposal(rank[chosen], weak[chosen], mean[chosen])

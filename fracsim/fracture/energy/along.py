@@ -16,6 +16,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from ...mesh.ranks import allgather
 from .around import over, pairs_within
 
 Ints = npt.NDArray[np.int64]
@@ -61,7 +62,7 @@ class Along(Alone):
     def update(self, number: Ints, point: Values, ahead: Values, radius: Values) -> None:
         """As above."""
         super().update(number, point, ahead, radius)
-        every = np.concatenate(self._comm.allgather(np.column_stack([number, point, ahead, self._square])))
+        every = np.concatenate(allgather(self._comm, np.column_stack([number, point, ahead, self._square])))
         self._order = np.argsort(every[:, 0], kind="stable")
         every = every[self._order]
         pairs = pairs_within(cKDTree(every[:, 1:4]), point, radius)
@@ -73,5 +74,5 @@ class Along(Alone):
 
     def _sums(self, released: Values) -> tuple[Values, Values]:
         """(n,) over those that are near."""
-        every = np.concatenate(self._comm.allgather(released))[self._order]
+        every = np.concatenate(allgather(self._comm, released))[self._order]
         return self._weights @ every, self._made

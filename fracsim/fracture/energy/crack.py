@@ -10,6 +10,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from ...mesh.edges import EdgeGraph
+from ...mesh.ranks import allgather
 from .front import WIDTH, Front
 
 Ints = npt.NDArray[np.int64]
@@ -66,7 +67,7 @@ class Crack:
         (collective)."""
         cells = np.flatnonzero(self._pattern != self._graph.pattern)
         self._pattern[cells] = self._graph.pattern[cells]
-        rows = np.concatenate(self._graph.domain.comm.allgather(self._of(cells, cut)))
+        rows = np.concatenate(allgather(self._graph.domain.comm, self._of(cells, cut)))
         number = rows[:, 0].astype(np.int64)
         kept = self._rows[~np.isin(self.number, number)]
         every = np.concatenate([kept, rows[rows[:, 1] >= 0]])

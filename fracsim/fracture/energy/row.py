@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ...mesh.ranks import allgather
 from ...mesh.simplices import is_split
 from ..criterion import Edges
 from .cutting import Cuts, cleave
@@ -47,7 +48,7 @@ class RowTips(CrackTips):
         (collective)."""
         reach = size >= toughness
         first = tips.point[reach & tips.mature & ~self.barred[tips.cell]]
-        every = np.concatenate(self._domain.comm.allgather(first))
+        every = np.concatenate(allgather(self._domain.comm, first))
         if not len(every):
             return reach, np.zeros(len(tips), bool)
         near = cKDTree(every).query(tips.point)[0] < self.disc * self._h[tips.cell]

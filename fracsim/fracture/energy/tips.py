@@ -323,7 +323,7 @@ class CrackTips:
     def _remembered(self, rows: Values) -> tuple[Edges, Values]:
         """Where edges are cut, from all ranks: (n,) local edges of this one, and (n, course) whither cracks go on from
         there (collective)."""
-        every = np.concatenate(self._domain.comm.allgather(rows))
+        every = np.concatenate(allgather(self._domain.comm, rows))
         every = every[np.lexsort(every[:, 5:2:-1].T)]  # neighbours cut the same edge where the first of them does
         keys, first = np.unique(every[:, :2].astype(np.int64), axis=0, return_index=True)
         local, place = self._graph.find_keys(keys)

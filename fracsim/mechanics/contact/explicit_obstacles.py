@@ -21,6 +21,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from ...mesh.domain import Domain
+from ...mesh.ranks import gather
 from ...mesh.split.identity import found_again
 from .carried import Carried
 from .law import Law
@@ -168,7 +169,7 @@ class ExplicitObstacles(Obstacles):
                              self.skin.area[each.points], self.skin.identity(each.points), each.slip, each.stiffness])
             for k, each in enumerate(self._past.springs)
         ]  # fmt: skip
-        gathered = self.comm.gather((np.concatenate(rows), np.array(self._past.pushed)))
+        gathered = gather(self.comm, (np.concatenate(rows), np.array(self._past.pushed)))
         if gathered is None:
             return super().saved()
         springs, pushed = zip(*gathered, strict=True)
