@@ -9,17 +9,19 @@ import numpy as np
 
 from .components import components
 from .data import Indices, MeshData, MeshError, Points
+from .joining import bodies_of, coincident_nodes, joined_bodies
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, distinct_rows, edges_of, facets_of, oriented, signed_measures
-from .words import middle_of
+from .topology import Floats, Mask, distinct_rows, facets_of, oriented, signed_measures
+from .words import format_point, middle_of
 
 SHOWN = 5  # examples in a message
 
 
-def check_mesh(mesh: MeshData) -> MeshData:
+def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     """The mesh, fit to be solved on, with a note for everything that was mended or that the user should know.
 
     Mended: nodes that no cell uses are removed (groups and regions follow); inverted cells are turned.
+    Joined, with `join`: coincident nodes of different bodies (see joining).
     Noted: nodes at the same place that are not joined, separate bodies, parts that hang together by an edge or node
     only, group facets inside the body, cells in several regions.
 
@@ -31,12 +33,19 @@ def check_mesh(mesh: MeshData) -> MeshData:
     _check_arrays(mesh)
     _check_coordinates(mesh)
     mesh = _without_orphans(mesh)
+    mesh = joined_bodies(mesh) if join else mesh
     mesh = _groups_once(_turned(mesh))
     _check_flat(mesh)
     _check_cells_once(mesh)
     table = _FacetTable(mesh.cells)
     _check_facets(mesh, table)
-    notes = [*_check_groups(mesh, table), *_coincident(mesh), *_bodies(mesh, table), *_regions(mesh)]
+    count, body = bodies_of(mesh)
+    notes = [
+        *_check_groups(mesh, table),
+        *_open_places(mesh, body),
+        *_bodies(mesh, table, count, body),
+        *_regions(mesh),
+    ]
     return replace(mesh, notes=mesh.notes + tuple(notes))
 
 
@@ -231,9 +240,10 @@ def _groups_once(mesh: MeshData) -> MeshData:
 # --- noted ----------------------------------------------------------------------------------------------------------
 
 
-def _coincident(mesh: MeshData) -> Iterator[str]:
-    order = np.lexsort(mesh.points.T)
-    same = (np.diff(mesh.points[order], axis=0) == 0).all(axis=1)
+def _open_places(mesh: MeshData, body: Indices) -> Iterator[str]:
+    """Nodes of one body at the same place."""
+    order = np.lexsort((body, *mesh.points.T))
+    same = (np.diff(mesh.points[order], axis=0) == 0).all(axis=1) & (np.diff(body[order]) == 0)
     if same.any():
         where = mesh.points[order[np.flatnonzero(same)[0]]].tolist()
         yield (
@@ -242,11 +252,16 @@ def _coincident(mesh: MeshData) -> Iterator[str]:
         )
 
 
-def _bodies(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
-    by_nodes = components(edges_of(mesh.cells), len(mesh.points))[0]
+def _bodies(mesh: MeshData, table: _FacetTable, by_nodes: int, body: Indices) -> Iterator[str]:
     by_facets = components(table.pairs(mesh.dim + 1), len(mesh.cells))[0]
     if by_nodes > 1:
         yield f"The mesh has {by_nodes} bodies that share no node; each needs its own supports."
+        if len(pairs := coincident_nodes(mesh, body)):
+            yield (
+                f"{len(np.unique(pairs))} nodes coincide with nodes of another body, the first at "
+                f"{format_point(mesh.points[pairs[0, 0]])} m: these bodies touch and are not joined. Where parts of a "
+                "file are meant to be one body, give [mesh] join = true."
+            )
     if by_facets > by_nodes:
         how = "an edge or a node" if mesh.dim == 3 else "a node"
         yield (

@@ -244,6 +244,8 @@ REFUSED: list[tuple[Data, str]] = [
     (changed(BAR) | {"mesh": {"surface": __file__, "h": np.inf}}, "mesh.h = inf: a surface is filled with cells of"),
     (changed(BAR) | {"mesh": {"surface": __file__}}, "mesh.h = None: a surface is filled with cells of size h > 0"),
     (changed(BAR) | {"mesh": {"surface": __file__, "h": 1.0, "scale": 0}}, "mesh.scale = 0: metres for each unit of"),
+    (changed(BAR) | {"mesh": {"file": __file__, "join": 1}}, "mesh.join = 1: whether nodes of different bodies"),
+    (changed(BAR) | {"mesh": {"surface": __file__, "h": 1.0, "join": True}}, "mesh.join is not a known key beside"),
     (changed(BAR) | {"mesh": {"file": __file__, "scale": [1]}}, "mesh.scale = [1]: metres for each unit of length"),
     (changed(BAR) | {"mesh": {"surface": __file__, "h": 1.0, "time_limit": "1"}}, "mesh.time_limit = 1: seconds that"),
     (changed(BAR) | {"mesh": {"file": __file__}}, "is of no known kind; known endings:"),

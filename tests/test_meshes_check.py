@@ -152,9 +152,57 @@ def test_bodies_apart_and_nodes_not_joined_are_noted(mesh: MeshData) -> None:
     two = MeshData(np.concatenate([mesh.points, beside]), np.concatenate([mesh.cells, mesh.cells + len(mesh.points)]))
     notes = check_mesh(two).notes
     common = len(np.unique(mesh.facet_groups["right"]))
-    assert notes[0].startswith(f"{common} nodes lie exactly on another node (the first at [1.0, ")
-    assert notes[1] == "The mesh has 2 bodies that share no node; each needs its own supports."
+    assert notes[0] == "The mesh has 2 bodies that share no node; each needs its own supports."
+    assert notes[1].startswith(f"{2 * common} nodes coincide with nodes of another body, the first at (1, ")
+    assert "[mesh] join = true" in notes[1]
     assert len(notes) == 2
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-7])
+def test_bodies_are_joined_where_their_nodes_coincide(mesh: MeshData, noise: float) -> None:
+    """Three boxes in a row; with a crack within the first one, which stays open."""
+    count, common = len(mesh.points), len(np.unique(mesh.facet_groups["right"]))
+    move = np.eye(mesh.dim)[0]
+    points = np.concatenate([mesh.points + shift * move for shift in range(3)])
+    points += noise * np.random.default_rng(3).uniform(-1, 1, points.shape)
+    cells = np.concatenate([mesh.cells + shift * count for shift in range(3)])
+    ends = {"left": mesh.facet_groups["left"], "right": mesh.facet_groups["right"] + 2 * count}
+    three = MeshData(points, cells, ends, {"middle": np.arange(len(mesh.cells), 2 * len(mesh.cells))})
+    joined = check_mesh(three, join=True)
+    assert joined.notes == (
+        f"{2 * common} nodes were joined with coincident nodes of another body: 3 bodies are 1 now.",
+    )
+    assert len(joined.points) == 3 * count - 2 * common and len(joined.cells) == 3 * len(mesh.cells)
+    facets = facets_of(joined.cells).reshape(-1, mesh.dim)
+    _, counts = np.unique(np.sort(facets, axis=1), axis=0, return_counts=True)
+    per_end = len(mesh.facet_groups["right"])
+    before = np.unique(np.sort(facets_of(three.cells).reshape(-1, mesh.dim), axis=1), axis=0)
+    assert len(counts) == len(before) - 2 * per_end
+    for name, at in (("left", 0.0), ("right", 3.0)):
+        np.testing.assert_allclose(joined.points[joined.facet_groups[name]][..., 0], at, atol=1e-6)
+    where = joined.points[joined.cells[joined.regions["middle"]]].mean(axis=1)[:, 0]
+    assert ((where > 1) & (where < 2)).all()
+
+
+def test_a_crack_stays_open_where_bodies_are_joined() -> None:
+    points = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [1, 1], [2, 0], [2, 1], [1, 0], [1, 1]])
+    cells = np.array([[0, 1, 2], [0, 4, 3], [7, 5, 6], [7, 6, 8]])
+    with pytest.raises(MeshError, match=r"1 nodes coincide with two nodes of one other body, the first at \(1, 1\) m"):
+        check_mesh(MeshData(points, cells), join=True)
+    crack = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [1, 1]])
+    beside = np.array([[0.0, 0], [0, 1], [-1, 0]])
+    two = MeshData(np.concatenate([crack, beside]), np.array([[0, 1, 2], [0, 4, 3], [5, 6, 7]]))
+    joined = check_mesh(two, join=True)
+    assert len(joined.points) == 6
+    assert any("1 nodes lie exactly on another node" in note for note in joined.notes)
+
+
+def test_join_without_coincident_nodes(mesh: MeshData) -> None:
+    assert check_mesh(mesh, join=True).notes == ("[mesh] join = true: the mesh is one body already.",)
+    away = mesh.points + 5.0
+    two = MeshData(np.concatenate([mesh.points, away]), np.concatenate([mesh.cells, mesh.cells + len(mesh.points)]))
+    with pytest.raises(MeshError, match="no nodes of the 2 bodies are at the same place"):
+        check_mesh(two, join=True)
 
 
 def test_bodies_that_touch_in_a_node_or_edge_are_noted() -> None:

@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 
@@ -187,8 +188,6 @@ def test_extruded_cells_of_gmsh(tmp_path: Path, version: float, order: int, inco
 
 
 def test_plane_quadrilaterals(tmp_path: Path) -> None:
-    import meshio
-
     x, y = np.meshgrid(np.arange(4.0), np.arange(3.0), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     grid = np.arange(12).reshape(4, 3)
@@ -203,3 +202,20 @@ def test_plane_quadrilaterals(tmp_path: Path) -> None:
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(6.0)
     assert [len(mesh.regions[name]) for name in ("tag-1", "tag-2")] == [10, 2]
     assert mesh.notes == ("5 quadrilaterals were cut into 10 triangles.",)
+
+
+def test_join_of_a_study_makes_parts_one_body(tmp_path: Path) -> None:
+    """Two boxes with a common face, in millimetres, of hexahedra and of tetrahedra."""
+    from fracsim.study import Mesh
+    from fracsim.study.mesh_source import build_mesh
+
+    box = np.array([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
+    first = np.array([[0, 1, 3, 2, 4, 5, 7, 6]])
+    path = tmp_path / "two.vtu"
+    points, cells = np.concatenate([box, box + np.eye(3)[0]]), np.concatenate([first, first + 8])
+    meshio.Mesh(points, [("hexahedron", cells)]).write(path)
+    apart = build_mesh(Mesh.model_validate({"file": path, "scale": 1e-3}))
+    assert any("8 nodes coincide with nodes of another body" in note for note in apart.notes)
+    joined = build_mesh(Mesh.model_validate({"file": path, "scale": 1e-3, "join": True}))
+    assert (len(apart.points), len(joined.points)) == (16, 12)
+    assert joined.notes[-1] == "4 nodes were joined with coincident nodes of another body: 2 bodies are 1 now."

@@ -63,7 +63,10 @@ def _reader(kind: type) -> TypeAdapter[Any]:
 
 # keys beside the source, and what each of them is
 BESIDE = {
-    "file": {"scale": "metres for each unit of length of the file, a number > 0"},
+    "file": {
+        "scale": "metres for each unit of length of the file, a number > 0",
+        "join": "whether nodes of different bodies at the same place become one, true or false",
+    },
     "surface": {
         "h": "a surface is filled with cells of size h > 0 (m)",
         "scale": "metres for each unit of length of the file, a number > 0",
@@ -80,6 +83,7 @@ BESIDE = {
     },
 }
 NEEDED = ("h", "thickness")  # of those that have it
+SWITCHES = ("join",)  # keys that are true or false
 
 
 def _check_source(mesh: Mesh) -> None:
@@ -92,7 +96,8 @@ def _check_source(mesh: Mesh) -> None:
     for name, meaning in BESIDE[key].items():
         value: Any = mesh.parameters.get(name)
         whole = name != "seed" or isinstance(value, int)
-        if (name in mesh.parameters or name in NEEDED) and not (is_number(value) and value >= SHORTEST and whole):
+        sound = isinstance(value, bool) if name in SWITCHES else is_number(value) and value >= SHORTEST and whole
+        if (name in mesh.parameters or name in NEEDED) and not sound:
             raise InputError(f"mesh.{name} = {value}: {meaning}")
 
 
@@ -166,7 +171,8 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
         else:
             assert mesh.file is not None
             data = read_mesh(mesh.file)
-        return _scaled(check_mesh(data), mesh)
+        join = mesh.file is not None and bool(mesh.parameters.get("join"))
+        return _scaled(check_mesh(data, join=join), mesh)
 
 
 def _scaled(data: MeshData, mesh: Mesh) -> MeshData:
