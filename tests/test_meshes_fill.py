@@ -254,9 +254,9 @@ def test_points_that_are_no_numbers_are_named() -> None:
         closed_surface(points, triangles, "S")
 
 
-def test_flat_triangle_is_named() -> None:
+def test_flat_body_is_refused() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 1]])
-    with pytest.raises(MeshError, match="S has 1 triangles without an area"):
+    with pytest.raises(MeshError, match="S is open: 4 edges"):
         closed_surface(points, np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [0, 2, 3]]), "S")
 
 

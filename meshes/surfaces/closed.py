@@ -16,8 +16,8 @@ from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
 from .enclosed import enclosed_volumes, windings
+from .mending import areas, directed_edges, flat_triangles, joined, mended
 
-JOINED = 1e-6  # points nearer than this share of the body's size are one
 PROBES = 300  # points of a part that are looked up in another part
 
 
@@ -47,7 +47,7 @@ class ClosedSurface:
     @property
     def area(self) -> float:
         """Area of the whole boundary [m^2]."""
-        return float(_areas(self.points, self.triangles).sum())
+        return float(areas(self.points, self.triangles).sum())
 
     @property
     def sides(self) -> tuple[float, ...]:
@@ -81,7 +81,7 @@ def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indic
     were turned. MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
     points, triangles = _read_triangles(path, scale, source)
     _check_points(points, triangles, source)
-    points, triangles = _joined(points, triangles)
+    points, triangles = joined(points, triangles)
     _check_areas(points, triangles, source)
     _check_edges(points, triangles, source, (2,))
     triangles, _, turned = _consistent(triangles, source)
@@ -116,18 +116,18 @@ def _triangles(block: Block) -> Indices:
 
 
 def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSurface:
-    """Triangles joined at coincident points, checked, turned outwards and sorted into bodies.
+    """Triangles joined at coincident points, mended (see mending), checked, turned outwards and sorted into bodies.
 
     Raises:
         MeshError: see read_surface; `source` begins the message.
     """
     _check_points(points, triangles, source)
-    points, triangles = _joined(points, triangles)
+    points, triangles, mends = mended(points, triangles)
     _check_areas(points, triangles, source)
     _check_closed(points, triangles, source)
     triangles, shell, turned = _consistent(triangles, source)
     triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
-    notes = []
+    notes = list(mends)
     if turned:
         notes.append(f"{turned} of {len(triangles)} surface triangles faced the other way than the rest; turned.")
     if inside_out:
@@ -154,39 +154,15 @@ def _check_points(points: Points, triangles: Indices, source: str) -> None:
         raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed.")
 
 
-def _joined(points: Points, triangles: Indices) -> tuple[Points, Indices]:
-    """Points at the same place made one (STL repeats every corner); triangles that collapse thereby are left out."""
-    from scipy.spatial import cKDTree  # as in components: not needed to fill what has been read
-
-    used, triangles = np.unique(triangles, return_inverse=True)
-    points, triangles = points[used], triangles.reshape(-1, 3)
-    points, number = np.unique(points, axis=0, return_inverse=True)
-    reach = JOINED * float(np.ptp(points, axis=0).max())
-    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
-    _, cluster = components(pairs, len(points))
-    first = np.unique(cluster, return_index=True)[1]
-    triangles = cluster[number.ravel()[triangles]]
-    whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    return points[first], triangles[whole].astype(np.int64)
-
-
 def _check_areas(points: Points, triangles: Indices, source: str) -> None:
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
-    areas = _areas(points, triangles)
-    longest = np.linalg.norm(points[triangles] - points[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
-    # Coordinates of single precision move a corner by up to 6e-8 of the body's size.
-    flat = np.flatnonzero(areas <= 1e-7 * float(np.ptp(points, axis=0).max()) * longest / 2)
+    flat = np.flatnonzero(flat_triangles(points, triangles))
     if len(flat):
         raise MeshError(
             f"{source} has {len(flat)} triangles without an area, the first at "
             f"{middle_of(points, triangles[flat[0]])}; remesh the surface there."
         )
-
-
-def _areas(points: Points, triangles: Indices) -> Floats:
-    spans = points[triangles[:, 1:]] - points[triangles[:, :1]]
-    return np.linalg.norm(np.cross(spans[:, 0], spans[:, 1]), axis=1) / 2
 
 
 def _check_closed(points: Points, triangles: Indices, source: str) -> None:
@@ -195,7 +171,7 @@ def _check_closed(points: Points, triangles: Indices, source: str) -> None:
 
 def _check_edges(points: Points, triangles: Indices, source: str, which: tuple[int, ...]) -> None:
     """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
-    edges, counts, _ = distinct_rows(np.sort(_directed_edges(triangles), axis=1))
+    edges, counts, _ = distinct_rows(np.sort(directed_edges(triangles), axis=1))
     found = {
         1: (edges[counts == 1], "is open: {} edges belong to one triangle only"),
         2: (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
@@ -204,13 +180,9 @@ def _check_edges(points: Points, triangles: Indices, source: str, which: tuple[i
         if len(wrong):
             raise MeshError(
                 f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
-                "close or mend it there."
+                "close or mend it there (MeshLab: Filters > Remeshing > Close Holes; Blender: Mesh > Clean Up > Fill "
+                "Holes)."
             )
-
-
-def _directed_edges(triangles: Indices) -> Indices:
-    """Edges in the direction of their triangle, three rows for each triangle: (3 k, 2)."""
-    return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
 def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]:
@@ -220,7 +192,7 @@ def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]
     links fall into two mirrored halves for each part, or into one where the part has one side only (Moebius).
     """
     count = len(triangles)
-    directed = _directed_edges(triangles)
+    directed = directed_edges(triangles)
     _, counts, edge = distinct_rows(np.sort(directed, axis=1))
     order = np.argsort(edge, kind="stable")
     order = order[counts[edge[order]] == 2]  # an open one has edges of one triangle

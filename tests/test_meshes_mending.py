@@ -1,0 +1,95 @@
+"""Faults of closed surfaces: mended with a note where the shape stays, against the volume in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fracsim.meshes import MeshError
+from fracsim.meshes.data import Indices, Points
+from fracsim.meshes.surfaces.closed import closed_surface, read_surface
+
+FILES = Path(__file__).parent / "meshes"
+CUBE = np.array([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
+QUADS = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (1, 3, 7, 5), (3, 2, 6, 7), (2, 0, 4, 6))  # normals outwards
+BOX = 60.0 * 40.0 * 20.0  # of the files, in their unit of length
+
+
+def soup(size: tuple[float, float, float] = (3.0, 2.0, 1.0)) -> Points:
+    """A box as separate triangles: (12, 3, 3)."""
+    return np.array([CUBE[list(corners)] * size for a, b, c, d in QUADS for corners in ((a, b, c), (a, c, d))])
+
+
+def surface_of(triangles: Points) -> tuple[Points, Indices]:
+    return triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "note"),
+    [
+        ("q1_vt_vn_blender_default.obj", 1e-3, None),
+        ("q2_vn_only.obj", 1e-3, None),
+        ("q3_colour_meshlab.obj", 1e-3, None),
+        ("s4_degenerate.stl", 1.0, "1 surface triangles without an area were left out."),
+        ("s6_tjunction.stl", 1.0, "1 edges of the surface had corners of other triangles on them"),
+        ("s8_noise.stl", 1.0, "points of the surface within 2e-05 of its size of another point were joined"),
+    ],
+)
+def test_files_of_other_programs(name: str, unit: float, note: str | None) -> None:
+    surface = read_surface(FILES / name)
+    assert surface.volume == pytest.approx(BOX * unit**3, rel=1e-5 if "noise" in name else 1e-12)
+    assert any(note in told for told in surface.notes) if note else surface.notes == ()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_t_junctions_on_every_edge(seed: int) -> None:
+    """Each triangle is cut anew at places of its own on all its edges, so that no two neighbours agree."""
+    random = np.random.default_rng(seed)
+    cut = []
+    for a, b, c in soup():
+        u, v, w = random.uniform(0.1, 0.9, 3)
+        p, q, r = a + u * (b - a), b + v * (c - b), c + w * (a - c)
+        cut += [(a, p, r), (p, b, q), (q, c, r), (p, q, r)]
+    turned = 1e-3 * np.array(cut) @ Rotation.random(random_state=seed).as_matrix().T + random.uniform(-1, 1, 3)
+    surface = closed_surface(*surface_of(turned), "S")
+    assert surface.volume == pytest.approx(6e-9, rel=1e-6)
+    assert len(surface.notes) == 1 and "were divided there" in surface.notes[0]
+
+
+def test_collinear_and_doubled_triangles() -> None:
+    """One edge of a face is halved by a triangle without an area; three triangles come twice, one the other way."""
+    triangles = soup()
+    a, b, c = triangles[0]
+    middle = (a + b) / 2
+    faces = [*triangles[1:], (a, middle, c), (middle, b, c), (a, b, middle), *triangles[4:6], triangles[7][::-1]]
+    surface = closed_surface(*surface_of(np.array(faces)), "S")
+    assert surface.volume == pytest.approx(6.0, rel=1e-12)
+    assert surface.notes[:2] == (
+        "3 surface triangles were given more than once, and are taken once.",
+        "1 surface triangles without an area were left out.",
+    )
+
+
+@pytest.mark.parametrize(("noise", "notes"), [(0.0, 0), (1e-7, 0), (3e-6, 1)])
+def test_noise_between_points_that_are_one(noise: float, notes: int) -> None:
+    triangles = soup()
+    triangles += 3.0 * noise * np.random.default_rng(1).uniform(-1, 1, triangles.shape)
+    surface = closed_surface(*surface_of(triangles), "S")
+    assert surface.volume == pytest.approx(6.0, rel=1e-4)
+    assert len(surface.triangles) == 12 and len(surface.notes) == notes
+
+
+def test_inward_normals_are_turned() -> None:
+    surface = closed_surface(*surface_of(soup()[:, ::-1]), "S")
+    assert surface.volume == pytest.approx(6.0) and "inside out" in surface.notes[0]
+
+
+def test_what_would_change_the_shape_is_refused() -> None:
+    with pytest.raises(MeshError, match=r"is open: 3 edges .* first at \(.*MeshLab: .*Close Holes"):
+        closed_surface(*surface_of(soup()[1:]), "S")
+    sheet = np.concatenate([soup(), soup()[:1] + np.array([0, 0, 0.5])])
+    with pytest.raises(MeshError, match="is open: 3 edges"):
+        closed_surface(*surface_of(sheet), "S")
