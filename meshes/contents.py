@@ -109,7 +109,7 @@ class Contents:
         regions = cut._cell_sets(mine)
         if self.copies:
             cells, regions = _each_once(cells, regions)
-        groups = cut._facet_sets(below) | cut._node_groups(cells, len(points))
+        groups = cut._node_groups(cells, len(points)) | cut._facet_sets(below)
         mesh = MeshData(points, cells, groups, regions, self.notes + notes + self._order_note(dim) + cut_notes)
         return _without(mesh, self._middle_nodes())
 
@@ -223,7 +223,7 @@ class Contents:
             marked = np.zeros(count, bool)
             marked[nodes] = True
             facets = facets_where(boundary, marked)
-            if len(facets) and name not in self.sets:
+            if len(facets):
                 groups[name] = facets
         return groups
 

@@ -1,19 +1,15 @@
-"""meshio on a file of which all that it names has been looked at: data of XDMF and HDF5, *INCLUDE of Abaqus, the second
-file of TetGen."""
+"""meshio on a file of which all that it names has been looked at: data of XDMF and HDF5, the second file of TetGen."""
 
 from __future__ import annotations
 
 import io
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 from .data import MeshError
 from .plain_files import data_elsewhere, is_hdf5, wrong_beside
 
-# as meshio takes it for the keyword: stars do not count
-_INCLUDE = re.compile(r"^[ \t*]*i\**n\**c\**l\**u\**d\**e[ \t*]*(?:,.*)?$", re.IGNORECASE | re.MULTILINE)
 # endings whose readers wait for more where a file has been cut off: meshio's name of the format, and whether it is text
 _WAITING = {
     ".dat": ("tecplot", True),
@@ -23,7 +19,6 @@ _WAITING = {
     ".ply": ("ply", False),
 }
 MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
-MOST_INCLUDES = 1000  # files of an Abaqus deck
 
 
 def meshio_mesh(path: Path) -> Any:
@@ -33,9 +28,7 @@ def meshio_mesh(path: Path) -> Any:
     ending = path.suffix.lower()
     if ending in (".xdmf", ".xmf"):
         return _xdmf_reader(path).read()
-    if ending == ".inp":
-        _check_includes(path)
-    elif ending in (".ele", ".node"):
+    if ending in (".ele", ".node"):
         other = path.stem + {".ele": ".node", ".node": ".ele"}[ending]
         _check(path, other)
         _check_begun(path)
@@ -89,28 +82,6 @@ def _xdmf_reader(path: Path) -> Any:
             return super()._read_data_item(item, root)
 
     return Reader(str(path))
-
-
-def _check_includes(deck: Path) -> None:
-    """Of an Abaqus deck and of what it includes, found as meshio finds it: in the working folder, then beside it."""
-    todo, seen = [deck], {deck.resolve()}
-    while todo:
-        path = todo.pop()
-        for line in _INCLUDE.findall(path.read_text(errors="replace")):
-            name = line.split("=")[-1].strip()
-            _check(path, name)
-            beside = path.parent / name
-            if os.path.exists(name) and not os.path.samefile(name, beside):
-                raise MeshError(
-                    f"Mesh file '{path}' could not be read: it names the file '{name}', of which there is one in the "
-                    f"working folder as well: call fracsim from the folder {path.parent.absolute()}."
-                )
-            if (whole := beside.resolve()) in seen:
-                raise MeshError(f"Mesh file '{path}' could not be read: it includes '{name}' a second time.")
-            seen.add(whole)
-            todo.append(beside)
-        if len(seen) > MOST_INCLUDES:
-            raise MeshError(f"Mesh file '{deck}' could not be read: it includes more than {MOST_INCLUDES} files.")
 
 
 def _begins_as_gmsh(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""A mesh from file: Gmsh's own format through gmsh, OBJ by `obj`, everything else through meshio."""
+"""A mesh from file: Gmsh's own format through gmsh, Abaqus by `abaqus`, OBJ by `obj`, all else through meshio."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .abaqus import read_abaqus
 from .contents import Block, Contents
 from .data import Indices, MeshData, MeshError
 from .gmsh_session import session
@@ -59,6 +60,8 @@ def read_contents(path: Path) -> Contents:
         raise MeshError(f"Mesh file '{path}' {wrong}.")
     if path.stat().st_size == 0:
         raise MeshError(f"Mesh file '{path}' is empty.")
+    if path.suffix.lower() == ".inp":
+        return read_abaqus(path)
     version = _gmsh_version(path)
     if version >= 4:
         return _read_with_gmsh(path)

@@ -227,24 +227,25 @@ def abaqus(folder: Path, name: str) -> Path:
     return folder / "main.inp"
 
 
-def test_an_abaqus_deck_includes_plain_files_beside_it(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_abaqus_deck_includes_plain_files_beside_it(here: Path) -> None:
+    """Beside the deck only: files of the same name in the working folder are another's."""
     deck = abaqus(here / "deck", "mesh.inp")
+    pipe(here / "mesh.inp")  # in the working folder
     assert len(read_mesh(deck).cells) == len(sample().cells)
     pipe(here / "deck" / "pipe.inp")
-    pipe(here / "mesh.inp")  # in the working folder
+    (here / "deck" / "link.inp").symlink_to("/etc/passwd")
     for name, said in {
         "/etc/passwd": "which lies outside the folder",
         "../mesh.inp": "which lies outside the folder",
         "pipe.inp": "which is a named pipe, not a file",
+        "link.inp": "which is a link",
         "main.inp": "a second time",
-        "mesh.inp": "of which there is one in the working folder as well: call fracsim from the folder",
+        "none.inp": "which does not exist",
     }.items():
-        for word in ("*INCLUDE", "*include", "**In*clude", " include"):
-            deck.write_text(f"*HEADING\n{word}, input={name}\n")
-            with pytest.raises(MeshError, match=said):
+        for line in ("*INCLUDE, INPUT=", "* include ,\n input = ", "*Node, input=", "*nset, nset=a, INPUT="):
+            deck.write_text(f"*HEADING\n{line}{name}\n")
+            with pytest.raises(MeshError, match=rf"main\.inp', line 2: .*{said}"):
                 read_mesh(deck)
-    monkeypatch.chdir(here / "deck")
-    assert len(read_mesh(deck).cells) == len(sample().cells)
 
 
 @pytest.mark.parametrize("ending", ["ele", "node"])

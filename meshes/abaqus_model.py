@@ -1,0 +1,305 @@
+"""What an Abaqus input file defines: parts, instances and the assembly, with their nodes, elements, sets and surfaces.
+
+Sets and surfaces are kept as they are written; `abaqus` resolves them when every node and element has its number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .abaqus_deck import KeywordBlock, keyword_blocks, number
+from .abaqus_elements import SUPPORTED, kind_of
+from .data import Indices, Points
+
+SHOWN = 5  # names in a message
+# Keywords that make nodes or elements in ways that are not supported: without these a body would be smaller.
+GENERATORS = {"NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYMMETRICMODELGENERATION", "SYSTEM", "PARAMETER"}
+GENERATORS |= {"IMPORT"}
+KEYWORDS = ("NODE", "ELEMENT", "NSET", "ELSET", "SURFACE", "PART", "INSTANCE", "ASSEMBLY", "INCLUDE")
+NO_INDICES = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class SetEntry:
+    """Members of a set: `numbers`, or the range first, last, step, or a set or number by its name, of an instance."""
+
+    block: KeywordBlock
+    numbers: Indices | None = None
+    span: tuple[int, int, int] | None = None
+    name: str = ""
+    instance: str = ""
+    of_elements: bool = False  # nodes of the elements of the set `name`
+    face: str = ""  # of a surface: identifier, "" for free faces
+
+
+@dataclass(eq=False)
+class NamedSet:
+    name: str
+    internal: bool
+    entries: list[SetEntry] = field(default_factory=list)
+    surface_kind: str = ""  # "ELEMENT", "NODE", "UNION"
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBlock:
+    block: KeywordBlock
+    kind: str
+    ids: Indices
+    nodes: Indices
+
+
+@dataclass(eq=False)
+class Component:
+    """A part, an instance or, with the name "", the assembly: what numbers nodes and elements on its own."""
+
+    name: str
+    opened: KeywordBlock | None = None
+    nodes: list[tuple[KeywordBlock, Indices, Points]] = field(default_factory=list)
+    elements: list[ElementBlock] = field(default_factory=list)
+    unused: dict[str, int] = field(default_factory=dict)  # number of elements by type
+    unused_ids: list[Indices] = field(default_factory=list)
+    unused_nodes: list[Indices] = field(default_factory=list)
+    node_sets: dict[str, NamedSet] = field(default_factory=dict)
+    element_sets: dict[str, NamedSet] = field(default_factory=dict)
+    surfaces: dict[str, NamedSet] = field(default_factory=dict)
+
+
+def label_key(name: str) -> str:
+    """What two spellings of a name have in common: letter case and the width of blanks do not count."""
+    return " ".join(name.split()).upper()
+
+
+class Deck:
+    """Parts, instances and the assembly, as the keyword blocks of a file define them."""
+
+    def __init__(self, path: Path) -> None:
+        self.assembly = Component("")
+        self.parts: dict[str, Component] = {}
+        self.instances: dict[str, tuple[Component, str, KeywordBlock]] = {}
+        self.notes: list[str] = []
+        self._open: list[tuple[KeywordBlock, Component]] = []
+        readers: dict[str, Callable[[KeywordBlock], None]] = {
+            "NODE": self._nodes,
+            "ELEMENT": self._elements,
+            "NSET": self._set,
+            "ELSET": self._set,
+            "SURFACE": self._surface,
+            "PART": self._begin,
+            "INSTANCE": self._begin,
+            "ASSEMBLY": self._begin,
+            "ENDPART": self._end,
+            "ENDINSTANCE": self._end,
+            "ENDASSEMBLY": self._end,
+        }
+        for block in keyword_blocks(path):
+            if block.keyword in readers:
+                readers[block.keyword](block)
+            elif block.keyword in GENERATORS and block.pieces:
+                block.refuse(
+                    f"*{block.keyword} is not supported: it makes or moves nodes or elements that are not in the file. "
+                    "Write the mesh out in full, for example from Abaqus/CAE: Job > Write Input."
+                )
+            elif len(block.keyword) > 2 and any(word.startswith(block.keyword) for word in KEYWORDS):
+                block.refuse(f"the keyword *{block.keyword} is cut short; write it in full, as *NODE or *ELEMENT.")
+        if self._open:
+            block = self._open[-1][0]
+            block.refuse(
+                f"*{block.keyword} has no *END {block.keyword}; the file is cut short or damaged. Export it again."
+            )
+
+    @property
+    def _scope(self) -> Component:
+        return self._open[-1][1] if self._open else self.assembly
+
+    def _begin(self, block: KeywordBlock) -> None:
+        kind, name = block.keyword, block.parameters.get("NAME", "")
+        outer = self._open[-1][0].keyword if self._open else ""
+        if outer != ("ASSEMBLY" if kind == "INSTANCE" else ""):
+            if outer:
+                block.refuse(f"*{kind} stands within *{outer}; *END {outer} is missing before it.")
+            block.refuse("*INSTANCE stands outside *ASSEMBLY; the file is damaged. Export it again.")
+        if kind == "ASSEMBLY":
+            self._open.append((block, self.assembly))
+            return
+        if not name:
+            block.refuse(f"*{kind} has no name; write *{kind}, NAME=...")
+        known = self.parts if kind == "PART" else self.instances
+        if label_key(name) in known:
+            block.refuse(f"there is a {kind.lower()} '{name}' already; names must differ.")
+        component = Component(name, block)
+        if kind == "PART":
+            self.parts[label_key(name)] = component
+        else:
+            part = block.parameters.get("PART", "")
+            if label_key(part) not in self.parts:
+                block.refuse(
+                    f"instance '{name}' is of the part '{part}', which the file does not define before it (parts: "
+                    f"{some_of(p.name for p in self.parts.values())}). An instance from an earlier analysis cannot be "
+                    "read; export the whole model."
+                )
+            self.instances[label_key(name)] = component, label_key(part), block
+        self._open.append((block, component))
+
+    def _end(self, block: KeywordBlock) -> None:
+        kind = block.keyword.removeprefix("END")
+        if not self._open or self._open[-1][0].keyword != kind:
+            block.refuse(f"*END {kind} stands without *{kind}; the file is damaged. Export it again.")
+        self._open.pop()
+
+    def _nodes(self, block: KeywordBlock) -> None:
+        if block.parameters.get("SYSTEM", "R").upper() != "R":
+            block.refuse("*NODE, SYSTEM= with cylindrical or spherical coordinates; write x, y, z.")
+        block.check_ended()
+        values, ends = block.numbers(np.float64)
+        counts = np.diff(ends, prepend=0)
+        width = int(counts[0]) if len(counts) else 4
+        wrong = (counts != width) & ~((counts > 3) & (counts < 8) & (width > 3)) | (counts < 3) | (counts > 7)
+        if wrong.any():
+            line = int(np.flatnonzero(wrong)[0])
+            block.refuse(
+                f"a node has {counts[line] - 1} coordinates; 2 or 3 are needed, as many as the nodes before: "
+                "1, 0.0, 0.5, 2.0. Is the line cut?",
+                line,
+            )
+        rows = values[(ends - counts)[:, None] + np.arange(min(width, 4))] if len(counts) else np.zeros((0, 4))
+        points = np.zeros((len(rows), 3))
+        points[:, : rows.shape[1] - 1] = rows[:, 1:]
+        with np.errstate(invalid="ignore"):
+            ids = rows[:, 0].astype(np.int64)
+        bad = (ids != rows[:, 0]) | (ids < 1) | ~np.isfinite(points).all(axis=1)
+        if bad.any():
+            block.refuse(
+                "a node needs a whole number from 1 and finite coordinates: 1, 0.0, 0.5, 2.0.", int(bad.argmax())
+            )
+        self._scope.nodes.append((block, ids, points))
+        self._member(block, "NSET", self._scope.node_sets, ids)
+
+    def _member(self, block: KeywordBlock, key: str, sets: dict[str, NamedSet], ids: Indices) -> None:
+        if name := block.parameters.get(key):
+            _named(sets, name).entries.append(SetEntry(block, numbers=ids))
+
+    def _elements(self, block: KeywordBlock) -> None:
+        element_type = "".join(block.parameters.get("TYPE", "").upper().split())
+        if not element_type:
+            block.refuse(f"*ELEMENT has no type; write *ELEMENT, TYPE=C3D4. Supported are {SUPPORTED}.")
+        try:
+            shape = kind_of(element_type)
+        except ValueError as error:
+            block.refuse(str(error))
+        if shape is None:
+            ids = self._unused_elements(block, element_type)
+        else:
+            block.check_ended()
+            rows = _element_rows(block, element_type, shape[1])
+            ids = rows[:, 0]
+            self._scope.elements.append(ElementBlock(block, shape[0], ids, rows[:, 1:]))
+        self._member(block, "ELSET", self._scope.element_sets, ids)
+
+    def _unused_elements(self, block: KeywordBlock, element_type: str) -> Indices:
+        ids: list[int] = []
+        nodes: list[int] = []
+        continued = False
+        for fields in block.lines():
+            values = [int(v) for v in (number(text, np.int64) for text in fields) if v is not None]
+            if not continued:
+                ids += values[:1]
+            nodes += values[0 if continued else 1 :]
+            continued = len(fields) > 15
+        self._scope.unused[element_type] = self._scope.unused.get(element_type, 0) + len(ids)
+        self._scope.unused_ids.append(np.array(ids, np.int64))
+        self._scope.unused_nodes.append(np.array(nodes, np.int64))
+        return self._scope.unused_ids[-1]
+
+    def _set(self, block: KeywordBlock) -> None:
+        parameters = block.parameters
+        name = parameters.get(block.keyword, "")
+        if not name:
+            block.refuse(f"*{block.keyword} has no name; write *{block.keyword}, {block.keyword}=left.")
+        sets = self._scope.node_sets if block.keyword == "NSET" else self._scope.element_sets
+        entries = _named(sets, name, "INTERNAL" in parameters).entries
+        instance = parameters.get("INSTANCE", "")
+        if block.keyword == "NSET" and parameters.get("ELSET"):
+            entries.append(SetEntry(block, name=parameters["ELSET"], instance=instance, of_elements=True))
+        if "GENERATE" in parameters:
+            values, ends = block.numbers(np.int64)
+            for i, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
+                row = [int(value) for value in values[begin:end]]
+                first, last, step = [*row, 1][:3] if len(row) in (2, 3) else (0, 0, 0)
+                if step < 1 or last < first:
+                    block.refuse("GENERATE needs first, last and step: 1, 380, 1.", i)
+                entries.append(SetEntry(block, span=(first, last, step), instance=instance))
+            return
+        numbers: list[int] = []
+        for fields in block.lines():
+            for text in fields:
+                value = number(text, np.int64)
+                if value is not None:
+                    numbers.append(int(value))
+                elif text:
+                    entries.append(SetEntry(block, name=text, instance=instance))
+        if numbers:
+            entries.append(SetEntry(block, numbers=np.array(numbers, np.int64), instance=instance))
+
+    def _surface(self, block: KeywordBlock) -> None:
+        name, kind = block.parameters.get("NAME", ""), block.parameters.get("TYPE", "ELEMENT").upper()
+        if not name:
+            block.refuse("*SURFACE has no name; write *SURFACE, TYPE=ELEMENT, NAME=top.")
+        if combine := block.parameters.get("COMBINE", "").upper():
+            kind = combine
+        if kind not in ("ELEMENT", "NODE", "UNION"):
+            self.notes.append(f"Surface '{name}' of the kind {kind[:40]} is not used.")
+            kind = ""
+        surface = _named(self._scope.surfaces, name, "INTERNAL" in block.parameters)
+        surface.surface_kind = kind
+        for i, fields in enumerate(block.lines() if kind else ()):
+            if kind == "UNION":
+                surface.entries += [SetEntry(block, name=text) for text in fields if text]
+                continue
+            if not fields[0] and kind == "ELEMENT" and not any(fields[1:]):
+                surface.entries.append(SetEntry(block))  # the whole free surface
+                continue
+            if not fields[0] or len(fields) > 2:
+                block.refuse("a line of *SURFACE needs a set or a number and a face: top_elements, S2.", i)
+            face = fields[1].upper() if len(fields) == 2 and kind == "ELEMENT" else ""
+            value = number(fields[0], np.int64)
+            numbers = None if value is None else np.array([value], np.int64)
+            surface.entries.append(SetEntry(block, numbers, name="" if numbers is not None else fields[0], face=face))
+
+
+def _named(sets: dict[str, NamedSet], name: str, internal: bool = False) -> NamedSet:
+    return sets.setdefault(label_key(name), NamedSet(" ".join(name.split()), internal))
+
+
+def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices:
+    """Element numbers and their nodes, (m, nodes + 1); an element may run over several lines."""
+    values, ends = block.numbers(np.int64)
+    width = nodes + 1
+    wanted = np.arange(width, (len(values) // width) * width + 1, width)
+    place = np.searchsorted(ends, wanted)
+    aligned = ends[np.minimum(place, len(ends) - 1)] == wanted if len(ends) else np.zeros(0, bool)
+    if len(values) % width or not aligned.all():
+        first = int(np.flatnonzero(~aligned)[0]) if not aligned.all() else len(aligned)
+        line = int(np.searchsorted(ends, first * width, side="right"))
+        count = int(ends[line] - first * width - 1)
+        block.refuse(
+            f"element {values[first * width]} has {count} nodes on this line; {element_type} needs {nodes}, and each "
+            "element begins on a line of its own. Is the file cut or damaged? Export it again.",
+            line,
+        )
+    rows = values.reshape(-1, width)
+    if (bad := rows.min(axis=1, initial=1) < 1).any():
+        block.refuse(
+            f"element {rows[bad.argmax(), 0]} has a number below 1; numbers of elements and nodes begin with 1.",
+            int(place[bad.argmax()]),
+        )
+    return rows
+
+
+def some_of(names: Iterable[str]) -> str:
+    """The first few names, and dots where there are more."""
+    listed = list(names)
+    return ", ".join(listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "") if listed else "none"
