@@ -388,6 +388,13 @@ class _Assembled:
         if others := [ids for placed in self.placed for ids in self._nodes_of_unused(placed)]:
             blocks.append(Block("vertex", np.unique(np.concatenate(others))[:, None]))
         sets = {name: [*parts, *[NO_INDICES] * (len(blocks) - len(parts))] for name, parts in sets.items()}
+        for mesh in dict.fromkeys(placed.mesh for placed in self.placed):
+            missing, first = mesh.missing_numbers()
+            if missing:
+                where = f" of part '{mesh.components[0].name}'" if mesh.components[0].name else ""
+                self.notes.append(
+                    f"Element numbers{where} left out: {missing}, first {first}; are lines of the file lost?"
+                )
         if self._lost:
             total = sum(self._lost.values())
             self.notes.append(

@@ -196,6 +196,8 @@ class Deck:
             block.check_ended()
             rows = _element_rows(block, element_type, shape[1])
             ids = rows[:, 0]
+            if shape[0] == "line3":  # Abaqus has the middle between the ends
+                rows = rows[:, [0, 1, 3, 2]]
             self._scope.elements.append(ElementBlock(block, shape[0], ids, rows[:, 1:]))
         self._member(block, "ELSET", self._scope.element_sets, ids)
 
@@ -226,9 +228,10 @@ class Deck:
             entries.append(SetEntry(block, name=parameters["ELSET"], instance=instance, of_elements=True))
         if "GENERATE" in parameters:
             values, ends = block.numbers(np.int64)
-            for i, (begin, end) in enumerate(zip(np.r_[0, ends[:-1]], ends, strict=True)):
-                row = [int(value) for value in values[begin:end]]
-                first, last, step = [*row, 1][:3] if len(row) in (2, 3) else (0, 0, 0)
+            if not len(ends):
+                block.refuse("GENERATE needs a line of first, last and step: 1, 380, 1. The data are missing.")
+            for i, row in enumerate(np.split(values, ends[:-1])):
+                first, last, step = [*row.tolist(), 1][:3] if len(row) in (2, 3) else (0, 0, 0)
                 if step < 1 or last < first:
                     block.refuse("GENERATE needs first, last and step: 1, 380, 1.", i)
                 entries.append(SetEntry(block, span=(first, last, step), instance=instance))

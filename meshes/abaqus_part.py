@@ -8,6 +8,8 @@ from .abaqus_deck import KeywordBlock
 from .abaqus_model import NO_INDICES, Component, ElementBlock
 from .data import Indices, Points
 
+MAX_GAPS = 3  # element numbers left out that are told of,
+MAX_GAP_SHARE = 0.01  # or so many of all elements
 MAX_UNUSED_SHARE = 0.1  # of the nodes of a part that no element may name
 MAX_UNUSED_NODES = 3  # and so many in any case: reference points
 
@@ -83,6 +85,23 @@ class LocalMesh:
         for kind, (numbers, indices) in self.cells.items():
             first = np.sort(np.unique(numbers, return_index=True)[1])
             self.cells[kind] = numbers[first], indices[first]
+
+    def missing_numbers(self) -> tuple[int, int]:
+        """How many element numbers are left out between the others, and the first; 0 where they are more than a few.
+
+        Many gaps are usual where elements were deleted on purpose; a few may be lines that were lost.
+        """
+        ids = [ids for ids, _ in self.cells.values()]
+        if not ids:
+            return 0, 0
+        used = np.concatenate([*ids, *(ids for component in self.components for ids in component.unused_ids)])
+        first, last = int(used.min()), int(used.max())
+        missing = last - first + 1 - len(used)
+        if not 0 < missing <= max(MAX_GAPS, MAX_GAP_SHARE * len(used)):
+            return 0, 0
+        there = np.zeros(last - first + 1, bool)
+        there[used - first] = True
+        return int((~there).sum()), first + int((~there).argmax())
 
     def check_nodes_used(self) -> None:
         """MeshError where over a tenth of the nodes belong to no element."""

@@ -316,6 +316,7 @@ REFUSED = {
     "sets in a ring": (CUBE + "*NSET, NSET=a\nb\n*NSET, NSET=b\na\n", 19, "contains itself"),
     "no such face": (CUBE + "*SURFACE, NAME=s\n1, S5\n", 17, "a tetra has no face 'S5'"),
     "range": (CUBE + "*NSET, NSET=a, GENERATE\n5, 1, 1\n", 18, "GENERATE needs first, last and step"),
+    "empty range": (CUBE + "*NSET, NSET=a, GENERATE\n", 17, "The data are missing"),
     "data first": ("1, 2, 3\n" + CUBE, 1, "stands before the first keyword"),
     "binary": (CUBE.replace("4, 0.", "4, \0"), 5, "the file is not text"),
     "comma": (CUBE + "*NSET, NSET=a,\n1, 2, 3\n", 18, "Take the comma away"),
@@ -387,3 +388,39 @@ def test_hexahedra_with_a_surface(deck: Write) -> None:
     assert volume(mesh) == pytest.approx(1)
     assert areas(mesh, "up") == pytest.approx(1) and areas(mesh, "free") == pytest.approx(6)
     assert np.all(mesh.points[mesh.facet_groups["up"], 2] == 1)
+
+
+def test_a_line_that_was_lost_is_told(deck: Write) -> None:
+    assert read(deck(CUBE.replace("3, 1, 4, 8, 7\n", ""))).notes[0] == (
+        "Element numbers left out: 1, first 3; are lines of the file lost?"
+    )
+
+
+@pytest.mark.parametrize(
+    ("dim", "order", "squares"), [(3, 1, False), (3, 2, False), (2, 1, False), (2, 2, False), (2, 1, True)]
+)
+def test_files_of_gmsh(tmp_path: Path, dim: int, order: int, squares: bool) -> None:
+    """Surfaces as CPS3 and CPS6, lines as T3D2 and T3D3, groups as sets; counts are gmsh's own."""
+    from fracsim.meshes.gmsh_session import session
+
+    path = tmp_path / "part.inp"
+    with session() as gmsh:
+        (gmsh.model.occ.addBox if dim == 3 else gmsh.model.occ.addRectangle)(0, 0, 0, *([1.0] * dim))
+        gmsh.model.occ.synchronize()
+        side = 1 if dim == 3 else 4
+        gmsh.model.addPhysicalGroup(dim - 1, [side], 7, "left")
+        gmsh.model.addPhysicalGroup(dim, [1], 8, "Körper")
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.4)
+        if squares:
+            gmsh.model.mesh.setRecombine(2, 1)
+        gmsh.model.mesh.generate(dim)
+        gmsh.model.mesh.setOrder(order)
+        facets = sum(map(len, gmsh.model.mesh.getElements(dim - 1, side)[1]))
+        cells = sum(map(len, gmsh.model.mesh.getElements(dim)[1]))
+        gmsh.write(str(path))
+    mesh = read(path)
+    assert mesh.dim == dim and volume(mesh) == pytest.approx(1)
+    assert len(mesh.cells) == cells * (2 if squares else 1)
+    assert len(mesh.regions["Körper"]) == len(mesh.cells)
+    assert len(mesh.facet_groups["left"]) == facets
+    assert np.all(mesh.points[mesh.facet_groups["left"], 0] == 0)
