@@ -123,7 +123,7 @@ def _divided(points: Points, triangles: Indices, reach: float) -> tuple[Indices,
             number, side = divmod(int(place), 3)
             if not nodes or replaced[number]:
                 continue
-            a, b, c = np.roll(triangles[number], -side).tolist()
+            a, b, c = (int(node) for node in np.roll(triangles[number], -side))
             chain = [a, *nodes, b]
             if c not in nodes:
                 new += [[one, other, c] for one, other in pairwise(chain)]
