@@ -1,4 +1,4 @@
-"""A mesh from file: Gmsh's own format through gmsh, Abaqus by `abaqus`, OBJ by `obj`, all else through meshio."""
+"""A mesh from file: Gmsh's own format by gmsh, Abaqus, OBJ and STL by readers of their names, others by meshio."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from .gmsh_session import session
 from .meshio_reader import meshio_mesh
 from .obj import read_obj
 from .plain_files import wrong_with
+from .stl import read_stl
+
+OWN_READERS = {".obj": read_obj, ".stl": read_stl}  # in place of meshio's
 
 # Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
 TAG_ARRAYS = (
@@ -162,7 +165,7 @@ def _meshio_mesh(path: Path) -> Any:
     said = io.StringIO()
     try:
         with _quiet(said):
-            return read_obj(path) if path.suffix.lower() == ".obj" else meshio_mesh(path)
+            return OWN_READERS.get(path.suffix.lower(), meshio_mesh)(path)
     except MeshError:
         raise
     except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit

@@ -1,0 +1,91 @@
+"""Triangles of an STL file, text or binary, of any writer.
+
+Not by meshio (5.3), which takes only `endloop` in one word, and reads on behind the end of a file that was cut.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .data import MeshError
+
+HEAD = 84  # bytes of a binary file before its triangles: 80 of text, 4 of their number
+TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_WORDS = re.compile(rb"^[ \t]*(vertex|end[ \t]*facet|end[ \t]*loop)\b", re.IGNORECASE | re.MULTILINE)
+
+
+def read_stl(path: Path) -> Any:
+    """A meshio.Mesh of the triangles, each with three points of its own: STL repeats them.
+
+    Raises:
+        MeshError: the file is neither text nor binary STL, or was cut off; with the line of a text file.
+    """
+    import meshio
+
+    data = path.read_bytes()
+    declared = int.from_bytes(data[80:HEAD], "little")
+    if declared and len(data) >= HEAD + TRIANGLE.itemsize * declared:  # never of text, which gives a huge number there
+        corners = np.frombuffer(data, TRIANGLE, declared, HEAD)["corners"].astype(np.float64)
+    elif data[:4096].lstrip()[:5].lower() == b"solid" and b"\0" not in data[HEAD:4096]:
+        corners = _of_text(path, data.replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
+    elif len(data) < HEAD:
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: it begins with {data[:16]!a}, not as STL does (`solid`)."
+        )
+    else:
+        room = (len(data) - HEAD) // TRIANGLE.itemsize
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: it declares {declared} triangles, and has room for {room}. It is "
+            "damaged or no STL file; export it again."
+        )
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    return meshio.Mesh(corners.reshape(-1, 3), [("triangle", triangles)])
+
+
+def _of_text(path: Path, data: bytes) -> npt.NDArray[np.float64]:
+    """(k, 3, 3) corners: what stands behind each `vertex`; three for each `endfacet`."""
+    parts = _WORDS.split(data)
+    plain = {word: b"".join(word.split()).lower() for word in set(parts[1::2])}
+    words = [plain[word] for word in parts[1::2]]
+    ends = sum(word == b"endfacet" for word in words)
+    texts = [text.split() for word, text in zip(words, parts[2::2], strict=True) if word == b"vertex"]
+    expected = [b"vertex"] * 3 + [b"endloop", b"endfacet"]
+    wrong = next((i for i, word in enumerate(words) if word != expected[i % 5]), len(words))
+    if wrong < len(words) or len(words) % 5 or not ends:
+        raise MeshError(
+            f"Mesh file '{path}', line {_line(parts, wrong)}: a facet of STL has three lines `vertex x y z`, then "
+            f"`endloop` and `endfacet` ({ends} of them are whole). The file is damaged or was cut off; export it again."
+        )
+    if not re.search(rb"end\s*solid", parts[-1], re.IGNORECASE):
+        raise MeshError(
+            f"Mesh file '{path}', line {_line(parts, len(words))}: the file ends without `endsolid` behind {ends} "
+            "facets. It was cut off; export it again."
+        )
+    try:
+        if any(len(text) != 3 for text in texts):
+            raise ValueError
+        return np.array([x for text in texts for x in text]).astype(np.float64).reshape(-1, 3, 3)
+    except ValueError:
+        bad = next(i for i, text in enumerate(texts) if not _are_three_numbers(text))
+        number = _line(parts, [i for i, word in enumerate(words) if word == b"vertex"][bad])
+        said = b" ".join(texts[bad])[:60].decode("utf-8", "replace")
+        raise MeshError(
+            f"Mesh file '{path}', line {number}: `vertex {said}` does not name three coordinates: vertex 0 0.5 1."
+        ) from None
+
+
+def _are_three_numbers(text: list[bytes]) -> bool:
+    try:
+        return len([float(x) for x in text]) == 3
+    except ValueError:
+        return False
+
+
+def _line(parts: list[bytes], word: int) -> int:
+    """The line, from 1, of a keyword of a file that was split at them."""
+    return 1 + sum(part.count(b"\n") for part in parts[: 2 * word + 1])

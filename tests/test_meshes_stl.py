@@ -1,0 +1,77 @@
+"""STL of other programs and damaged STL, against the triangles that were written by hand."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fracsim.meshes import MeshError
+from fracsim.meshes.read import read_contents
+from fracsim.meshes.surfaces.closed import read_surface
+
+FILES = Path(__file__).parent / "meshes"
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+FACES = TETRAHEDRON[[[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]]
+
+
+def text(faces: Any = FACES, name: str = "part", end: str = "\n") -> str:
+    lines = [f"solid {name}"]
+    for face in faces:
+        lines += ["  facet normal 0 0 0", "    outer loop"]
+        lines += [f"      vertex {x:.6e} {y:.6e} {z:.6e}" for x, y, z in face]
+        lines += ["    endloop", "  endfacet"]
+    return end.join([*lines, f"endsolid {name}"]) + end
+
+
+def binary(faces: Any = FACES, head: bytes = b"") -> bytes:
+    rows = [struct.pack("<12fH", 0, 0, 0, *face.ravel(), 0) for face in faces]
+    return head.ljust(80, b" ") + struct.pack("<I", len(faces)) + b"".join(rows)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        text().encode(),
+        text().upper().encode(),
+        text().replace("endloop", "end loop").replace("endfacet", "End  Facet").encode(),
+        text(name="vertex 1 of a é").encode("latin-1"),
+        text(end="\r\n").encode(),
+        text(end="\r").encode(),
+        text(FACES[:2]).encode() + text(FACES[2:], "second").encode(),
+        binary(),
+        binary(head=b"solid made by a program"),
+        binary() + b"\0" * 7,
+    ],
+)
+def test_every_writing_gives_the_same_triangles(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "part.stl").write_bytes(data)
+    contents = read_contents(tmp_path / "part.stl")
+    np.testing.assert_array_equal(contents.points[contents.blocks[0].nodes], FACES)
+    assert read_surface(tmp_path / "part.stl").volume == pytest.approx(1 / 6)
+
+
+def test_end_loop_in_two_words() -> None:
+    assert read_surface(FILES / "s2_end_loop.stl").volume == pytest.approx(60.0 * 40.0 * 20.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (binary()[:-10], "declares 4 triangles, and has room for 3"),
+        (text().encode()[:450], rf"line {1 + text()[:450].count(chr(10))}: .* without `endsolid` behind 2 facets"),
+        (text().encode()[:350], rf"line {1 + text()[:350].count(chr(10))}: a facet of STL .* \(1 of them are whole"),
+        (text().replace("vertex 0.000000e+00", "vertex 0,0", 1).encode(), "line 4: `vertex 0,0 .*three coordinates"),
+        (text().replace("endloop\n", "\n", 1).encode(), "line 8: a facet of STL has"),
+        (b"solid nothing\nendsolid nothing\n", r"line 3: a facet of STL has .* \(0 of them"),
+        (b"hello", "begins with b'hello'"),
+        (b"x" * 500, "declares 2021161080 triangles"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, data: bytes, message: str) -> None:
+    (tmp_path / "part.stl").write_bytes(data)
+    with pytest.raises(MeshError, match=message):
+        read_surface(tmp_path / "part.stl")
