@@ -16,8 +16,9 @@ _WAITING = {
     ".tec": ("tecplot", True),
     ".off": ("off", True),
     ".mdpa": ("mdpa", False),
-    ".ply": ("ply", False),
 }
+_PLY_TYPES = {b"char": b"int8", b"uchar": b"uint8", b"ushort": b"uint16", b"uint": b"uint32"}
+MAX_PLY_HEAD = 65536  # bytes
 MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
 
 
@@ -36,6 +37,9 @@ def meshio_mesh(path: Path) -> Any:
     elif ending == ".msh" and not _begins_as_gmsh(path):
         with _Ending(path.open("rb", buffering=0)) as file:
             return meshio.ansys.read(file)
+    elif ending == ".ply":
+        with _Ending(io.BytesIO(_with_known_head(path.read_bytes()))) as file:  # type: ignore[arg-type]
+            return meshio.read(file, "ply")
     elif ending in _WAITING:
         with _Ending(path.open("rb", buffering=0)) as file:
             kind, text = _WAITING[ending]
@@ -43,6 +47,20 @@ def meshio_mesh(path: Path) -> Any:
     elif is_hdf5(path):
         _check_hdf5(path, path)
     return meshio.read(path)
+
+
+def _with_known_head(data: bytes) -> bytes:
+    """A PLY file with the names of its head that meshio knows: of the corners of faces, and of types."""
+    head, mark, rest = data.partition(b"end_header")
+    if not mark or len(head) > MAX_PLY_HEAD:
+        return data
+    lines = [line.split() for line in head.splitlines()]
+    for line in lines:
+        if line[:1] == [b"property"]:
+            line[1:-1] = [_PLY_TYPES.get(word, word) for word in line[1:-1]]
+            if line[1:2] == [b"list"] and line[-1] == b"vertex_index":
+                line[-1] = b"vertex_indices"
+    return b"\n".join(b" ".join(line) for line in lines if line) + b"\n" + mark + rest
 
 
 def _check(path: Path, name: str) -> None:
