@@ -1,4 +1,4 @@
-"""A mesh from file: Gmsh's own format by gmsh, Abaqus, OBJ and STL by readers of their names, others by meshio."""
+"""A mesh from file: by gmsh (.msh), VTK (its formats, Exodus), readers of their names, and meshio for all else."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,22 +23,11 @@ from .meshio_reader import meshio_mesh
 from .obj import read_obj
 from .plain_files import wrong_with
 from .stl import read_stl
+from .tags import tag_sets
+from .vtk_readers import ENDINGS as VTK_ENDINGS
+from .vtk_readers import read_with_vtk
 
 OWN_READERS = {".obj": read_obj, ".stl": read_stl}  # in place of meshio's
-
-# Arrays by which formats mark groups of cells, the first that is there is used; 0 means "no group" in all of them.
-TAG_ARRAYS = (
-    "gmsh:physical",
-    "group",
-    "medit:ref",
-    "cell_tags",
-    "nastran:ref",
-    "netgen:index",
-    "su2:tag",
-    "tetgen:ref",
-)
-NOT_TAGS = ("gmsh:geometrical",)
-MOST_TAGS = 1000  # an integer array with more values than this numbers cells; it does not group them
 
 
 def read_mesh(path: str | Path) -> MeshData:
@@ -65,6 +55,8 @@ def read_contents(path: Path) -> Contents:
         raise MeshError(f"Mesh file '{path}' is empty.")
     if path.suffix.lower() == ".inp":
         return read_abaqus(path)
+    if path.suffix.lower() in VTK_ENDINGS:
+        return read_with_vtk(path)
     version = _gmsh_version(path)
     if version >= 4:
         return _read_with_gmsh(path)
@@ -149,7 +141,7 @@ def _read_with_meshio(path: Path) -> Contents:
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise MeshError(f"Mesh file '{path}' holds points of shape {points.shape}; (n, 2) or (n, 3) is needed.")
     blocks = [_block(block) for block in mesh.cells]
-    sets, notes = _tag_sets(mesh, blocks)
+    sets, _, notes = tag_sets(mesh.cell_data, blocks, partial(_names_of, mesh))
     named = _named_sets(mesh, blocks)
     nodes = {str(name): np.asarray(members, np.int64) for name, members in (mesh.point_sets or {}).items()}
     return Contents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
@@ -159,7 +151,7 @@ def _meshio_mesh(path: Path) -> Any:
     """meshio's mesh; its exits become errors and its printing is kept for their message."""
     import meshio
 
-    known = sorted(meshio.extension_to_filetypes)
+    known = sorted({*meshio.extension_to_filetypes, *VTK_ENDINGS})
     if not any(path.name.lower().endswith(extension) for extension in known):
         raise MeshError(f"Mesh file '{path}' is of no known kind; known endings: {', '.join(known)}.")
     said = io.StringIO()
@@ -197,36 +189,6 @@ def _named_sets(mesh: Any, blocks: list[Block]) -> dict[str, list[Indices]]:
         if len(members) == len(blocks) and not str(name).startswith("gmsh:"):
             sets[str(name)] = [np.asarray([] if part is None else part, np.int64) for part in members]
     return sets
-
-
-def _tag_sets(mesh: Any, blocks: list[Block]) -> tuple[dict[str, list[Indices]], tuple[str, ...]]:
-    """Sets from an array of integer tags on the cells, under their names where the file gives some."""
-    arrays = {key: values for key, values in mesh.cell_data.items() if _groups_cells(key, values)}
-    chosen = next((key for key in TAG_ARRAYS if key in arrays), next(iter(arrays), None))
-    if chosen is None:
-        return {}, ()
-    others = [key for key in arrays if key != chosen]
-    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(others)}.",) if others else ()
-    sets: dict[str, list[Indices]] = {}
-    for i, (block, tags) in enumerate(zip(blocks, arrays[chosen], strict=True)):
-        for tag in np.unique(tags):
-            if tag == 0 and (chosen in TAG_ARRAYS or block.dim < _top(blocks)):
-                continue
-            for name in _names_of(mesh, int(tag), block.dim):
-                sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])[i] = np.flatnonzero(tags == tag)
-    return sets, notes
-
-
-def _groups_cells(key: str, values: list[Any]) -> bool:
-    """Whether an array on the cells holds tags: integers, one a cell, of few values."""
-    parts = [np.asarray(part) for part in values]
-    if key in NOT_TAGS or any(part.ndim != 1 or part.dtype.kind not in "iu" for part in parts):
-        return False
-    return not parts or len(np.unique(np.concatenate(parts))) <= MOST_TAGS
-
-
-def _top(blocks: list[Block]) -> int:
-    return max((block.dim for block in blocks if len(block.nodes)), default=0)
 
 
 def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:

@@ -1,10 +1,11 @@
-"""Work with a time limit, in a process of its own: what runs inside gmsh's library nothing else can interrupt."""
+"""Work with a time limit, in a process of its own: what runs inside gmsh's or VTK's library nothing else can stop."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import pickle
+import resource
 import signal
 import subprocess
 import sys
@@ -17,22 +18,33 @@ from .data import MeshError
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
 
-def within[T](seconds: float, work: Callable[..., T], *arguments: Any) -> T:
+class Died(MeshError):
+    """A process that ended before its work was done."""
+
+    def __init__(self, how: str, said: str = "") -> None:
+        """`how`: "signal 11" or "exit code 1"; `said`: the end of what it printed."""
+        super().__init__(f"gmsh died ({how}{': ' if said else ''}{said}); is there enough memory? Try a larger h.")
+        self.how = how
+
+
+def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: int | None = None) -> T:
     """work(*arguments), a function of a module, done by another Python process; its exceptions are raised here.
+
+    `memory`: bytes that the process may address; None: any number.
 
     Raises:
         TimeoutError: it was not done after `seconds`.
-        MeshError: the process died of something else, such as a fault within gmsh or want of memory.
+        Died: the process died of something else, such as a fault within a library or want of memory.
     """
     command = [sys.executable, "-P", "-m", __name__]  # -P: not a folder of the same name that lies here
-    task = pickle.dumps((max(1, ceil(seconds)), os.getpid(), work, arguments))
+    task = pickle.dumps((max(1, ceil(seconds)), memory, os.getpid(), work, arguments))
     done = subprocess.run(command, input=task, capture_output=True, check=False)
     if done.returncode == -signal.SIGALRM:
         raise TimeoutError
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip()[-300:]
         how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
-        raise MeshError(f"gmsh died ({how}{': ' if said else ''}{said}); is there enough memory? Try a larger h.")
+        raise Died(how, said)
     result, failure = pickle.loads(done.stdout)
     if failure is not None:
         raise failure
@@ -43,8 +55,11 @@ def _serve() -> None:
     """Do the task on standard input. The kernel's alarm ends this process, also in the middle of compiled code."""
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever is printed meanwhile is no part of the answer
-    seconds, parent, work, arguments = pickle.load(sys.stdin.buffer)
+    seconds, memory, parent, work, arguments = pickle.load(sys.stdin.buffer)
     signal.alarm(seconds)
+    if memory is not None:
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody waits for the answer any more
     if os.getppid() != parent:
         return
