@@ -452,7 +452,8 @@ def _join_pieces(path: Path, grid: _Grid, notes: list[str]) -> None:
             "of the others are the same; merge the pieces in the program that wrote it, or write GlobalPointIds",
         )
     if joined := len(number) - len(first):
-        grid.connectivity = first[number][grid.connectivity]
+        grid.points, grid.connectivity = grid.points[first], number[grid.connectivity].astype(np.int64)
+        grid.point_data = {name: values[first] for name, values in grid.point_data.items()}
         notes.append(
             f"{joined} nodes that {len(grid.pieces)} pieces have in common were joined, by their "
             f"{'places' if ids is None else 'global numbers'}."

@@ -52,14 +52,15 @@ def test_exodus_is_as_netcdf_has_it(name: str) -> None:
     raw, mesh = by_hand(HERE / name), read_mesh(HERE / name)
     cells = np.concatenate([raw["connect1"], raw["connect2"]]) - 1
     points = np.stack([raw[f"coord{axis}"] for axis in "xyz"], axis=1)
-    np.testing.assert_array_equal(mesh.points, points)
-    np.testing.assert_array_equal(mesh.cells, cells[:, :4])
-    assert len(mesh.cells) == 760 and abs(volumes(points, mesh.cells).sum() / VOLUME - 1) < 1e-9
+    np.testing.assert_array_equal(mesh.points[mesh.cells], points[cells[:, :4]])
+    assert len(mesh.cells) == 760 and abs(volumes(mesh.points, mesh.cells).sum() / VOLUME - 1) < 1e-9
     assert list(mesh.regions) == names(raw["eb_names"]) == ["steel", "epoxy"]
     np.testing.assert_array_equal(mesh.regions["epoxy"], np.arange(len(raw["connect1"]), 760))
     for i, side in enumerate(names(raw["ss_names"]), start=1):
         facets = cells[raw[f"elem_ss{i}"][:, None] - 1, SIDES[raw[f"side_ss{i}"] - 1]]
-        np.testing.assert_array_equal(sorted_rows(mesh.facet_groups[side]), sorted_rows(facets))
+        places = mesh.points[np.unique(mesh.facet_groups[side])]
+        assert len(mesh.facet_groups[side]) == len(facets)
+        np.testing.assert_array_equal(np.sort(places, axis=0), np.sort(points[np.unique(facets)], axis=0))
     nodes = read_contents(HERE / name).point_sets
     for i, key in enumerate(names(raw["ns_names"]), start=1):
         np.testing.assert_array_equal(nodes[key], np.sort(raw[f"node_ns{i}"]) - 1)
