@@ -43,10 +43,15 @@ def begin_process() -> None:
     runs = sys.argv[1:2] == ["run"]
     _open_streams(None if runs else _READER_GONE)
     if runs:
-        for number in STOP_SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # ignored: by nohup
-                signal.signal(number, _end_before_the_run)
+        _heed_signals()
     _check_surroundings()
+
+
+def _heed_signals() -> None:
+    """Until the run takes over, of a process that runs."""
+    for number in STOP_SIGNALS if sys.argv[1:2] == ["run"] else ():
+        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored: by nohup
+            signal.signal(number, _end_before_the_run)
 
 
 _PARENT = os.getppid()
@@ -227,10 +232,14 @@ def import_dolfinx() -> None:
         return
     name = "dolfinx.utils"
     with outside_working_folder(), kept_out(name, ModuleType(name)):
+        if _own:  # PETSc's handlers would end what SIGHUP and SIGQUIT meet from here on by MPI_Abort
+            importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
         dolfinx = importlib.import_module("dolfinx")
         _check_dolfinx(str(dolfinx.__version__))
         _read_settings("dolfinx", "jit")
         _read_settings("ffcx", "options")
+    if _own:
+        _heed_signals()  # UCX, of Open MPI, has taken SIGHUP
     del dolfinx.utils
 
 

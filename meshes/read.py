@@ -24,6 +24,7 @@ from .obj import read_obj
 from .plain_files import wrong_with
 from .stl import read_stl
 from .tags import tag_sets
+from .timed import Died, within
 from .vtk_readers import ENDINGS as VTK_ENDINGS
 from .vtk_readers import read_with_vtk
 
@@ -92,16 +93,31 @@ GMSH_SHAPES = {"Point": "vertex", "Line": "line", "Triangle": "triangle", "Tetra
 GMSH_SHAPES |= {"Quadrilateral": "quad", "Hexahedron": "hexahedron", "Prism": "wedge", "Pyramid": "pyramid"}
 
 
+SLOW = 1e6  # bytes a second that gmsh reads at least
+
+
 def _read_with_gmsh(path: Path) -> Contents:
+    """By a process of its own: damaged files have been seen to end gmsh by SIGABRT."""
     try:
-        # by a name of its own: of part.msh.opt beside part.msh gmsh would run the commands
-        with TemporaryDirectory() as folder, session() as gmsh:
-            linked = Path(folder) / "mesh.msh"
-            linked.symlink_to(path.resolve())
-            gmsh.merge(str(linked))
-            return _contents_of_model(gmsh)
+        return within(60 + path.stat().st_size / SLOW, _contents_by_gmsh, path)
+    except Died as died:
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: gmsh died ({died.how}); the file is damaged, or there is not "
+            "enough memory."
+        ) from None
     except MeshError as error:
         raise MeshError(f"Mesh file '{path}' could not be read: {error}") from error
+    except TimeoutError:
+        raise MeshError(f"Mesh file '{path}' could not be read: gmsh did not end; the file is damaged.") from None
+
+
+def _contents_by_gmsh(path: Path) -> Contents:
+    # by a name of its own: of part.msh.opt beside part.msh gmsh would run the commands
+    with TemporaryDirectory() as folder, session() as gmsh:
+        linked = Path(folder) / "mesh.msh"
+        linked.symlink_to(path.resolve())
+        gmsh.merge(str(linked))
+        return _contents_of_model(gmsh)
 
 
 def _contents_of_model(gmsh: Any) -> Contents:

@@ -138,6 +138,23 @@ os.kill(os.getpid(), {int(number)})
     assert "Process received signal" not in done.stderr and "PETSC ERROR" not in done.stderr
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGTERM])
+def test_a_signal_between_imports_and_the_run_is_heeded(number: signal.Signals) -> None:
+    """PETSc, which begins with DOLFINx, takes over two of them, and would end the process by MPI_Abort."""
+    code = f"""
+import os, sys, time
+sys.argv = ["fracsim", "run"]
+from fracsim import process
+process.begin_process()
+process.import_dolfinx()
+os.kill(os.getpid(), {int(number)})
+time.sleep(5)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == Exit.STOPPED, done.stderr
+    assert done.stderr == f"fracsim: stopped by signal {number.name} before the first step; nothing was written\n"
+
+
 # --- another DOLFINx ------------------------------------------------------------------------------------------------
 
 
