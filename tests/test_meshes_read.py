@@ -12,6 +12,7 @@ import pytest
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.read import read_mesh
+from fracsim.meshes.scattered.drawn import fill_outline, read_outline
 
 
 def sample(dim: int) -> MeshData:
@@ -294,3 +295,10 @@ def test_a_file_that_ends_gmsh_is_a_message(tmp_path: Path) -> None:
     )
     with pytest.raises(MeshError, match=r"part.msh' could not be read: gmsh died .signal \d+.*the file is damaged"):
         read_mesh(tmp_path / "part.msh")
+
+
+def test_a_long_outline_is_too_many_cells(tmp_path: Path) -> None:
+    """A sliver of no area, whose sides have a hundred billion parts: a message before there is memory for them."""
+    (tmp_path / "long.csv").write_text("0, 0\n1e10, 0\n1e10, 1e-9\n")
+    with pytest.raises(MeshError, match=r"would make about 2\.0e\+11 cells"):
+        fill_outline(read_outline(tmp_path / "long.csv"), 0.1)

@@ -50,8 +50,9 @@ class Drawn:
         return [int(count) for count in np.diff([0, *last, len(self.start)])]
 
     def cells_estimate(self, h: float) -> int:
-        """About how many triangles of size h [m] fill it."""
-        return max(1, round(CELLS * abs(self.area) / h**2))
+        """About how many triangles of size h [m] fill it: one at each part of a side at least."""
+        parts = np.linalg.norm(self.end - self.start, axis=1).sum() / h
+        return max(1, round(CELLS * abs(self.area) / h**2), round(parts))
 
 
 def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
