@@ -277,6 +277,8 @@ class _Assembled:
 
     def _named_surface(self, placed: _Placed, entry: SetEntry) -> tuple[_Placed, str, SetEntry]:
         target, meant = self._target(placed, entry, "surfaces")
+        if not meant.name:
+            entry.block.refuse(f"'{entry.name[:80]}' is a number; COMBINE=UNION needs names of surfaces.")
         return target, meant.name, meant
 
     def _faces(self, cells: Indices, entry: SetEntry) -> Iterator[Indices]:

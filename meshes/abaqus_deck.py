@@ -288,8 +288,8 @@ def _keyword_words(source: SourceText, star: int) -> tuple[str, int]:
     """The keyword line without its star, continued where it ends with a comma, and where its data begin."""
     text = source.text
     end = _line_end(text, star)
-    line = text[star + 1 : end].strip()
-    while line.endswith(b",") and end < len(text):
+    lines = [text[star + 1 : end].strip()]
+    while lines[-1].endswith(b",") and end < len(text):
         after = _line_end(text, end)
         continued = text[end:after].strip()
         if continued.startswith(b"**"):
@@ -302,9 +302,9 @@ def _keyword_words(source: SourceText, star: int) -> tuple[str, int]:
                 f"the keyword line before ends with a comma, and so goes on here with '{decoded(continued)[:40]}', "
                 "which is no parameter. Take the comma away."
             ))  # fmt: skip
-        line += continued
+        lines.append(continued)
         end = after
-    return decoded(line), end
+    return decoded(b"".join(lines)), end
 
 
 def _block(words: str, source: SourceText, offset: int) -> KeywordBlock:

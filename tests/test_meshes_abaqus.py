@@ -317,6 +317,7 @@ REFUSED = {
     "no such face": (CUBE + "*SURFACE, NAME=s\n1, S5\n", 17, "a tetra has no face 'S5'"),
     "range": (CUBE + "*NSET, NSET=a, GENERATE\n5, 1, 1\n", 18, "GENERATE needs first, last and step"),
     "empty range": (CUBE + "*NSET, NSET=a, GENERATE\n", 17, "The data are missing"),
+    "union": (TWO.format(place="", sets="*Surface, name=s, combine=union\nBlock-1.5\n"), 26, "is a number; COMBINE"),
     "data first": ("1, 2, 3\n" + CUBE, 1, "stands before the first keyword"),
     "binary": (CUBE.replace("4, 0.", "4, \0"), 5, "the file is not text"),
     "comma": (CUBE + "*NSET, NSET=a,\n1, 2, 3\n", 18, "Take the comma away"),
