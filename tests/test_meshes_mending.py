@@ -109,3 +109,24 @@ def test_what_would_change_the_shape_is_refused() -> None:
     sheet = np.concatenate([soup(), soup()[:1] + np.array([0, 0, 0.5])])
     with pytest.raises(MeshError, match="is open: 3 edges"):
         closed_surface(*surface_of(sheet), "S")
+
+
+@pytest.mark.parametrize("start", range(12))
+def test_concave_polygons_of_an_obj(tmp_path: Path, start: int) -> None:
+    """A prism below a star of twelve corners, whose faces begin at any corner; two objects in one file."""
+    angles = np.arange(12) * np.pi / 6
+    radii = np.where(np.arange(12) % 2, 0.3, 1.0)
+    star = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+    area = 12 * 0.5 * 1.0 * 0.3 * np.sin(np.pi / 6)
+    lines = []
+    for name, away in (("one", 0.0), ("two", 5.0)):
+        lines += [f"o {name}"] + [f"v {x + away} {y} {z}" for z in (0, 2) for x, y in star]
+        around = [(start + i) % 12 for i in range(12)]
+        faces = [around[::-1], [12 + i for i in around]]
+        faces += [[i, (i + 1) % 12, 12 + (i + 1) % 12, 12 + i] for i in range(12)]
+        lines += ["f " + " ".join(str(i - 24) for i in face) for face in faces]
+    (tmp_path / "star.obj").write_text("\n".join(lines) + "\n")
+    surface = read_surface(tmp_path / "star.obj")
+    assert len(surface.bodies) == 2
+    assert surface.volume == pytest.approx(2 * 2 * area, rel=1e-12)
+    assert surface.area == pytest.approx(2 * (2 * area + 12 * 2 * np.linalg.norm(star[1] - star[0])), rel=1e-12)

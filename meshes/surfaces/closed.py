@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cell_cutting import triangles_of
 from ..components import components
 from ..contents import Block
 from ..data import Indices, MeshError, Points
@@ -17,6 +16,7 @@ from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
 from .enclosed import enclosed_volumes, windings
 from .mending import areas, directed_edges, flat_triangles, joined, mended
+from .polygons import triangles_of_faces
 
 PROBES = 300  # points of a part that are looked up in another part
 
@@ -91,7 +91,9 @@ def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indic
 def _read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
     """As they are in a file; `scale`: metres per unit of it."""
     contents = read_contents(path)
-    triangles = np.concatenate([np.zeros((0, 3), np.int64), *map(_triangles, contents.blocks)])
+    triangles = np.concatenate(
+        [np.zeros((0, 3), np.int64), *(_triangles(contents.points, block) for block in contents.blocks)]
+    )
     if len(triangles) == 0 or contents.points.shape[1] != 3:
         raise MeshError(f"{source} holds no triangles in space.")
     return scale * contents.points, triangles
@@ -104,15 +106,19 @@ def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSu
     return closed_surface(np.concatenate([points for points, _ in shells]), np.concatenate(triangles), source)
 
 
-def _triangles(block: Block) -> Indices:
-    """The triangles of a block, quads cut in two."""
+def _triangles(points: Points, block: Block) -> Indices:
+    """The triangles of a block, quads and polygons cut into them."""
     if block.shape == "triangle":
         return block.corners
-    if block.shape == "quad":
-        return triangles_of(block.corners)[0]
-    if block.dim == 2 and len(block.nodes):
-        raise MeshError(f"The surface has {len(block.nodes)} faces of kind {block.kind}; cut them into triangles.")
-    return np.zeros((0, 3), np.int64)
+    faces = block.corners if block.shape == "quad" else block.nodes
+    if block.dim != 2 or len(faces) == 0:
+        return np.zeros((0, 3), np.int64)
+    if faces.shape[1] < 4 or faces.min() < 0 or faces.max() >= len(points) or points.shape[1] != 3:
+        raise MeshError(
+            f"The surface has {len(faces)} faces of kind {block.kind} with fewer than three corners, or with corners "
+            "that do not exist; export it again, as triangles."
+        )
+    return triangles_of_faces(points, faces)
 
 
 def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSurface:
