@@ -181,14 +181,18 @@ def _vtk_grid(path: Path) -> _Grid:
 def _declared_legacy(data: Any) -> tuple[list[int], int | None]:
     """Numbers of points and of cells that a legacy file declares; none where its grid has no list of cells."""
     version = re.match(rb"# vtk DataFile Version (\d+)", data)
-    points = re.search(rb"^POINTS[ \t]+(\d+)", data, re.MULTILINE | re.IGNORECASE)
-    polygons = re.search(rb"^DATASET[ \t]+POLYDATA", data, re.MULTILINE | re.IGNORECASE)
+    flags = re.MULTILINE | re.IGNORECASE  # each search ends where it finds its word: files are large
+    kind = re.search(rb"^DATASET[ \t]+(\w+)", data, flags)
+    points = re.search(rb"^POINTS[ \t]+(\d+)", data, flags)
+    polygons = kind is not None and kind[1].upper() == b"POLYDATA"
     words = rb"VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS" if polygons else rb"CELLS"
     counts: dict[bytes, int] = {}
-    for word in re.finditer(rb"^(" + words + rb"|CELL_DATA|POINT_DATA)[ \t]+(\d+)", data, re.MULTILINE | re.IGNORECASE):
+    for word in re.finditer(rb"^(" + words + rb"|CELL_DATA|POINT_DATA)[ \t]+(\d+)", data, flags):
         if word[1].upper().endswith(b"_DATA") or word[1].upper() in counts:
             break
         counts[word[1].upper()] = int(word[2])
+        if not polygons:
+            break
     offsets = version is not None and int(version[1]) >= 5  # declares offsets, one more than cells
     cells = sum(max(count - offsets, 0) for count in counts.values()) if counts else None
     return ([int(points[1])] if points else []), cells
