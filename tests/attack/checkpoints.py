@@ -29,16 +29,21 @@ _STOPPED: dict[str, Path] = {}
 
 def prepare(folder: Path) -> None:
     """Runs that were stopped on their way, after edges broke where they do."""
-    for name, data in RUNS.items():
-        place = folder / "stopped" / name
-        place.mkdir(parents=True, exist_ok=True)
-        study = write(place / "study.toml", data)
-        _STOPPED[name] = place
-        for limit in (0.3, 0.6, 1.0, 1.5, 2.5, 4.0):
-            if (place / "out" / STATE).exists() and len(history(place / "out")["step"]) > 1:
-                break
-            call("run", study, "-o", place / "out", "--overwrite", "--wall-limit", limit)
-        expect((place / "out" / STATE).exists(), f"{name} could not be stopped on its way")
+    for name in RUNS:
+        _STOPPED[name] = stopped(name, folder)
+
+
+def stopped(name: str, folder: Path) -> Path:
+    """The folder of a run that was stopped on its way, whatever the speed of the machine."""
+    place = folder / "stopped" / name
+    place.mkdir(parents=True, exist_ok=True)
+    study = write(place / "study.toml", RUNS[name])
+    for limit in (0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0):
+        if (place / "out" / STATE).exists() and len(history(place / "out")["step"]) > 1:
+            return place
+        call("run", study, "-o", place / "out", "--overwrite", "--wall-limit", limit)
+    expect((place / "out" / STATE).exists(), f"{name} could not be stopped on its way")
+    return place
 
 
 def attack(number: int, chance: random.Random, place: Path) -> str:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from fracsim.errors import Exit
 
-from .corpus import RUNS, contents, write
+from .checkpoints import stopped
+from .corpus import contents
 from .trial import call, expect
 
 NAMES = ("study.toml", "history.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json",
@@ -20,12 +21,7 @@ _STOPPED: dict[str, Path] = {}
 def prepare(folder: Path) -> None:
     """A run that was stopped, to go on from, of two kinds."""
     for name in ("strip", "rigid"):
-        place = folder / "stopped" / name
-        place.mkdir(parents=True, exist_ok=True)
-        study = write(place / "study.toml", RUNS[name])
-        if not (place / "out" / "checkpoint").exists():
-            call("run", study, "-o", place / "out", "--wall-limit", 0.5).expect(Exit.STOPPED)
-        _STOPPED[name] = place
+        _STOPPED[name] = stopped(name, folder)
 
 
 def attack(number: int, chance: random.Random, place: Path) -> str:
