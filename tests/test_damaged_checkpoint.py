@@ -106,7 +106,8 @@ def test_what_is_no_file_is_not_opened(stopped: Path, tmp_path: Path, kind: str)
         path.unlink()
         os.mkfifo(path) if kind == "fifo" else path.mkdir()
 
-    assert "there is no checkpoint" in refused(stopped, tmp_path, damage)
+    said = "is a named pipe, not a file" if kind == "fifo" else "is a folder, not a file"
+    assert said in refused(stopped, tmp_path, damage)
 
 
 # --- of rigid bodies --------------------------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ def _shells() -> list[Trial]:
 
 def _strengths() -> list[Trial]:
     found = []
-    for strength in (0.0, 1e-300, 1e-3, 1e3, 1e30, float("inf")):
+    for strength in (0.0, 1e-45, 1e-3, 1e3, 1e30, float("inf")):
         study = x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=strength)
         found.append(_trial("strength", f"{strength:g}-Pa", study))
     return [*found, _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan")))]
