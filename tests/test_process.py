@@ -142,7 +142,8 @@ os.kill(os.getpid(), {int(number)})
 def test_a_signal_between_imports_and_the_run_is_heeded(number: signal.Signals) -> None:
     """PETSc, which begins with DOLFINx, takes over two of them, and would end the process by MPI_Abort."""
     code = f"""
-import os, sys, time
+import os, signal, sys, time
+signal.signal({int(number)}, signal.SIG_DFL)  # a shell may have had it ignored, in the background
 sys.argv = ["fracsim", "run"]
 from fracsim import process
 process.begin_process()

@@ -341,7 +341,7 @@ class OtherRank:
         return [mine, [opened_by(self.other, each) for each in self._strikes[1::2]]]
 
 
-def test_strikes_on_several_ranks_open_what_they_open_on_one() -> None:
+def test_strikes_on_several_ranks_open_what_they_open_on_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three bars bent one after the other and at once, with surfaces for two of them: the same edges, cuts, starts, and
     numbers of analyses; what one rank opens the other knows when it is asked again."""
     mesh = copies(lattice(6, 2, 2, size=0.25), 3)
@@ -349,6 +349,7 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one() -> None:
     alone, first, second = (Copies.of(breakable(mesh, 2e4, SurfaceRules(5))) for _ in range(3))
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     comm = OtherRank(second)
+    monkeypatch.setattr("fracsim.rigid.analyses.gather", lambda comm, value: comm.gather(value))
     serial, spread = Analyses(alone), Analyses(first, comm, "begin")  # type: ignore[arg-type]
     for size in (1e4, 3e4):
         force = size * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])

@@ -158,6 +158,7 @@ def test_any_solver_options_are_forgotten() -> None:
     """PETSc's database is as it was once a scene is destroyed."""
     from petsc4py import PETSc
 
+    gc.collect()  # scenes of other tests take their options along
     before = dict(PETSc.Options().getAll())
     scene, state = make_scene(solver=DIRECT)
     march(scene, state, 1)
