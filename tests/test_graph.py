@@ -163,6 +163,7 @@ def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
     assert pieces.count == 2 and np.array_equal(pieces.of_node, find_pieces(graph).of_node)
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (1, 2, 3))
 @pytest.mark.parametrize("case", ("2d", "3d", "quadratic"))
 def test_pieces_are_those_of_scipy(on_ranks: OnRanks, case: str, ranks: int) -> None:
