@@ -18,6 +18,7 @@ from .output.checkpoint_file import (
     Stored,
     check_mesh,
     checkpoint_path,
+    last_checkpoint,
     read_stored,
     refusal,
     require,
@@ -184,7 +185,8 @@ class RigidRun:
         """Write a checkpoint on the way out, and say where; none where a step `failed`: a blow in it would be lost."""
         if not failed:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
-        return f"No checkpoint was written: a blow in the step that failed would be lost. {self._last_saved()}"
+        last = last_checkpoint(self.folder, self._saved_at)
+        return f"No checkpoint was written: a blow in the step that failed would be lost. {last}"
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
@@ -195,14 +197,7 @@ class RigidRun:
                 return self._saved(failed=False)
         except CannotWrite:
             pass
-        return self._last_saved()
-
-    def _last_saved(self) -> str:
-        """Where the last good checkpoint is."""
-        if self._saved_at is None:
-            return "There is no checkpoint"
-        path = checkpoint_path(self.folder)
-        return f"The last good checkpoint: {path} at t = {self._saved_at:g} s; go on with --restart"
+        return last_checkpoint(self.folder, self._saved_at)
 
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint

@@ -17,7 +17,7 @@ from .errors import CannotWrite, NotConverged, Stopped, one_line
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
 from .output.checkpoint import read_checkpoint, write_checkpoint
-from .output.checkpoint_file import Notes, checkpoint_path, read_notes
+from .output.checkpoint_file import Notes, last_checkpoint, read_notes
 from .output.folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
@@ -293,7 +293,7 @@ class Run:
         try:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
         except NotConverged as error:
-            return f"No checkpoint was written: {error}. {self._last_saved()}"
+            return f"No checkpoint was written: {error}. {last_checkpoint(self.folder, self._saved_at)}"
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
@@ -304,14 +304,7 @@ class Run:
                 return self._saved()
         except CannotWrite:
             pass
-        return self._last_saved()
-
-    def _last_saved(self) -> str:
-        """Where the last good checkpoint is."""
-        if self._saved_at is None:
-            return "There is no checkpoint"
-        path = checkpoint_path(self.folder)
-        return f"The last good checkpoint: {path} at t = {self._saved_at:g} s; go on with --restart"
+        return last_checkpoint(self.folder, self._saved_at)
 
 
 def wanted_fields(study: Study) -> list[str]:

@@ -64,6 +64,13 @@ def checkpoint_path(folder: Path) -> Path:
     return folder / CHECKPOINT
 
 
+def last_checkpoint(folder: Path, t: float | None) -> str:
+    """A sentence that names the last good checkpoint of a run, of the time t, s; None: it has written none."""
+    if t is None:
+        return "There is no checkpoint"
+    return f"The last good checkpoint: {checkpoint_path(folder)} at t = {t:g} s; go on with --restart"
+
+
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
