@@ -142,17 +142,21 @@ class _Assembled:
         ]
         if not deck.instances and deck.parts:
             found = [(part.name, key, [part], None) for key, part in deck.parts.items()]
+            self.notes.append(
+                "The file has *PART and no *ASSEMBLY: if it was cut off, bodies are missing. Its parts are read where "
+                "they lie."
+            )
         elif left := [part.name for key, part in deck.parts.items() if key not in {f[1] for f in found}]:
             self.notes.append(f"Parts without an instance are left out: {some_of(left)}.")
         for name, part, components, block in [*found, ("", "", [deck.assembly], None)]:
             own = components[-1]
             if own.nodes or own.elements or own.unused or not name:
                 mesh = LocalMesh(components)
-                mesh.check_nodes_used()
+                mesh.check_nodes_used(deck.last)
             else:
                 if part not in meshes:
                     meshes[part] = LocalMesh(components[:1])
-                    meshes[part].check_nodes_used()
+                    meshes[part].check_nodes_used(deck.last)
                 mesh = meshes[part]
             self.points.append(moved(mesh.points, block) if block else mesh.points)
             placed = _Placed(name, part, components, mesh, start)
@@ -391,6 +395,11 @@ class _Assembled:
             blocks.append(Block("vertex", np.unique(np.concatenate(others))[:, None]))
         sets = {name: [*parts, *[NO_INDICES] * (len(blocks) - len(parts))] for name, parts in sets.items()}
         for mesh in dict.fromkeys(placed.mesh for placed in self.placed):
+            if mesh.ends_with(self.deck.last) and (unused := mesh.unused_nodes()):
+                self.notes.append(
+                    f"The file ends with elements, and {unused} nodes belong to none of them: if it was cut off, cells "
+                    "are missing. Compare the number of elements with that of the program that wrote it."
+                )
             missing, first = mesh.missing_numbers()
             if missing:
                 where = f" of part '{mesh.components[0].name}'" if mesh.components[0].name else ""
@@ -400,7 +409,7 @@ class _Assembled:
         if self._lost:
             total = sum(self._lost.values())
             self.notes.append(
-                f"Sets name {total} nodes or elements that are not in the file: {some_of([*self._lost])}."
+                f"Sets name {total} nodes or elements that are not in the file: {some_of([*self._lost])}. Is it whole?"
             )
         return Contents(np.concatenate(self.points), blocks, sets, points, notes=tuple(self.notes))
 

@@ -22,28 +22,13 @@ import numpy.typing as npt
 
 from .data import Indices, MeshError
 from .plain_files import wrong_beside
+from .text_rows import SourceText, decoded
 
 MAX_INCLUDES = 1000  # files that a deck includes, however deep
 _BLANKS = b" \t"
 _SEPARATORS_TO_BLANKS = bytes.maketrans(b",\n\t", b"   ")
 _FIELD = re.compile(r'(?:"[^"]*"?|[^",])*')  # up to a comma outside quotes
 _FORTRAN_EXPONENT = re.compile(r"(?<=[0-9.])[dD](?=[-+0-9])")
-
-
-@dataclass(frozen=True, eq=False)
-class SourceText:
-    """The bytes of a file, its lines ended by a line feed."""
-
-    path: Path
-    text: bytes
-
-    def line(self, offset: int) -> int:
-        """Number of the line, from 1, at an offset."""
-        return self.text.count(b"\n", 0, offset) + 1
-
-    def refuse(self, offset: int, message: str) -> NoReturn:
-        """Raises MeshError with file and line."""
-        raise MeshError(f"Mesh file '{self.path}', line {self.line(offset)}: {message}")
 
 
 @dataclass(eq=False)
@@ -85,6 +70,10 @@ class KeywordBlock:
         for *_, line in self._lines():
             fields = [unquoted(part) for part in split_fields(decoded(line))]
             yield fields[:-1] if len(fields) > 1 and not fields[-1] else fields
+
+    def is_open(self) -> bool:
+        """Whether the last data line is the last of a file and has no line end."""
+        return any(end == len(source.text) and not source.text.endswith(b"\n") for source, _, end in self.pieces)
 
     def check_ended(self) -> None:
         """MeshError where the last data line is the last of a file and has no line end: it may be cut short."""
@@ -150,14 +139,6 @@ def _numbers_at_once(text: bytes, kind: type[Any]) -> tuple[npt.NDArray[Any], In
     open_ended = separators[line_ends - 1]
     ends = (commas + np.arange(1, len(line_ends) + 1) - np.cumsum(open_ended)).astype(np.int64)
     return (values, ends) if ends[-1] == len(values) else None
-
-
-def decoded(text: bytes) -> str:
-    """Text in UTF-8, or else in Windows' Latin alphabet."""
-    try:
-        return text.decode()
-    except UnicodeDecodeError:
-        return text.decode("cp1252", errors="replace")
 
 
 def split_fields(line: str) -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 from .abaqus_deck import KeywordBlock, keyword_blocks, number
 from .abaqus_elements import SUPPORTED, kind_of
 from .data import Indices, Points
+from .text_rows import SourceText
 
 SHOWN = 5  # names in a message
 # Keywords that make nodes or elements in ways that are not supported: without these a body would be smaller.
@@ -95,7 +96,8 @@ class Deck:
             "ENDINSTANCE": self._end,
             "ENDASSEMBLY": self._end,
         }
-        for block in keyword_blocks(path):
+        blocks = keyword_blocks(path)
+        for block in blocks:
             if block.keyword in readers:
                 readers[block.keyword](block)
             elif block.keyword in GENERATORS and block.pieces:
@@ -105,6 +107,11 @@ class Deck:
                 )
             elif len(block.keyword) > 2 and any(word.startswith(block.keyword) for word in KEYWORDS):
                 block.refuse(f"the keyword *{block.keyword} is cut short; write it in full, as *NODE or *ELEMENT.")
+        self.last = blocks[-1] if blocks else KeywordBlock("", {}, SourceText(path, b""), 0)
+        if self.last.keyword in ("NSET", "ELSET", "SURFACE") and self.last.is_open():
+            self.notes.append(
+                f"The file ends within a line of *{self.last.keyword}, without a line break; is the set whole?"
+            )
         if self._open:
             block = self._open[-1][0]
             block.refuse(

@@ -11,6 +11,7 @@ from .data import Indices, Points
 MAX_GAPS = 3  # element numbers left out that are told of,
 MAX_GAP_SHARE = 0.01  # or so many of all elements
 MAX_UNUSED_SHARE = 0.1  # of the nodes of a part that no element may name
+MAX_CUT_SHARE = 0.01  # the same, where the file ends with the elements
 MAX_UNUSED_NODES = 3  # and so many in any case: reference points
 
 
@@ -103,16 +104,29 @@ class LocalMesh:
         there[used - first] = True
         return int((~there).sum()), first + int((~there).argmax())
 
-    def check_nodes_used(self) -> None:
-        """MeshError where over a tenth of the nodes belong to no element."""
+    def unused_nodes(self) -> int:
+        """The number of nodes that no element has."""
         others = [ids for component in self.components for ids in component.unused_nodes]
         used = self.used | np.isin(self.node_ids, np.concatenate(others)) if others else self.used
-        lost = int((~used).sum())
-        if self.cells and lost > max(MAX_UNUSED_NODES, MAX_UNUSED_SHARE * len(used)):
+        return int((~used).sum())
+
+    def ends_with(self, last: KeywordBlock) -> bool:
+        """Whether the last keyword of the file is one of its *ELEMENT: nothing tells that the list is whole."""
+        return any(item.block is last for component in self.components for item in component.elements)
+
+    def check_nodes_used(self, last: KeywordBlock) -> None:
+        """MeshError where over a tenth of the nodes belong to no element; or 1 %, where the file ends with elements.
+
+        `last`: the last keyword of the file.
+        """
+        share = MAX_CUT_SHARE if self.ends_with(last) else MAX_UNUSED_SHARE
+        lost = self.unused_nodes()
+        if self.cells and lost > max(MAX_UNUSED_NODES, share * len(self.used)):
             block = next(component for component in self.components if component.elements).elements[-1].block
+            where = ", with which the file ends," if self.ends_with(last) else ""
             block.refuse(
-                f"{lost} of {len(used)} nodes belong to no element; *ELEMENT seems to be cut short. Export the file "
-                "again, or delete the nodes that are not needed."
+                f"{lost} of {len(self.used)} nodes belong to no element; *ELEMENT{where} seems to be cut short. Export "
+                "the file again, or delete the nodes that are not needed."
             )
 
 

@@ -21,6 +21,7 @@ LAGRANGE = {
     "VTK_LAGRANGE_PYRAMID": "pyramid",
 }
 DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "polygon": 2}  # every other kind is a solid
+MAX_NAMES = 8  # in a note
 MAX_LOST_SHARE = 0.1  # of a file's nodes that may be in no cell
 MAX_LOST_NODES = 3  # that may be in no cell of a small file: reference points, centres of arcs
 
@@ -110,7 +111,8 @@ class Contents:
         if self.copies:
             cells, regions = _each_once(cells, regions)
         groups = cut._node_groups(cells, len(points)) | cut._facet_sets(below)
-        mesh = MeshData(points, cells, groups, regions, self.notes + notes + self._order_note(dim) + cut_notes)
+        notes = self.notes + notes + self._order_note(dim) + cut_notes + self._unused_note({*groups, *regions}, dim)
+        mesh = MeshData(points, cells, groups, regions, notes)
         return _without(mesh, self._middle_nodes())
 
     def _census(self, dims: range) -> str:
@@ -195,6 +197,15 @@ class Contents:
         if not curved:
             return ()
         return (f"{curved} cells are of second or higher order; only their corner nodes are kept (straight edges).",)
+
+    def _unused_note(self, used: set[str], dim: int) -> tuple[str, ...]:
+        """Sets that are neither regions nor groups."""
+        names = list(dict.fromkeys(name for name in (*self.sets, *self.point_sets) if name not in used))
+        if not names:
+            return ()
+        facets = "edges" if dim == 2 else "triangles"
+        listed = ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if names[MAX_NAMES:] else "")
+        return (f"Sets not used, for they hold neither cells nor all nodes of {facets} of the boundary: {listed}.",)
 
     def _facet_sets(self, blocks: list[int]) -> dict[str, Indices]:
         groups = {}

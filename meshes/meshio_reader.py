@@ -1,29 +1,81 @@
-"""meshio on a file of which all that it names has been looked at: data of XDMF and HDF5, the second file of TetGen."""
+"""What nothing else here reads, by meshio: XDMF, Medit, PLY, TetGen, SU2, AVS, Fluent and others.
+
+Before meshio opens a file, all that the file names has been looked at: data of XDMF and HDF5, the second file of
+TetGen. What meshio raises is of use to a programmer; a message for users has the format and, of text, the line.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
+import warnings
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from .data import MeshError
+import numpy as np
+
+from .contents import Block, Contents
+from .data import Indices, MeshError
 from .plain_files import data_elsewhere, is_hdf5, wrong_beside
+from .tags import tag_sets
+from .text_rows import shown
 
-# endings whose readers wait for more where a file has been cut off: meshio's name of the format, and whether it is text
-_WAITING = {
-    ".dat": ("tecplot", True),
-    ".tec": ("tecplot", True),
-    ".off": ("off", True),
-    ".mdpa": ("mdpa", False),
-}
+# Endings: the format, meshio's name of it where meshio reads it line by line, and whether it is text.
+FORMATS: dict[str, tuple[str, str, bool]] = {
+    ".mesh": ("Medit", "medit", True), ".meshb": ("Medit, binary", "", False), ".su2": ("SU2", "su2", True),
+    ".vol": ("Netgen", "netgen", True), ".avs": ("AVS UCD", "avsucd", True), ".post": ("PERMAS", "permas", True),
+    ".dato": ("PERMAS", "permas", True), ".dat": ("Tecplot", "tecplot", True), ".tec": ("Tecplot", "tecplot", True),
+    ".off": ("OFF", "off", True), ".mdpa": ("Kratos", "mdpa", False), ".xdmf": ("XDMF", "", False),
+    ".xmf": ("XDMF", "", False), ".ply": ("PLY", "ply", False), ".ele": ("TetGen", "", False),
+    ".node": ("TetGen", "", False), ".msh": ("ANSYS Fluent", "ansys", False), ".cgns": ("CGNS", "", False),
+    ".h5m": ("MOAB", "", False), ".hmf": ("HMF", "", False), ".xml": ("DOLFIN XML", "", False),
+    ".f3grid": ("FLAC3D", "", False), ".ugrid": ("UGRID", "", False), ".svg": ("SVG", "", False),
+    ".wkt": ("WKT", "", False),
+}  # fmt: skip
 _PLY_TYPES = {b"char": b"int8", b"uchar": b"uint8", b"ushort": b"uint16", b"uint": b"uint32"}
 MAX_PLY_HEAD = 65536  # bytes
+MAX_LINE_SEARCH = 1 << 26  # bytes of a file in which the line of a fault is looked for
 MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
 
 
-def meshio_mesh(path: Path) -> Any:
-    """meshio's mesh. MeshError where the file names one that may not be read; else whatever meshio raises."""
+def read_with_meshio(path: Path) -> Contents:
+    """Everything in a file, for a process of its own: damaged files make some readers of meshio wait or ask for memory.
+
+    Raises:
+        MeshError: the file is damaged, or names one that may not be read.
+    """
+    position: list[int] = []
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return _contents(path, _mesh(path, position))
+    except MeshError:
+        raise
+    except (Exception, SystemExit):  # readers of meshio raise whatever their parsers raise, or exit
+        _refuse(path, position[0] if position else None)
+
+
+def _refuse(path: Path, position: int | None) -> NoReturn:
+    """MeshError; `position`: in bytes, where its reader stopped."""
+    format_, _, text = FORMATS.get(path.suffix.lower(), ("this kind", "", False))
+    where = ""
+    if text and position is not None and path.stat().st_size < MAX_LINE_SEARCH:
+        data = path.read_bytes()
+        lines = data[:position].rstrip(b"\r\n").split(b"\n")
+        where = f" Its reader stopped at line {len(lines)}: `{shown(lines[-1])}`."
+        if position >= len(data):
+            where = f" Its reader came to the end, line {len(lines)}: was the file cut off?"
+    raise MeshError(
+        f"Mesh file '{path}' could not be read: it is damaged, or no file of the format {format_}, or holds something "
+        f"of it that is not supported.{where} Supported are nodes with simplices, hexahedra, prisms and pyramids; "
+        "export the mesh again, or in another format: MSH 4.1 (gmsh), VTU (ParaView), MED (Salome), Abaqus (.inp)."
+    )
+
+
+def _mesh(path: Path, position: list[int]) -> Any:
+    """meshio's mesh; where that fails, and the file is read from its beginning on, `position` tells how far."""
     import meshio
 
     ending = path.suffix.lower()
@@ -34,19 +86,65 @@ def meshio_mesh(path: Path) -> Any:
         _check(path, other)
         _check_begun(path)
         _check_begun(path.parent / other)
-    elif ending == ".msh" and not _begins_as_gmsh(path):
-        with _Ending(path.open("rb", buffering=0)) as file:
-            return meshio.ansys.read(file)
+    elif is_hdf5(path):
+        _check_hdf5(path, path)
     elif ending == ".ply":
         with _Ending(io.BytesIO(_with_known_head(path.read_bytes()))) as file:  # type: ignore[arg-type]
             return meshio.read(file, "ply")
-    elif ending in _WAITING:
+    elif FORMATS[ending][1]:
+        _, name, text = FORMATS[ending]
         with _Ending(path.open("rb", buffering=0)) as file:
-            kind, text = _WAITING[ending]
-            return meshio.read(io.TextIOWrapper(file) if text else file, kind)
-    elif is_hdf5(path):
-        _check_hdf5(path, path)
+            stream = _Lines(file) if text else file
+            try:
+                return meshio.ansys.read(file) if name == "ansys" else meshio.read(stream, name)
+            except (Exception, SystemExit):
+                with contextlib.suppress(OSError, ValueError):
+                    position.append(stream.tell() & (1 << 63) - 1)  # of text, higher bits are of its decoder
+                raise
     return meshio.read(path)
+
+
+# --- contents of meshio's mesh --------------------------------------------------------------------------------------
+
+
+def _contents(path: Path, mesh: Any) -> Contents:
+    points = np.asarray(mesh.points)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise MeshError(f"Mesh file '{path}' holds points of shape {points.shape}; (n, 2) or (n, 3) is needed.")
+    blocks = [_block(block) for block in mesh.cells]
+    sets, used, notes = tag_sets(mesh.cell_data, blocks, partial(_names_of, mesh))
+    named = _named_sets(mesh, blocks)
+    nodes = {str(name): np.asarray(members, np.int64) for name, members in (mesh.point_sets or {}).items()}
+    unused = [key for key in [*mesh.cell_data, *mesh.point_data] if key not in used and ":" not in key]
+    if unused:
+        notes += (f"Not used: the arrays {', '.join(unused)}.",)
+    return Contents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
+
+
+def _block(block: Any) -> Block:
+    if isinstance(block.data, np.ndarray) and block.data.dtype != object:
+        return Block(block.type, np.asarray(block.data, np.int64))
+    return Block(block.type, np.zeros((len(block.data), 0), np.int64))  # polygons and polyhedra: refused by kind later
+
+
+def _named_sets(mesh: Any, blocks: list[Block]) -> dict[str, list[Indices]]:
+    """Cell sets that have names in the file."""
+    sets = {}
+    for name, members in (mesh.cell_sets or {}).items():
+        if len(members) == len(blocks) and not str(name).startswith("gmsh:"):
+            sets[str(name)] = [np.asarray([] if part is None else part, np.int64) for part in members]
+    return sets
+
+
+def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:
+    """Names of a tag: of a field of the same dimension, or made from the number."""
+    for name, value in (mesh.field_data or {}).items():
+        if np.shape(value) == (2,) and (int(value[0]), int(value[1])) == (tag, dim) and str(name).strip():
+            return [str(name)]
+    return [f"tag-{tag}"]
+
+
+# --- files before meshio opens them ---------------------------------------------------------------------------------
 
 
 def _with_known_head(data: bytes) -> bytes:
@@ -102,11 +200,6 @@ def _xdmf_reader(path: Path) -> Any:
     return Reader(str(path))
 
 
-def _begins_as_gmsh(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(1) == b"$"
-
-
 class _Ending(io.BufferedReader):
     """A file that ends with an error where it is read beyond its end again and again: readers of meshio's wait there
     for what does not come, where a file has been cut off."""
@@ -127,6 +220,18 @@ class _Ending(io.BufferedReader):
 
     def readline(self, size: int | None = -1, /) -> bytes:
         return self._checked(super().readline(size))
+
+
+class _Lines(io.TextIOWrapper):
+    """Text whose position can be told while it is read line by line."""
+
+    def __init__(self, file: _Ending) -> None:
+        super().__init__(file, encoding="utf-8", errors="replace")
+
+    def __next__(self) -> str:  # type: ignore[override]
+        if line := self.readline():
+            return line
+        raise StopIteration
 
 
 def _check_begun(path: Path) -> None:

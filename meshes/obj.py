@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from .data import MeshError
+from .contents import Block, Contents
+from .data import Indices, MeshError
 
 KINDS = {3: "triangle", 4: "quad"}
 
 
-def read_obj(path: Path) -> Any:
-    """A meshio.Mesh of the points (n, 3) and faces; "obj:group_ids" counts the lines `g`, -1 before the first.
+def read_obj(path: Path) -> Contents:
+    """Points (n, 3) and faces; sets of faces by the lines `g`, or where there are none by the lines `o`.
 
     An index k > 0 is the k-th point of the file, k < 0 the k-th from the last one before its line. What stands behind
     the first slash of an index, or behind three coordinates, is left out.
@@ -26,25 +26,24 @@ def read_obj(path: Path) -> Any:
     Raises:
         MeshError: a line that is no point or face, or a face with a point that does not exist; with its number.
     """
-    import meshio
-
     points: list[list[float]] = []
-    blocks: list[tuple[int, list[list[int]], list[int]]] = []  # corners of a face, faces, groups
-    group, farthest = -1, (-1, 0)  # the last point that a face names, and its line
+    blocks: list[tuple[int, list[list[int]]]] = []  # corners of a face, faces
+    named: dict[str, list[tuple[str, int, int]]] = {"g": [], "o": []}  # name, block and face that come behind the line
+    farthest = (-1, 0)  # the last point that a face names, and its line
     for number, (word, *values) in _lines(path):
         try:
             if word == "v":
                 x, y, z, *_ = map(float, values)
                 points.append([x, y, z])
-            elif word == "g":
-                group += 1
+            elif word in named:
+                at = (len(blocks) - 1, len(blocks[-1][1])) if blocks else (0, 0)
+                named[word].append((" ".join(values), *at))
             elif word == "f":
                 face = [_place(value, len(points)) for value in values]
                 farthest = max(farthest, (max(face), number), key=lambda found: found[0])
                 if not blocks or blocks[-1][0] != len(face):
-                    blocks.append((len(face), [], []))
+                    blocks.append((len(face), []))
                 blocks[-1][1].append(face)
-                blocks[-1][2].append(group)
         except ValueError:
             what = "three coordinates: v 0 0.5 1" if word == "v" else "points that are there before it: f 1 2 3"
             line = " ".join([word, *values])[:80]
@@ -52,9 +51,22 @@ def read_obj(path: Path) -> Any:
     if farthest[0] >= len(points):
         last, number = farthest
         raise MeshError(f"Mesh file '{path}', line {number}: there is no point {last + 1}, but {len(points)} in all.")
-    cells = [(KINDS.get(corners, "polygon"), np.array(faces)) for corners, faces, _ in blocks]
-    groups = [np.array(groups) for *_, groups in blocks]
-    return meshio.Mesh(np.array(points).reshape(-1, 3), cells, cell_data={"obj:group_ids": groups})
+    found = [Block(KINDS.get(corners, "polygon"), np.array(faces, np.int64)) for corners, faces in blocks]
+    return Contents(np.array(points, np.float64).reshape(-1, 3), found, _sets(named["g"] or named["o"], found))
+
+
+def _sets(named: list[tuple[str, int, int]], blocks: list[Block]) -> dict[str, list[Indices]]:
+    """Sets of faces from the places at which their names stand; a face is in the set of the last name before it."""
+    sets: dict[str, list[Indices]] = {}
+    ends = [tuple(place) for _, *place in named[1:]]
+    for (name, *begin), end in zip(named, [*ends, (len(blocks), 0)], strict=False):
+        for i, block in enumerate(blocks):
+            first = begin[1] if i == begin[0] else 0
+            stop = end[1] if i == end[0] else len(block.nodes)
+            if name and begin[0] <= i <= end[0] and first < stop:
+                members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
+                members[i] = np.union1d(members[i], np.arange(first, stop)).astype(np.int64)
+    return sets
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -1,34 +1,32 @@
-"""A mesh from file: by gmsh (.msh), VTK (its formats, Exodus), readers of their names, and meshio for all else."""
+"""A mesh from file: which reader reads which file."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import re
-import warnings
-from collections.abc import Iterator
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
-
-import numpy as np
 
 from .abaqus import read_abaqus
-from .contents import Block, Contents
-from .data import Indices, MeshData, MeshError
-from .gmsh_session import session
-from .meshio_reader import meshio_mesh
+from .contents import Contents
+from .data import MeshData, MeshError
+from .meshio_reader import FORMATS, read_with_meshio
+from .msh2 import SAVE, read_msh2
+from .nastran import read_nastran
 from .obj import read_obj
 from .plain_files import wrong_with
 from .stl import read_stl
-from .tags import tag_sets
-from .timed import Died, within
+from .timed import read_within
+from .unv import read_unv
 from .vtk_readers import ENDINGS as VTK_ENDINGS
 from .vtk_readers import read_with_vtk
 
-OWN_READERS = {".obj": read_obj, ".stl": read_stl}  # in place of meshio's
+OWN_READERS: dict[str, Callable[[Path], Contents]] = {
+    ".inp": read_abaqus, ".obj": read_obj, ".stl": read_stl, ".unv": read_unv, ".bdf": read_nastran,
+    ".nas": read_nastran, ".fem": read_nastran, **dict.fromkeys(VTK_ENDINGS, read_with_vtk),
+}  # fmt: skip
+SECONDS, SLOW = 60, 1e6  # of another program on a file, and the bytes a second that it reads at least
+MSH2 = 2  # version of MSH that is read here; later ones by gmsh
+_NASTRAN = re.compile(rb"^(BEGIN\s+BULK|GRID\*?[\s,])", re.MULTILINE | re.IGNORECASE)
 
 
 def read_mesh(path: str | Path) -> MeshData:
@@ -54,14 +52,33 @@ def read_contents(path: Path) -> Contents:
         raise MeshError(f"Mesh file '{path}' {wrong}.")
     if path.stat().st_size == 0:
         raise MeshError(f"Mesh file '{path}' is empty.")
-    if path.suffix.lower() == ".inp":
-        return read_abaqus(path)
-    if path.suffix.lower() in VTK_ENDINGS:
-        return read_with_vtk(path)
+    ending = path.suffix.lower()
+    if ending in OWN_READERS:
+        return OWN_READERS[ending](path)
+    if ending == ".med":
+        from .med import read_med
+
+        return _by_another_process(path, read_med, "h5py")
     version = _gmsh_version(path)
-    if version >= 4:
-        return _read_with_gmsh(path)
-    return replace(_read_with_meshio(path), copies=version > 0)
+    if version > MSH2:
+        from .gmsh_reader import read_with_gmsh
+
+        return _by_another_process(path, read_with_gmsh, "gmsh")
+    if version:
+        return read_msh2(path)
+    if ending not in FORMATS:
+        known = sorted({*OWN_READERS, *FORMATS, ".med"})
+        raise MeshError(
+            f"Mesh file '{path}' is of no known kind; known endings: {', '.join(known)}. Export it as MSH 4.1 (gmsh), "
+            "VTU (ParaView), MED (Salome) or Abaqus (.inp)."
+        )
+    if ending == ".dat" and _NASTRAN.search(path.read_bytes()):
+        return read_nastran(path)
+    return _by_another_process(path, read_with_meshio, "meshio")
+
+
+def _by_another_process(path: Path, reader: Callable[[Path], Contents], program: str) -> Contents:
+    return read_within(path, reader, program, SECONDS + path.stat().st_size / SLOW)
 
 
 def _gmsh_version(path: Path) -> int:
@@ -76,143 +93,17 @@ def _gmsh_version(path: Path) -> int:
     if not head.startswith((b"$MeshFormat", b"$Comments")):
         if head.lstrip()[:1] == b"(":
             return 0  # of ANSYS Fluent
+        freefem = (
+            ' (FreeFem\'s own .msh: savemesh(Th, "part.mesh") writes Medit instead.)' if head[:1].isdigit() else ""
+        )
         raise MeshError(
             f"Mesh file '{path}' could not be read: it is no mesh of Gmsh, for it begins with {head[:16]!a}, not with "
-            "$MeshFormat. Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`."
+            f"$MeshFormat.{freefem} {SAVE}."
         )
     _, found, rest = head.partition(b"$MeshFormat")
     number = re.match(rb"\s*(\d{1,3})(\.\d*)?\s", rest) if found else None
-    return int(number[1]) if number else 0
-
-
-# --- Gmsh's .msh, version 4 -----------------------------------------------------------------------------------------
-# Not by meshio (5.3), which refuses files where only some cells are in a physical group, and keeps one unnamed group of
-# each. Version 2 not by gmsh, which puts all elements of one entity into all groups that one of them is in.
-
-GMSH_SHAPES = {"Point": "vertex", "Line": "line", "Triangle": "triangle", "Tetrahedron": "tetra"}
-GMSH_SHAPES |= {"Quadrilateral": "quad", "Hexahedron": "hexahedron", "Prism": "wedge", "Pyramid": "pyramid"}
-
-
-SLOW = 1e6  # bytes a second that gmsh reads at least
-
-
-def _read_with_gmsh(path: Path) -> Contents:
-    """By a process of its own: damaged files have been seen to end gmsh by SIGABRT."""
-    try:
-        return within(60 + path.stat().st_size / SLOW, _contents_by_gmsh, path)
-    except Died as died:
+    if not number or int(number[1]) < 1:
         raise MeshError(
-            f"Mesh file '{path}' could not be read: gmsh died ({died.how}); the file is damaged, or there is not "
-            "enough memory."
-        ) from None
-    except MeshError as error:
-        raise MeshError(f"Mesh file '{path}' could not be read: {error}") from error
-    except TimeoutError:
-        raise MeshError(f"Mesh file '{path}' could not be read: gmsh did not end; the file is damaged.") from None
-
-
-def _contents_by_gmsh(path: Path) -> Contents:
-    # by a name of its own: of part.msh.opt beside part.msh gmsh would run the commands
-    with TemporaryDirectory() as folder, session() as gmsh:
-        linked = Path(folder) / "mesh.msh"
-        linked.symlink_to(path.resolve())
-        gmsh.merge(str(linked))
-        return _contents_of_model(gmsh)
-
-
-def _contents_of_model(gmsh: Any) -> Contents:
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    place = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
-    place[tags] = np.arange(len(tags))
-    blocks: list[Block] = []
-    owners: list[tuple[int, int]] = []
-    for entity in gmsh.model.getEntities():
-        for kind, _, nodes in zip(*gmsh.model.mesh.getElements(*entity), strict=True):
-            name, _, order, count, _, _ = gmsh.model.mesh.getElementProperties(kind)
-            shape = GMSH_SHAPES.get(name.split()[0], name)
-            blocks.append(Block(shape if order == 1 else f"{shape}{count}", place[nodes].reshape(-1, count)))
-            owners.append(entity)
-    return Contents(coordinates.reshape(-1, 3), blocks, _physical_groups(gmsh, blocks, owners))
-
-
-def _physical_groups(gmsh: Any, blocks: list[Block], owners: list[tuple[int, int]]) -> dict[str, list[Indices]]:
-    """Physical groups by name; entities of several dimensions may share one."""
-    sets: dict[str, list[Indices]] = {}
-    for dim, tag in gmsh.model.getPhysicalGroups():
-        name = gmsh.model.getPhysicalName(dim, tag) or f"tag-{tag}"
-        entities = set(gmsh.model.getEntitiesForPhysicalGroup(dim, tag).tolist())
-        members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
-        for i, (block, owner) in enumerate(zip(blocks, owners, strict=True)):
-            if owner[0] == dim and owner[1] in entities:
-                members[i] = np.arange(len(block.nodes))
-    return sets
-
-
-# --- everything else ------------------------------------------------------------------------------------------------
-
-
-def _read_with_meshio(path: Path) -> Contents:
-    mesh = _meshio_mesh(path)
-    points = np.asarray(mesh.points)
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise MeshError(f"Mesh file '{path}' holds points of shape {points.shape}; (n, 2) or (n, 3) is needed.")
-    blocks = [_block(block) for block in mesh.cells]
-    sets, _, notes = tag_sets(mesh.cell_data, blocks, partial(_names_of, mesh))
-    named = _named_sets(mesh, blocks)
-    nodes = {str(name): np.asarray(members, np.int64) for name, members in (mesh.point_sets or {}).items()}
-    return Contents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
-
-
-def _meshio_mesh(path: Path) -> Any:
-    """meshio's mesh; its exits become errors and its printing is kept for their message."""
-    import meshio
-
-    known = sorted({*meshio.extension_to_filetypes, *VTK_ENDINGS})
-    if not any(path.name.lower().endswith(extension) for extension in known):
-        raise MeshError(f"Mesh file '{path}' is of no known kind; known endings: {', '.join(known)}.")
-    said = io.StringIO()
-    try:
-        with _quiet(said):
-            return OWN_READERS.get(path.suffix.lower(), meshio_mesh)(path)
-    except MeshError:
-        raise
-    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parsers raise, or exit
-        reason = "" if isinstance(error, SystemExit) else str(error)
-        reason = " ".join((reason or said.getvalue()).split()) or type(error).__name__
-        raise MeshError(
-            f"Mesh file '{path}' could not be read: {reason[:300]} (damaged, or of another kind?)"
-        ) from error
-
-
-@contextlib.contextmanager
-def _quiet(said: io.StringIO) -> Iterator[None]:
-    """Keep what Python code prints, and drop its warnings (meshio multiplies in 32 bits on every text STL)."""
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-def _block(block: Any) -> Block:
-    if isinstance(block.data, np.ndarray) and block.data.dtype != object:
-        return Block(block.type, np.asarray(block.data, np.int64))
-    return Block(block.type, np.zeros((len(block.data), 0), np.int64))  # polygons and polyhedra: refused by kind later
-
-
-def _named_sets(mesh: Any, blocks: list[Block]) -> dict[str, list[Indices]]:
-    """Cell sets that have names in the file."""
-    sets = {}
-    for name, members in (mesh.cell_sets or {}).items():
-        if len(members) == len(blocks) and not str(name).startswith("gmsh:"):
-            sets[str(name)] = [np.asarray([] if part is None else part, np.int64) for part in members]
-    return sets
-
-
-def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:
-    """Names of a tag: of MED families, of a field of the same dimension, or made from the number."""
-    families = getattr(mesh, "cell_tags", {}).get(tag)
-    if families:
-        return [str(name) for name in families]
-    for name, value in (mesh.field_data or {}).items():
-        if np.shape(value) == (2,) and (int(value[0]), int(value[1])) == (tag, dim):
-            return [str(name)]
-    return [f"tag-{tag}"]
+            f"Mesh file '{path}' could not be read: no version stands behind $MeshFormat: `4.1 0 8`. {SAVE}."
+        )
+    return int(number[1])

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from .contents import Block, Contents
 from .data import MeshError
 
 HEAD = 84  # bytes of a binary file before its triangles: 80 of text, 4 of their number
@@ -19,14 +19,12 @@ TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribu
 _WORDS = re.compile(rb"^[ \t]*(vertex|end[ \t]*facet|end[ \t]*loop)\b", re.IGNORECASE | re.MULTILINE)
 
 
-def read_stl(path: Path) -> Any:
-    """A meshio.Mesh of the triangles, each with three points of its own: STL repeats them.
+def read_stl(path: Path) -> Contents:
+    """The triangles, each with three points of its own: STL repeats them.
 
     Raises:
         MeshError: the file is neither text nor binary STL, or was cut off; with the line of a text file.
     """
-    import meshio
-
     data = path.read_bytes()
     declared = int.from_bytes(data[80:HEAD], "little")
     if declared and len(data) >= HEAD + TRIANGLE.itemsize * declared:  # never of text, which gives a huge number there
@@ -44,7 +42,7 @@ def read_stl(path: Path) -> Any:
             "damaged or no STL file; export it again."
         )
     triangles = np.arange(3 * len(corners)).reshape(-1, 3)
-    return meshio.Mesh(corners.reshape(-1, 3), [("triangle", triangles)])
+    return Contents(corners.reshape(-1, 3), [Block("triangle", triangles)], {})
 
 
 def _of_text(path: Path, data: bytes) -> npt.NDArray[np.float64]:

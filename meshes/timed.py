@@ -11,10 +11,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from math import ceil
+from pathlib import Path
 from typing import Any
 
 from .data import MeshError
 
+MEMORY, MEMORY_PER_BYTE = 4 << 30, 64  # of a reader with its libraries; compressed files grow
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
 
@@ -49,6 +51,23 @@ def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: i
     if failure is not None:
         raise failure
     return result
+
+
+def read_within[T](
+    path: Path, reader: Callable[[Path], T], program: str, seconds: float, advice: str = "Export it again."
+) -> T:
+    """reader(path), done by another process for `seconds` at most; with 4 GiB and 64 times the file's size of memory.
+
+    Raises:
+        MeshError: of the reader, or the process did not come to an end, or died; the message names `program`.
+    """
+    try:
+        return within(seconds, reader, path, memory=MEMORY + MEMORY_PER_BYTE * path.stat().st_size)
+    except Died as died:
+        why = f"{program} died ({died.how}); the file is damaged, or there is not enough memory"
+    except TimeoutError:
+        why = f"{program} did not end within {seconds:.0f} s; the file is damaged"
+    raise MeshError(f"Mesh file '{path}' could not be read: {why}. {advice}")
 
 
 def _serve() -> None:

@@ -31,7 +31,6 @@ ENDINGS = {
     **dict.fromkeys((".e", ".ex2", ".exo", ".exii", ".g", ".gen"), EXODUS),
 }
 SECONDS, SECONDS_PER_MB = 60, 2  # of a reader, on a machine that has other work as well
-MEMORY, MEMORY_PER_BYTE = 4 << 30, 64  # of a reader with its libraries; compressed files grow
 MAX_WORDS = 300  # characters of what VTK says
 DUPLICATE = 1  # bit of vtkGhostType: a cell that another piece has as well
 
@@ -56,21 +55,18 @@ def read_with_vtk(path: Path) -> Contents:
     Raises:
         MeshError: the file is damaged, of another kind, or names a file that may not be read.
     """
-    from .timed import Died, within
+    from .timed import read_within
 
-    megabytes = path.stat().st_size / 1e6
-    seconds = SECONDS + SECONDS_PER_MB * megabytes
-    try:
-        memory = MEMORY + MEMORY_PER_BYTE * path.stat().st_size
-        contents: Contents = within(seconds, _read, path, memory=memory)
-        return contents
-    except TimeoutError:
-        _refuse(path, f"it was not read after {seconds:.0f} s; it is damaged")
-    except Died as died:
-        _refuse(path, f"its reader ended before it was done ({died.how}); the file is damaged, or memory is short")
+    seconds = SECONDS + SECONDS_PER_MB * path.stat().st_size / 1e6
+    return read_within(path, _read, "VTK's reader", seconds, _supported(path))
 
 
 def _refuse(path: Path, why: str) -> NoReturn:
+    raise MeshError(f"Mesh file '{path}' could not be read: {why}. {_supported(path)}")
+
+
+def _supported(path: Path) -> str:
+    """What is read of the format of a file, and how to write it: the end of a message."""
     ending = path.suffix.lower()
     advice = {
         VTK: "an unstructured grid or polygons, as VTK legacy (.vtk) or XML (.vtu, .vtp, .pvtu); save it again, for "
@@ -79,7 +75,7 @@ def _refuse(path: Path, why: str) -> NoReturn:
         EXODUS: "Exodus II in netCDF, classic or HDF5; export it again, for example in Cubit by `export mesh "
         '"part.exo"`',
     }[ENDINGS[ending]]
-    raise MeshError(f"Mesh file '{path}' could not be read: {why}. Supported: {advice}.")
+    return f"Supported: {advice}."
 
 
 def _read(path: Path) -> Contents:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_keywords_comments_blanks_and_continuations(deck: Write) -> None:
         assert len(mesh.facet_groups["all nodes"]) == 12
 
 
-DATA = Path(__file__).parent / "data/meshes"
+DATA = Path(__file__).parent / "meshes"
 
 
 def areas(mesh: MeshData, name: str) -> float:
@@ -85,24 +86,27 @@ def areas(mesh: MeshData, name: str) -> float:
 
 def test_a_deck_of_abaqus_cae_with_a_reference_point() -> None:
     """A bar of 100 x 20 x 20 mm; its right end as a surface of faces S1 to S4."""
-    mesh = read(DATA / "abaqus_cae_rp.inp")
+    mesh = read(DATA / "a1_cae_rp.inp")
     assert (len(mesh.points), len(mesh.cells)) == (280, 760)
     assert volume(mesh) == pytest.approx(40000)
     assert {name: len(cells) for name, cells in mesh.regions.items()} == {"Set-steel": 380, "Set-epoxy": 380}
     for name, x in {"Set-left": 0, "Set-right": 100, "Surf-right": 100}.items():
         assert areas(mesh, name) == pytest.approx(400)
         assert np.all(mesh.points[mesh.facet_groups[name], 0] == x)
-    assert mesh.notes == ("1 of 281 nodes belong to no cell and were removed.",)
+    assert mesh.notes == (
+        "Sets not used, for they hold neither cells nor all nodes of triangles of the boundary: Set-RP.",
+        "1 of 281 nodes belong to no cell and were removed.",
+    )
 
 
 def test_a_comment_among_the_elements_ends_nothing() -> None:
-    mesh = read(DATA / "abaqus_comment_in_elements.inp")
+    mesh = read(DATA / "a6_comment_in_elements.inp")
     assert (len(mesh.points), len(mesh.cells)) == (280, 760)
     assert volume(mesh) == pytest.approx(0.1 * 0.02 * 0.02)
 
 
 def test_two_parts_are_two_bodies() -> None:
-    mesh = read(DATA / "abaqus_twoparts.inp")
+    mesh = read(DATA / "a5_twoparts.inp")
     assert len(mesh.cells) == 760 and len(mesh.points) == 300
     assert any("2 bodies that share no node" in note for note in mesh.notes)
     assert volume(mesh, "Block-1") == pytest.approx(0.05 * 0.02 * 0.02)
@@ -111,7 +115,7 @@ def test_two_parts_are_two_bodies() -> None:
 
 def test_three_instances_of_a_part_are_three_bodies() -> None:
     """Bricks of 0.1 x 0.1 x 0.01 m, one above the other with gaps of 0.1 mm."""
-    mesh = read(DATA / "abaqus_three_instances.inp")
+    mesh = read(DATA / "a5d_three_instances.inp")
     assert len(mesh.cells) == 3 * 712
     assert any("3 bodies that share no node" in note for note in mesh.notes)
     for i in range(3):
@@ -188,7 +192,7 @@ def test_sets_by_number_range_and_name(deck: Write) -> None:
         "bottom": [1, 2, 3, 4], "top": [5, 6, 7, 8], "ends": list(range(1, 9)), "of cells": list(range(1, 9)),
         "far": [5, 6, 7, 8],
     }  # fmt: skip
-    assert contents.notes == ("Sets name 999999999992 nodes or elements that are not in the file: far.",)
+    assert contents.notes == ("Sets name 999999999992 nodes or elements that are not in the file: far. Is it whole?",)
 
 
 def test_a_face_of_abaqus_cae_is_a_set_of_nodes_and_of_elements(deck: Write) -> None:
@@ -425,3 +429,47 @@ def test_files_of_gmsh(tmp_path: Path, dim: int, order: int, squares: bool) -> N
     assert len(mesh.regions["Körper"]) == len(mesh.cells)
     assert len(mesh.facet_groups["left"]) == facets
     assert np.all(mesh.points[mesh.facet_groups["left"], 0] == 0)
+
+
+# --- decks that were cut at the end of a line -------------------------------------------------------------------------
+
+
+def test_a_deck_cut_at_any_line_says_so() -> None:
+    """The bar without its end: refused, or a note that tells of a cut; never a smaller body without a word."""
+    text = (DATA / "a6_comment_in_elements.inp").read_text()
+    lines = text.splitlines(keepends=True)
+    first = next(i for i, line in enumerate(lines) if line.upper().startswith("*ELEMENT"))
+    last = next(i for i in range(first + 1, len(lines)) if lines[i].startswith("*") and lines[i][1] != "*")
+    told = {"refused": 0, "noted": 0}
+    for end in range(first + 2, last, 7):
+        deck = "".join(lines[:end])
+        cells = sum(line[:1].isdigit() for line in lines[first:end])
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "cut.inp"
+            path.write_text(deck)
+            try:
+                mesh = read(path)
+            except MeshError as error:
+                assert "belong to no element; *ELEMENT, with which the file ends, seems to be cut short" in str(error)
+                told["refused"] += 1
+                continue
+        assert len(mesh.cells) == cells
+        if any("if it was cut off, cells are missing" in note for note in mesh.notes):
+            told["noted"] += 1
+        else:  # nothing in the file can tell: all nodes are there
+            assert len(mesh.points) == 280 and cells > 700
+    assert told["refused"] > 90 and told["noted"]
+
+
+def test_parts_without_an_assembly_are_told(deck: Write) -> None:
+    text = TWO.format(place="", sets="")
+    whole, cut = read(deck(text)), read(deck(text[: text.index("*Assembly")]))
+    assert (len(whole.cells), len(cut.cells)) == (12, 6)
+    assert any("*PART and no *ASSEMBLY: if it was cut off, bodies are missing" in note for note in cut.notes)
+    assert not any("ASSEMBLY" in note for note in whole.notes)
+
+
+def test_a_set_whose_last_line_may_be_cut_is_told(deck: Write) -> None:
+    text = CUBE + "*NSET, NSET=low\n1, 2, 3, 4"
+    assert read(deck(text + "\n")).notes == ()
+    assert read(deck(text)).notes == ("The file ends within a line of *NSET, without a line break; is the set whole?",)

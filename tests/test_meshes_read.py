@@ -206,7 +206,11 @@ def test_other_cells_are_named_and_counted(tmp_path: Path, cells: list[Any], mes
         ("bad.stl", "no solid", r"bad.stl' could not be read: "),
         ("odd.msh", "hello", r"odd.msh' could not be read: "),
         ("cut.msh", "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 2 1 2\n2 1 0 2\n1\n2\n0 0", r"cut.msh'"),
-        ("cut2.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n9\n1 0 0 0\n", r"cut2.msh' could not be read: "),
+        (
+            "cut2.msh",
+            "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n9\n1 0 0 0\n",
+            r"cut2.msh., line 6: the file ends within the section .Nodes",
+        ),
     ],
 )
 def test_files_that_cannot_be_read(

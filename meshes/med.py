@@ -1,0 +1,168 @@
+"""MED files of Salome and gmsh, version 3 and later, which are HDF5.
+
+Format: "MED file format" of the MED library, HDF5 structure. A cell or node belongs to one family; a family belongs to
+any number of groups. Negative families are of cells, positive ones of nodes, 0 is of no group.
+
+Not by gmsh, whose build in Debian lacks the MED library; not by meshio (5.3), which takes no accents in names, and no
+families without groups.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NoReturn
+
+import h5py
+import numpy as np
+
+from .contents import Block, Contents
+from .data import Indices, MeshError, Points
+from .plain_files import HDF5_SIGNATURE, data_elsewhere
+from .text_rows import decoded, shown
+
+KINDS = {
+    "PO1": ("vertex", 1), "SE2": ("line", 2), "SE3": ("line3", 3), "SE4": ("line4", 4), "TR3": ("triangle", 3),
+    "TR6": ("triangle6", 6), "TR7": ("triangle7", 7), "QU4": ("quad", 4), "QU8": ("quad8", 8), "QU9": ("quad9", 9),
+    "TE4": ("tetra", 4), "T10": ("tetra10", 10), "PY5": ("pyramid", 5), "P13": ("pyramid13", 13), "PE6": ("wedge", 6),
+    "P15": ("wedge15", 15), "P18": ("wedge18", 18), "HE8": ("hexahedron", 8), "H20": ("hexahedron20", 20),
+    "H27": ("hexahedron27", 27),
+}  # fmt: skip
+# What cannot be used: refused later by these names where it is of the body, else left out.
+OTHER_KINDS = {"POG": "polygon", "PG2": "polygon", "POE": "polyhedron", "OCT": "hexagonal prism"}
+SUPPORTED = (
+    "one unstructured mesh of MED 3 or later; in Salome select the mesh and File > Export > MED, in gmsh File > Export "
+    "as .med or .msh"
+)
+
+
+def read_med(path: Path) -> Contents:
+    """Nodes, cells and groups of the one mesh of a MED file.
+
+    Raises:
+        MeshError: the file is damaged, holds no mesh or several ones; the message names the place in the file.
+    """
+    with path.open("rb") as file:
+        head = file.read(len(HDF5_SIGNATURE))
+    if head != HDF5_SIGNATURE:
+        _refuse(path, f"it begins with `{shown(head)}`, not as HDF5 does; MED files older than version 3 are not read")
+    where = ["its HDF5"]
+    try:
+        with h5py.File(path) as file:
+            if name := data_elsewhere(file):
+                _refuse(path, f"the data of '{name}' lie in another file; save all in one")
+            return _contents(path, file, where)
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError, OverflowError) as error:
+        if isinstance(error, MeshError):
+            raise
+        _refuse(path, f"{where[0]} is damaged, or not as MED has it")
+
+
+def _refuse(path: Path, why: str) -> NoReturn:
+    raise MeshError(f"Mesh file '{path}' could not be read: {why}. Supported: {SUPPORTED}.")
+
+
+def _contents(path: Path, file: Any, where: list[str]) -> Contents:
+    meshes = list(file["ENS_MAA"]) if "ENS_MAA" in file else []
+    if len(meshes) != 1:
+        many = f"{len(meshes)} meshes ({', '.join(meshes[:5])}); export one of them alone"
+        _refuse(path, f"it holds {many if meshes else 'no mesh (no group ENS_MAA)'}")
+    (name,) = meshes
+    mesh = file["ENS_MAA"][name]
+    if int(mesh.attrs.get("TYP", 0)) != 0:
+        _refuse(path, f"its mesh '{name}' is a structured grid")
+    steps = [key for key in mesh if isinstance(mesh[key], h5py.Group) and "NOE" in mesh[key]]
+    if not steps:
+        _refuse(path, f"its mesh '{name}' has no nodes (no group NOE)")
+    step = mesh[steps[0]]
+    notes = [f"The mesh has {len(steps)} steps in time; the first one is read."] if len(steps) > 1 else []
+    where[0] = f"the list of nodes (ENS_MAA/{name}/{steps[0]}/NOE)"
+    points = _points(path, step["NOE"], int(mesh.attrs.get("ESP", 3)))
+    blocks, families = [], []
+    for key in step.get("MAI", ()):
+        where[0] = f"the list of cells {key} (ENS_MAA/{name}/{steps[0]}/MAI/{key})"
+        block, family = _block(path, key, step["MAI"][key], len(points))
+        blocks.append(_turned(block, points))
+        families.append(family)
+    where[0] = f"the list of families (FAS/{name})"
+    cell_groups, node_groups = _groups_of_families(file, name)
+    sets: dict[str, list[Indices]] = {}
+    for i, family in enumerate(families):
+        for number in np.unique(family[family != 0]).tolist():
+            for group in cell_groups.get(number) or [f"family-{abs(number)}"]:
+                members = sets.setdefault(group, [np.zeros(0, np.int64) for _ in blocks])
+                members[i] = np.union1d(members[i], np.flatnonzero(family == number)).astype(np.int64)
+    point_sets: dict[str, Indices] = {}
+    if "FAM" in step["NOE"]:
+        where[0] = "the families of nodes"
+        family = _integers(step["NOE"]["FAM"], len(points))
+        for number in np.unique(family[family != 0]).tolist():
+            for group in node_groups.get(number) or [f"nodes-{abs(number)}"]:
+                members_of = np.flatnonzero(family == number)
+                point_sets[group] = np.union1d(point_sets.get(group, members_of), members_of).astype(np.int64)
+    if fields := list(file["CHA"]) if "CHA" in file else []:
+        notes.append(f"Not used: results ({', '.join(fields)}).")
+    return Contents(points, blocks, sets, point_sets, notes=tuple(notes))
+
+
+def _points(path: Path, nodes: Any, dim: int) -> Points:
+    values = np.asarray(nodes["COO"][()], np.float64)
+    declared = int(nodes["COO"].attrs.get("NBR", len(values) // max(dim, 1)))
+    if dim not in (2, 3) or values.shape != (dim * declared,):
+        _refuse(
+            path,
+            f"it declares {declared} nodes of {dim} coordinates (2 or 3 are needed), and has {values.size} numbers",
+        )
+    return np.ascontiguousarray(values.reshape(dim, -1).T)  # all x, then all y, ...
+
+
+def _block(path: Path, key: str, group: Any, node_count: int) -> tuple[Block, Indices]:
+    """The cells of one kind and their families."""
+    kind, size = KINDS.get(key, (OTHER_KINDS.get(key, f"cells of the kind {key}"), 0))
+    stored = group["NOD"]
+    if not size:
+        count = max(len(group["INN"]) - 1, 0) if "INN" in group else int(stored.attrs.get("NBR", 1))
+        return Block(kind, np.zeros((count, 0), np.int64)), np.zeros(count, np.int64)
+    declared = int(stored.attrs.get("NBR", len(stored) // size))
+    nodes = _integers(stored, size * declared) - 1
+    if len(nodes) and not (nodes.min() >= 0 and nodes.max() < node_count):
+        wrong = int(nodes[(nodes < 0) | (nodes >= node_count)][0]) + 1
+        _refuse(path, f"a cell of its list {key} has the node {wrong}, and there are {node_count}")
+    family = _integers(group["FAM"], declared) if "FAM" in group else np.zeros(declared, np.int64)
+    return Block(kind, np.ascontiguousarray(nodes.reshape(size, -1).T)), family
+
+
+def _turned(block: Block, points: Points) -> Block:
+    """Tetrahedra as they are elsewhere, where all of them have MED's order, which is the mirrored one."""
+    if block.shape != "tetra" or not len(block.nodes) or points.shape[1] != 3:
+        return block
+    corners = points[block.corners]
+    if np.all(np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0):
+        return Block(block.kind, np.concatenate([block.nodes[:, [1, 0]], block.nodes[:, 2:]], axis=1))
+    return block
+
+
+def _integers(stored: Any, count: int) -> Indices:
+    """A list of integers. ValueError where it has not as many as declared."""
+    values = stored[()]
+    if values.dtype.kind not in "iu" or values.shape != (count,):
+        raise ValueError(stored.name)
+    integers: Indices = values.astype(np.int64)
+    return integers
+
+
+def _groups_of_families(file: Any, mesh: str) -> tuple[dict[int, list[str]], dict[int, list[str]]]:
+    """Names of the groups of each family of cells, and of nodes; families without groups by their own names."""
+    found: tuple[dict[int, list[str]], dict[int, list[str]]] = {}, {}
+    families = file["FAS"][mesh] if "FAS" in file and mesh in file["FAS"] else {}
+    for key, names in zip(("ELEME", "NOEUD"), found, strict=True):
+        for family in families.get(key, ()):
+            entry = families[key][family]
+            groups = [_name(row) for row in entry["GRO"]["NOM"][()]] if "GRO" in entry else []
+            names[int(entry.attrs["NUM"])] = [group for group in groups if group] or [family.strip()]
+    return found
+
+
+def _name(row: Any) -> str:
+    """The name of a group: 80 bytes, or signed numbers of one byte."""
+    data = bytes(row) if isinstance(row, bytes) else np.asarray(row).astype(np.int8).tobytes()
+    return decoded(data.split(b"\0")[0]).strip()
