@@ -1,4 +1,4 @@
-"""What nothing else here reads, by meshio: XDMF, Medit, PLY, TetGen, SU2, AVS, Fluent and others.
+"""What nothing else here reads, by meshio: XDMF, PLY, TetGen, SU2, AVS, Fluent and others.
 
 Before meshio opens a file, all that the file names has been looked at: data of XDMF and HDF5, the second file of
 TetGen. What meshio raises is of use to a programmer; a message for users has the format and, of text, the line.
@@ -24,10 +24,10 @@ from .text_rows import shown
 
 # Endings: the format, meshio's name of it where meshio reads it line by line, and whether it is text.
 FORMATS: dict[str, tuple[str, str, bool]] = {
-    ".mesh": ("Medit", "medit", True), ".meshb": ("Medit, binary", "", False), ".su2": ("SU2", "su2", True),
+    ".meshb": ("Medit, binary", "", False), ".su2": ("SU2", "su2", True),
     ".vol": ("Netgen", "netgen", True), ".avs": ("AVS UCD", "avsucd", True), ".post": ("PERMAS", "permas", True),
     ".dato": ("PERMAS", "permas", True), ".dat": ("Tecplot", "tecplot", True), ".tec": ("Tecplot", "tecplot", True),
-    ".off": ("OFF", "off", True), ".mdpa": ("Kratos", "mdpa", False), ".xdmf": ("XDMF", "", False),
+    ".mdpa": ("Kratos", "mdpa", False), ".xdmf": ("XDMF", "", False),
     ".xmf": ("XDMF", "", False), ".ply": ("PLY", "ply", False), ".ele": ("TetGen", "", False),
     ".node": ("TetGen", "", False), ".msh": ("ANSYS Fluent", "ansys", False), ".cgns": ("CGNS", "", False),
     ".h5m": ("MOAB", "", False), ".hmf": ("HMF", "", False), ".xml": ("DOLFIN XML", "", False),

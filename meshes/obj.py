@@ -1,11 +1,13 @@
-"""Points and faces of a Wavefront OBJ file.
+"""Points and faces of files of surfaces in text: Wavefront OBJ, and OFF.
 
-Not by meshio (5.3): it takes a negative index for one before the first point, colours behind the coordinates for more
-coordinates, and refuses files with another count of normals or texture points than of points.
+Not by meshio (5.3). Of OBJ it takes a negative index for one before the first point, colours behind the coordinates for
+more coordinates, and refuses files with another count of normals or texture points than of points. Of OFF it takes
+neither counts behind the keyword nor normals and colours.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError
+from .text_rows import EXPORT_AGAIN, SourceText, shown
 
 KINDS = {3: "triangle", 4: "quad"}
 
@@ -87,3 +90,45 @@ def _place(text: str, count: int) -> int:
     if index == 0 or place < 0:
         raise ValueError(text)
     return place
+
+
+# --- OFF ------------------------------------------------------------------------------------------------------------
+
+_OFF = re.compile(rb"\s*((?:ST|C|N)*OFF)\b")  # behind the coordinates come colours, normals, points of a texture
+_COMMENT = re.compile(rb"#[^\n]*")
+FACE = "a face is `number-of-corners corners...`, numbers from 0"
+
+
+def read_off(path: Path) -> Contents:
+    """Points (n, 3) and faces of an OFF file in text; colours and normals are left out.
+
+    Raises:
+        MeshError: the file is damaged; the message names file and line.
+    """
+    source = SourceText(path, _COMMENT.sub(b"", path.read_bytes()))
+    word = _OFF.match(source.text)
+    if not word:
+        source.refuse(0, f"`{shown(source.text[:80])}` is not OFF, with which such a file begins. {EXPORT_AGAIN}")
+    lines = source.rows(word.end(), len(source.text), "counts, coordinates, or corners of a face")
+    if not len(lines) or lines.counts[0] not in (2, 3) or (lines.columns([0], 2) < 0).any():
+        source.damaged(word.start(1), "no numbers of points and faces stand behind OFF: `8 6 0`.")
+    points, faces = (int(count) for count in lines.columns([0], 2)[0])
+    if len(lines) != 1 + points + faces:
+        where = int(lines.offsets[-1])
+        source.damaged(where, f"{points} points and {faces} faces are declared, and {len(lines) - 1} lines are there.")
+    if (short := lines.counts[1 : 1 + points] < 3).any():
+        source.damaged(int(lines.offsets[1 + short.argmax()]), "a point has three coordinates: `0 0.5 1`.")
+    rows = np.arange(1 + points, len(lines))
+    corners = lines.columns(rows, 1)[:, 0]
+    if (wrong := (corners < 3) | (corners != np.rint(corners)) | (corners >= lines.counts[rows])).any():
+        source.damaged(int(lines.offsets[rows[wrong.argmax()]]), f"the corners are too few or too many; {FACE}.")
+    blocks = []
+    for size in map(int, np.unique(corners)):
+        same = rows[corners == size]
+        nodes = lines.columns(same, 1 + size)[:, 1:]
+        if (wrong := ((nodes < 0) | (nodes >= points) | (nodes != np.rint(nodes))).any(axis=1)).any():
+            source.damaged(
+                int(lines.offsets[same[wrong.argmax()]]), f"a corner is none of the {points} points; {FACE}."
+            )
+        blocks.append(Block(KINDS.get(size, "polygon"), nodes.astype(np.int64)))
+    return Contents(lines.columns(np.arange(1, 1 + points), 3), blocks, {})

@@ -9,10 +9,11 @@ from pathlib import Path
 from .abaqus import read_abaqus
 from .contents import Contents
 from .data import MeshData, MeshError
+from .medit import read_medit
 from .meshio_reader import FORMATS, read_with_meshio
 from .msh2 import SAVE, read_msh2
 from .nastran import read_nastran
-from .obj import read_obj
+from .obj import read_obj, read_off
 from .plain_files import wrong_with
 from .stl import read_stl
 from .timed import read_within
@@ -21,8 +22,8 @@ from .vtk_readers import ENDINGS as VTK_ENDINGS
 from .vtk_readers import read_with_vtk
 
 OWN_READERS: dict[str, Callable[[Path], Contents]] = {
-    ".inp": read_abaqus, ".obj": read_obj, ".stl": read_stl, ".unv": read_unv, ".bdf": read_nastran,
-    ".nas": read_nastran, ".fem": read_nastran, **dict.fromkeys(VTK_ENDINGS, read_with_vtk),
+    ".inp": read_abaqus, ".mesh": read_medit, ".obj": read_obj, ".off": read_off, ".stl": read_stl, ".unv": read_unv,
+    **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran), **dict.fromkeys(VTK_ENDINGS, read_with_vtk),
 }  # fmt: skip
 SECONDS, SLOW = 60, 1e6  # of another program on a file, and the bytes a second that it reads at least
 MSH2 = 2  # version of MSH that is read here; later ones by gmsh

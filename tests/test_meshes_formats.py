@@ -573,8 +573,8 @@ SCRAPS = re.compile(
     r"could not convert|unpack|index \d+ is|list index|substring|NoneType|unhashable|'[a-z]+\d+'"
 )
 MESHIO = {
-    "part.mesh": None, "part.su2": None, "part.vol": "netgen", "part.avs": "avsucd", "part.dat": "tecplot",
-    "part.ele": "tetgen", "part.off": None, "part.xdmf": None, "part.h5m": None, "part.ply": None,
+    "part.su2": None, "part.vol": "netgen", "part.avs": "avsucd", "part.dat": "tecplot",
+    "part.ele": "tetgen", "part.xdmf": None, "part.h5m": None, "part.ply": None,
     "part.f3grid": None, "part.xml": "dolfin-xml", "part.cgns": None, "part.mdpa": None, "part.ugrid": None,
     "part.hmf": None,
 }  # fmt: skip
@@ -584,7 +584,7 @@ MESHIO = {
 def test_no_text_of_python_reaches_a_user(tmp_path: Path, name: str) -> None:
     """Files of all formats that meshio reads, cut off, and with a word in the place of a number."""
     box = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
-    cells = [("triangle", box.cells[:, :3])] if name.endswith((".off", ".ply")) else [("tetra", box.cells)]
+    cells = [("triangle", box.cells[:, :3])] if name.endswith(".ply") else [("tetra", box.cells)]
     if name == "part.ply":
         meshio.Mesh(box.points, cells).write(tmp_path / name, binary=False)
     else:
@@ -628,3 +628,149 @@ def test_a_reader_that_does_not_end_is_ended(tmp_path: Path) -> None:
         read_within(tmp_path / "part.xyz", Path.read_bytes, "it", 1)
     with pytest.raises(MeshError, match="is a named pipe, not a file"):
         read_mesh(tmp_path / "part.xyz")
+
+
+# --- Medit and OFF ----------------------------------------------------------------------------------------------------
+
+FREEFEM = """MeshVersionFormatted 1
+
+Dimension
+2
+
+Identifier
+";1, Date: 26/11/25 14:55 40s"
+
+Geometry
+"/home/user/part.mesh.gmsh"
+
+Vertices
+5
+0 0 4
+1 0 1
+1 1 1
+0 1 3
+.5 .5 0
+
+Edges
+4
+1 2 1
+2 3 2
+3 4 3
+4 1 4
+
+Triangles
+4
+1 2 5 7
+2 3 5 7
+3 4 5 8
+4 1 5 8
+
+SubDomainFromMesh
+1
+3 1 1 0
+
+SubDomainFromGeom
+1
+2 1 1 0
+
+VertexOnGeometricVertex
+1
+ 1 1
+
+End
+"""
+
+
+def test_plane_mesh_of_freefem(tmp_path: Path) -> None:
+    """With the sections that FreeFem 4.15 writes behind the cells."""
+    (tmp_path / "part.mesh").write_text(FREEFEM)
+    mesh = check_mesh(read_mesh(tmp_path / "part.mesh"))
+    np.testing.assert_array_equal(mesh.points, [[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0.5]])
+    assert {name: rows.tolist() for name, rows in mesh.regions.items()} == {"tag-7": [0, 1], "tag-8": [2, 3]}
+    groups = {name: sorted(rows[0].tolist()) for name, rows in mesh.facet_groups.items()}
+    assert groups == {"tag-1": [0, 1], "tag-2": [1, 2], "tag-3": [2, 3], "tag-4": [0, 3]}
+    assert mesh.notes == ()
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_medit_of_gmsh(tmp_path: Path, order: int) -> None:
+    """Numbers of nodes and tetrahedra as gmsh has them, and the volume in closed form."""
+    from fracsim.meshes.gmsh_session import session
+
+    with session() as gmsh:
+        gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.generate(3)
+        gmsh.model.mesh.setOrder(order)
+        gmsh.write(str(tmp_path / "part.mesh"))
+        kind, width = {1: (4, 4), 2: (11, 10)}[order]
+        count = len(gmsh.model.mesh.getElementsByType(kind)[0])
+        nodes = len(gmsh.model.mesh.getNodes()[0])
+    contents = read_contents(tmp_path / "part.mesh")
+    (cells,) = [block.nodes for block in contents.blocks if block.shape == "tetra"]
+    assert cells.shape == (count, width) and len(contents.points) == nodes
+    assert volumes(contents.points[cells[:, :4]]).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Vertices\n5", "Vertices\n6", "line 12: the section Vertices declares 6 entries of 3 numbers, and holds 5"),
+        ("1 1 1\n", "1 1\n", "line 16: the section Vertices declares 5 entries of 3 numbers, and holds 4.6"),
+        ("1 1 1\n", "1 1 x\n", "line 16: `1 1 x` is not what stands here"),
+        ("2 3 5 7", "2 9 5 7", "the triangle number 2 has a node that is not among the 5 vertices"),
+        ("2 3 5 7", "2 3.5 5 7", "entry 2 of Triangles has a number that is not whole"),
+        ("Dimension\n2", "Dimension\n4", "the dimension is 2 or 3"),
+        ("MeshVersionFormatted 1", "hello", "begins with `hello`, not with MeshVersionFormatted"),
+        ("Vertices\n", "Corners\n", "it has no section Vertices"),
+    ],
+)
+def test_damaged_medit(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in FREEFEM
+    (tmp_path / "part.mesh").write_text(FREEFEM.replace(old, new, 1))
+    with pytest.raises(MeshError, match=message):
+        read_mesh(tmp_path / "part.mesh")
+
+
+def test_medit_without_its_end_is_told(tmp_path: Path) -> None:
+    (tmp_path / "part.mesh").write_text(FREEFEM.replace("End\n", ""))
+    assert read_mesh(tmp_path / "part.mesh").notes == (
+        "The file lacks the keyword End: if it was cut off, cells are missing.",
+    )
+
+
+TETRAHEDRON = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+FACES = ["3 0 2 1", "3 0 1 3", "3 1 2 3", "3 2 0 3"]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["OFF", "4 4 6", *TETRAHEDRON, *FACES],
+        ["OFF 4 4 0", *TETRAHEDRON, *FACES],  # gmsh
+        ["NOFF", "4 4 0", *(f"{point} 0.1 0.2 0.3 " for point in TETRAHEDRON), *FACES],  # MeshLab
+        ["# of a program", "COFF", "4 4 0", "", *(f"{point} 9 9 9 255" for point in TETRAHEDRON), *FACES],
+        ["OFF", "4 4 0", *TETRAHEDRON, *(f"{face} 255 0 0 # red" for face in FACES)],
+    ],
+)
+def test_off_of_several_writers(tmp_path: Path, lines: list[str]) -> None:
+    (tmp_path / "part.off").write_text("\n".join(lines) + "\n")
+    assert read_surface(tmp_path / "part.off").volume == pytest.approx(1 / 6)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["OFF", "4 5 0", *TETRAHEDRON, *FACES], "line 10: 4 points and 5 faces are declared, and 8 lines are there"),
+        (["OFF", "4 4 0", "0 0", *TETRAHEDRON[1:], *FACES], "line 3: a point has three coordinates"),
+        (["OFF", "4 4 0", *TETRAHEDRON, "3 0 2 4", *FACES[1:]], "line 7: a corner is none of the 4 points"),
+        (["OFF", "4 4 0", *TETRAHEDRON, "4 0 2 1", *FACES[1:]], "line 7: the corners are too few or too many"),
+        (["OFF", "4 4 0", *TETRAHEDRON, "3 O 2 1", *FACES[1:]], "line 7: `3 O 2 1` is not what stands here"),
+        (["off"], "line 1: `off` is not OFF"),
+        (["OFF"], "line 1: no numbers of points and faces"),
+    ],
+)
+def test_damaged_off(tmp_path: Path, lines: list[str], message: str) -> None:
+    (tmp_path / "part.off").write_text("\n".join(lines) + "\n")
+    with pytest.raises(MeshError, match=message):
+        read_surface(tmp_path / "part.off")

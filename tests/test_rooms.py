@@ -33,7 +33,7 @@ OF_REPORT = {
 def imports(path: Path, package: str) -> set[str]:
     """Absolute names of the modules that a file imports; `package`: the one that it is in."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
