@@ -15,7 +15,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
-from .text_rows import EXPORT_AGAIN, SourceText, shown
+from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
 
 KINDS = {
     "Edges": ("line", 2), "Triangles": ("triangle", 3), "Quadrilaterals": ("quad", 4), "Tetrahedra": ("tetra", 4),
@@ -72,7 +72,7 @@ class _Medit:
             if name in SECOND_ORDER and self._holds(begin, end, KINDS[SECOND_ORDER[name]][1] + 1):
                 kind, size = KINDS[SECOND_ORDER[name]]
             rows = self._entries(name, at, begin, end, size + 1, NUMBERS)
-            if (wrong := (rows != np.rint(rows)).any(axis=1)).any():
+            if (wrong := not_whole(rows).any(axis=1)).any():
                 self.source.damaged(at, f"entry {wrong.argmax() + 1} of {name} has a number that is not whole.")
             self.cells.setdefault(kind, []).append(rows.astype(np.int64))
         elif name == "End":
@@ -87,7 +87,7 @@ class _Medit:
         """(count, width) the numbers of a section; where one line lacks or has numbers the message has that line."""
         lines = self.source.rows(begin, end, needed)
         values = lines.values
-        count = int(values[0]) if len(values) and values[0] >= 0 else -1
+        count = int(values[0]) if len(values) and not not_whole(values[:1])[0] and values[0] >= 0 else -1
         if len(values) != 1 + count * width:
             odd = np.flatnonzero(lines.counts[1:] != width)
             at = int(lines.offsets[1 + odd[0]]) if len(odd) else at

@@ -18,7 +18,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
-from .text_rows import EXPORT_AGAIN, SourceText, decoded, numbered, shown
+from .text_rows import EXPORT_AGAIN, SourceText, decoded, not_whole, numbered, shown
 
 SAVE = "Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`"
 # Numbers of element types in MSH files: kind and number of nodes, corners first.
@@ -164,7 +164,7 @@ class _Msh2:
         return np.frombuffer(self.source.text, kind, count, begin)
 
     def _whole(self, values: Any, offsets: Indices, needed: str) -> Indices:
-        wrong = (values != np.rint(values)) | (np.abs(values) > 2**53)
+        wrong = not_whole(values)
         if wrong.any():
             place = int(wrong.argmax())
             self.source.damaged(int(offsets[place]), f"{values[place]:g} is no whole number; {needed}.")
@@ -217,8 +217,7 @@ class _Msh2:
             yield type_, (values[:, 0], self._physical(values, 3, tag_count), values[:, 3 + tag_count :])
 
     def _whole_rows(self, values: Any, offsets: Indices) -> Indices:
-        if (values != np.rint(values)).any() or (np.abs(values) > 2**53).any():
-            wrong = ((values != np.rint(values)) | (np.abs(values) > 2**53)).any(axis=1)
+        if (wrong := not_whole(values).any(axis=1)).any():
             self.source.damaged(int(offsets[wrong.argmax()]), f"a number of this element is not whole; {ELEMENT}.")
         whole: Indices = values.astype(np.int64)
         return whole

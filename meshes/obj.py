@@ -15,7 +15,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError
-from .text_rows import EXPORT_AGAIN, SourceText, shown
+from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
 
 KINDS = {3: "triangle", 4: "quad"}
 
@@ -110,9 +110,10 @@ def read_off(path: Path) -> Contents:
     if not word:
         source.refuse(0, f"`{shown(source.text[:80])}` is not OFF, with which such a file begins. {EXPORT_AGAIN}")
     lines = source.rows(word.end(), len(source.text), "counts, coordinates, or corners of a face")
-    if not len(lines) or lines.counts[0] not in (2, 3) or (lines.columns([0], 2) < 0).any():
+    counts = lines.columns([0], 2)[0] if len(lines) and lines.counts[0] in (2, 3) else np.array([-1.0])
+    if not_whole(counts).any() or counts.min() < 0:
         source.damaged(word.start(1), "no numbers of points and faces stand behind OFF: `8 6 0`.")
-    points, faces = (int(count) for count in lines.columns([0], 2)[0])
+    points, faces = map(int, counts)
     if len(lines) != 1 + points + faces:
         where = int(lines.offsets[-1])
         source.damaged(where, f"{points} points and {faces} faces are declared, and {len(lines) - 1} lines are there.")
@@ -120,13 +121,13 @@ def read_off(path: Path) -> Contents:
         source.damaged(int(lines.offsets[1 + short.argmax()]), "a point has three coordinates: `0 0.5 1`.")
     rows = np.arange(1 + points, len(lines))
     corners = lines.columns(rows, 1)[:, 0]
-    if (wrong := (corners < 3) | (corners != np.rint(corners)) | (corners >= lines.counts[rows])).any():
+    if (wrong := (corners < 3) | not_whole(corners) | (corners >= lines.counts[rows])).any():
         source.damaged(int(lines.offsets[rows[wrong.argmax()]]), f"the corners are too few or too many; {FACE}.")
     blocks = []
     for size in map(int, np.unique(corners)):
         same = rows[corners == size]
         nodes = lines.columns(same, 1 + size)[:, 1:]
-        if (wrong := ((nodes < 0) | (nodes >= points) | (nodes != np.rint(nodes))).any(axis=1)).any():
+        if (wrong := ((nodes < 0) | (nodes >= points) | not_whole(nodes)).any(axis=1)).any():
             source.damaged(
                 int(lines.offsets[same[wrong.argmax()]]), f"a corner is none of the {points} points; {FACE}."
             )

@@ -120,6 +120,12 @@ def _token_starts(text: bytes) -> Indices:
     return starts
 
 
+def not_whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Which numbers are no whole numbers that 64 bits hold exactly; nan and inf are none."""
+    wrong: npt.NDArray[np.bool_] = (values != np.rint(values)) | (np.abs(values) > 2**53)
+    return wrong
+
+
 def shown(line: bytes) -> str:
     """The beginning of the first line, for a message."""
     return line.strip().split(b"\n")[0][:SHOWN].decode("utf-8", "replace").rstrip()

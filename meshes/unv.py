@@ -15,7 +15,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
-from .text_rows import Rows, SourceText, decoded, numbered, shown
+from .text_rows import Rows, SourceText, decoded, not_whole, numbered, shown
 
 OLD_NODES, NODES = (15,), (781, 2411)
 ELEMENTS = (780, 2412)
@@ -38,6 +38,7 @@ KINDS: dict[int, tuple[str, list[int]]] = {
 BEAMS = range(11, 40)  # have a line of their own before their nodes
 ONE_NODE = (121, 122, 136, 137, 138, 139, 141, 142, 151, 152, 161)  # rigid, springs, masses: left out and counted
 _WORD = re.compile(rb"\S+")
+MAX_NODES = 1000  # of an element
 NODE_LINE = "a node has a line `number 1 1 11`, then a line `x y z`"
 ELEMENT_LINE = "an element has a line `number type property material colour nodes`, then its nodes, eight on a line"
 GROUP_LINE = "a group has a line of eight whole numbers, a line with its name, then its members"
@@ -119,8 +120,8 @@ class _Unv:
         self.points.append(np.ascontiguousarray(points))
 
     def _whole(self, values: Points, offsets: Indices, needed: str) -> Indices:
-        wrong = (values != np.rint(values)) | (np.abs(values) > 2**53)
-        if (rows := wrong.reshape(len(values), -1).any(axis=1)).any():
+        rows = not_whole(values).reshape(len(values), -1).any(axis=1) if values.size else np.zeros(0, bool)
+        if rows.any():
             self.source.damaged(int(offsets[rows.argmax()]), f"a number of this line is not whole; {needed}.")
         whole: Indices = values.astype(np.int64)
         return whole
@@ -163,7 +164,7 @@ class _Unv:
                 f"{lines.counts[line]} numbers stand here instead of 6; {ELEMENT_LINE}.",
             )
         head = lines.columns([line], 6)[0]
-        if not (0 <= head[5] <= 1000 and head[5] == int(head[5]) and head[1] == int(head[1])):
+        if not_whole(head).any() or not 0 <= head[5] <= MAX_NODES:
             self.source.damaged(int(lines.offsets[line]), f"this is no head of an element; {ELEMENT_LINE}.")
         return head
 
@@ -193,15 +194,16 @@ class _Unv:
             head_end = text.find(b"\n", begin, end) + 1
             name_end = text.find(b"\n", head_end, end) + 1
             head = self.source.rows(begin, head_end or end, GROUP_LINE)
-            if not head_end or not name_end or not len(head.values) or head.values[-1] < 0:
+            count = int(head.values[-1]) if len(head.values) and not not_whole(head.values).any() else -1
+            if not head_end or not name_end or count < 0:
                 self.source.damaged(begin, f"this is no head of a group; {GROUP_LINE}.")
-            count = int(head.values[-1])
             stop = _after_tokens(text, name_end, end, width * count)
             if stop < 0:
                 self.source.damaged(begin, f"a group of {count} members ends before the last of them.")
-            members = self._whole(
-                self.source.rows(name_end, stop, GROUP_LINE).values, np.full(width * count, name_end), GROUP_LINE
-            ).reshape(-1, width)
+            values = self.source.rows(name_end, stop, GROUP_LINE).values
+            if len(values) != width * count:
+                self.source.damaged(begin, f"a group of {count} members has more numbers on its last line.")
+            members = self._whole(values, np.full(len(values), name_end), GROUP_LINE).reshape(-1, width)
             name = decoded(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
             nodes, elements = (members[members[:, 0] == kind, 1] for kind in (7, 8))
             self.groups.append((name, nodes, elements))

@@ -118,7 +118,8 @@ def _triangles(points: Points, block: Block) -> Indices:
             f"The surface has {len(faces)} faces of kind {block.kind} with fewer than three corners, or with corners "
             "that do not exist; export it again, as triangles."
         )
-    return triangles_of_faces(points, faces)
+    with np.errstate(all="ignore"):  # coordinates out of reach are told by closed_surface
+        return triangles_of_faces(points, faces)
 
 
 def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSurface:
