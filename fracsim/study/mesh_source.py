@@ -71,6 +71,7 @@ BESIDE = {
         "h": "a surface is filled with cells of size h > 0 (m)",
         "scale": "metres for each unit of length of the file, a number > 0",
         "time_limit": "seconds that gmsh may take, a number > 0",
+        "repair": "whether holes are filled and parts that cross are made one, true or false",
     },
     "outline": {
         "h": "an outline is filled with cells of size h > 0 (m)",
@@ -83,7 +84,7 @@ BESIDE = {
     },
 }
 NEEDED = ("h", "thickness")  # of those that have it
-SWITCHES = ("join",)  # keys that are true or false
+SWITCHES = ("join", "repair")  # keys that are true or false
 
 
 def _check_source(mesh: Mesh) -> None:
@@ -107,15 +108,26 @@ def check_file(path: Path, key: str) -> None:
         raise InputError(f'{key} = "{path}"{": there is no such file" if wrong == MISSING else f" {wrong}"}')
 
 
+REPAIR = "Or set [mesh] repair = true: it fills holes, mends what cuts itself, and says what it changed."
+
+
 def open_surface(mesh: Mesh) -> ClosedSurface | None:
     """The closed surface of a [mesh] table in metres, checked but not filled; None where it names none. InputError."""
     if mesh.surface is None:
         return None
-    from ..meshes.surfaces.closed import read_surface
+    from ..meshes.surfaces.closed import Repairable
+    from ..meshes.surfaces.repair import read_body
 
     _check_source(mesh)
+    given = mesh.parameters
+    repair = bool(given.get("repair"))
     with _told():
-        return read_surface(mesh.surface, float(mesh.parameters.get("scale", 1.0)))
+        try:
+            return read_body(
+                mesh.surface, float(given.get("scale", 1.0)), repair=repair, time_limit=given.get("time_limit")
+            )
+        except Repairable as error:
+            raise MeshError(str(error) if repair else f"{error} {REPAIR}") from None
 
 
 def open_outline(mesh: Mesh) -> Drawn | None:

@@ -21,6 +21,10 @@ from .polygons import triangles_of_faces
 PROBES = 300  # points of a part that are looked up in another part
 
 
+class Repairable(MeshError):
+    """A surface that is open or cuts itself, which `repair` may mend."""
+
+
 @dataclass(frozen=True)
 class ClosedSurface:
     """Triangles that enclose one or more bodies.
@@ -73,23 +77,23 @@ def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
             triangles without an area or points that are no numbers, or parts that cut each other.
     """
     path = Path(path)
-    return closed_surface(*_read_triangles(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
+    return closed_surface(*triangles_as_given(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
 
 
 def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, int]:
     """Points [m] and triangles of a surface, closed or open, joined at coincident points and turned alike; how many
     were turned. MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
-    points, triangles = _read_triangles(path, scale, source)
-    _check_points(points, triangles, source)
+    points, triangles = triangles_as_given(path, scale, source)
+    check_points(points, triangles, source)
     points, triangles = joined(points, triangles)
-    _check_areas(points, triangles, source)
-    _check_edges(points, triangles, source, (2,))
-    triangles, _, turned = _consistent(triangles, source)
+    check_areas(points, triangles, source)
+    check_edges(points, triangles, source, (2,))
+    triangles, _, turned = turned_alike(triangles, source)
     return points, triangles, turned
 
 
-def _read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
-    """As they are in a file; `scale`: metres per unit of it."""
+def triangles_as_given(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
+    """Points [m] and triangles as they are in a file; `scale`: metres per unit of it. MeshError as of read_surface."""
     contents = read_contents(path)
     triangles = np.concatenate(
         [np.zeros((0, 3), np.int64), *(_triangles(contents.points, block) for block in contents.blocks)]
@@ -128,11 +132,11 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
     Raises:
         MeshError: see read_surface; `source` begins the message.
     """
-    _check_points(points, triangles, source)
+    check_points(points, triangles, source)
     points, triangles, mends = mended(points, triangles)
-    _check_areas(points, triangles, source)
+    check_areas(points, triangles, source)
     _check_closed(points, triangles, source)
-    triangles, shell, turned = _consistent(triangles, source)
+    triangles, shell, turned = turned_alike(triangles, source)
     triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
     notes = list(mends)
     if turned:
@@ -147,7 +151,7 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
     return ClosedSurface(points, triangles, shell, bodies, tuple(notes))
 
 
-def _check_points(points: Points, triangles: Indices, source: str) -> None:
+def check_points(points: Points, triangles: Indices, source: str) -> None:
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise MeshError(f"{source} names points that do not exist (there are {len(points)}); it is damaged.")
     used = np.unique(triangles)
@@ -161,7 +165,7 @@ def _check_points(points: Points, triangles: Indices, source: str) -> None:
         raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed.")
 
 
-def _check_areas(points: Points, triangles: Indices, source: str) -> None:
+def check_areas(points: Points, triangles: Indices, source: str) -> None:
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
     flat = np.flatnonzero(flat_triangles(points, triangles))
@@ -173,26 +177,28 @@ def _check_areas(points: Points, triangles: Indices, source: str) -> None:
 
 
 def _check_closed(points: Points, triangles: Indices, source: str) -> None:
-    _check_edges(points, triangles, source, (1, 2))
+    check_edges(points, triangles, source, (1, 2))
 
 
-def _check_edges(points: Points, triangles: Indices, source: str, which: tuple[int, ...]) -> None:
+def check_edges(points: Points, triangles: Indices, source: str, which: tuple[int, ...]) -> None:
     """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
     edges, counts, _ = distinct_rows(np.sort(directed_edges(triangles), axis=1))
     found = {
         1: (edges[counts == 1], "is open: {} edges belong to one triangle only"),
         2: (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
     }
-    for wrong, what in (found[kind] for kind in which):
+    for kind in which:
+        wrong, what = found[kind]
         if len(wrong):
-            raise MeshError(
+            refused = Repairable if kind == 1 and not len(found[2][0]) else MeshError
+            raise refused(
                 f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
                 "close or mend it there (MeshLab: Filters > Remeshing > Close Holes; Blender: Mesh > Clean Up > Fill "
                 "Holes)."
             )
 
 
-def _consistent(triangles: Indices, source: str) -> tuple[Indices, Indices, int]:
+def turned_alike(triangles: Indices, source: str) -> tuple[Indices, Indices, int]:
     """Triangles turned so that neighbours face the same side; the connected part of each; how many were turned.
 
     Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; the
@@ -247,7 +253,7 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
         probes = np.unique(corners[i].reshape(-1, 3), axis=0)
         within = abs(windings(probes[:: 1 + len(probes) // PROBES], corners[j])) > 0.5
         if within.any() and not within.all():
-            raise MeshError(
+            raise Repairable(
                 f"{source} has parts that cut each other, near {middle_of(points, triangles[shell == i].ravel())}; "
                 "join them into one surface, or move them apart."
             )

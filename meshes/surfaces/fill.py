@@ -16,8 +16,9 @@ from ..parameters import affordable, positive, require
 from ..sizing import Sizing, cells_for_body
 from ..timed import within
 from ..topology import Floats, boundary_facets, distinct_rows, facets_of, signed_measures
-from .closed import ClosedSurface, read_surface
+from .closed import ClosedSurface
 from .enclosed import enclosed_volumes
+from .repair import read_body
 
 SHARP = 40 * pi / 180  # edges where the normal turns by more than this are kept
 REMESHED = 0.10  # a remeshed surface may enclose this much more or less of its volume, or its own triangles are taken
@@ -30,7 +31,9 @@ TOLD = 0.01  # share of the file's volume from which on a difference is told
 Shell = tuple[Points, Indices]
 
 
-def fill_surface(path: str | Path, h: float, *, scale: float = 1.0, time_limit: float | None = None) -> MeshData:
+def fill_surface(
+    path: str | Path, h: float, *, scale: float = 1.0, time_limit: float | None = None, repair: bool = False
+) -> MeshData:
     """Tetrahedra of size h [m] inside a closed surface (STL, OBJ, PLY, ...), checked.
 
     The surface is meshed anew at size h, edges of more than 40 degrees kept; where that fails its own triangles are
@@ -41,12 +44,14 @@ def fill_surface(path: str | Path, h: float, *, scale: float = 1.0, time_limit: 
         h: size of the cells [m].
         scale: metres per unit of length of the file.
         time_limit: seconds that gmsh may take; None: a minute and a millisecond for each cell expected.
+        repair: whether holes are filled, and what cuts itself is mended (see repair).
 
     Raises:
-        MeshError: h is out of range; the surface is not closed or is damaged (see read_surface); gmsh fails or takes
+        MeshError: h is out of range; the surface is not closed or is damaged (see read_body); gmsh fails or takes
             too long; the volume of the cells is not that of the surface.
     """
-    return fill_closed(read_surface(path, scale), h, f"Surface file '{path}'", time_limit)
+    surface = read_body(path, scale, repair=repair, time_limit=time_limit)
+    return fill_closed(surface, h, f"Surface file '{path}'", time_limit)
 
 
 def fill_closed(surface: ClosedSurface, h: float, source: str, time_limit: float | None = None) -> MeshData:
@@ -164,7 +169,8 @@ def _filled(shells: list[Shell], bodies: list[list[int]], h: float, source: str)
             points, cells = cells_in(gmsh, 3)
     except MeshError as error:
         raise MeshError(
-            f"{source} could not be filled with tetrahedra ({error}) Does the surface cut itself?"
+            f"{source} could not be filled with tetrahedra ({error}) Does the surface cut itself? [mesh] repair "
+            "= true mends that in many cases."
         ) from error
     return points, cells
 
