@@ -9,6 +9,7 @@ families without groups.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,6 +19,7 @@ import numpy as np
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
 from .plain_files import HDF5_SIGNATURE, data_elsewhere
+from .tags import members_by_tag
 from .text_rows import decoded, shown
 
 KINDS = {
@@ -87,18 +89,11 @@ def _contents(path: Path, file: Any, where: list[str]) -> Contents:
     cell_groups, node_groups = _groups_of_families(file, name)
     sets: dict[str, list[Indices]] = {}
     for i, family in enumerate(families):
-        for number in np.unique(family[family != 0]).tolist():
-            for group in cell_groups.get(number) or [f"family-{abs(number)}"]:
-                members = sets.setdefault(group, [np.zeros(0, np.int64) for _ in blocks])
-                members[i] = np.union1d(members[i], np.flatnonzero(family == number)).astype(np.int64)
-    point_sets: dict[str, Indices] = {}
-    if "FAM" in step["NOE"]:
-        where[0] = "the families of nodes"
-        family = _integers(step["NOE"]["FAM"], len(points))
-        for number in np.unique(family[family != 0]).tolist():
-            for group in node_groups.get(number) or [f"nodes-{abs(number)}"]:
-                members_of = np.flatnonzero(family == number)
-                point_sets[group] = np.union1d(point_sets.get(group, members_of), members_of).astype(np.int64)
+        for group, members in _groups(family, cell_groups, "family"):
+            sets.setdefault(group, [np.zeros(0, np.int64) for _ in blocks])[i] = members
+    where[0] = "the list of families of nodes"
+    family = _integers(step["NOE"]["FAM"], len(points)) if "FAM" in step["NOE"] else np.zeros(0, np.int64)
+    point_sets = dict(_groups(family, node_groups, "nodes"))
     if fields := list(file["CHA"]) if "CHA" in file else []:
         notes.append(f"Not used: results ({', '.join(fields)}).")
     return Contents(points, blocks, sets, point_sets, notes=tuple(notes))
@@ -148,6 +143,16 @@ def _integers(stored: Any, count: int) -> Indices:
         raise ValueError(stored.name)
     integers: Indices = values.astype(np.int64)
     return integers
+
+
+def _groups(family: Indices, names: dict[int, list[str]], word: str) -> Iterator[tuple[str, Indices]]:
+    """Groups and their members, from the family of each cell or node; families that are not listed by their number."""
+    parts: dict[str, list[Indices]] = {}
+    for number, members in members_by_tag(family):
+        for group in names.get(number) or [f"{word}-{abs(number)}"]:
+            parts.setdefault(group, []).append(members)
+    for group, found in parts.items():
+        yield group, np.unique(np.concatenate(found))
 
 
 def _groups_of_families(file: Any, mesh: str) -> tuple[dict[int, list[str]], dict[int, list[str]]]:

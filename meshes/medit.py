@@ -15,6 +15,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .tags import sets_by_tag
 from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
 
 KINDS = {
@@ -101,18 +102,17 @@ class _Medit:
         if self.points is None:
             raise MeshError(f"Mesh file '{self.source.path}' could not be read: it has no section Vertices. {EXPORT}")
         blocks: list[Block] = []
-        sets: dict[str, list[Indices]] = {}
+        labels_of: list[Indices] = []
         tables = {kind: np.concatenate(parts) for kind, parts in self.cells.items()}
-        for i, (kind, rows) in enumerate(tables.items()):
-            nodes, labels = rows[:, :-1] - 1, rows[:, -1]
+        for kind, rows in tables.items():
+            nodes = rows[:, :-1] - 1
             if (missing := ((nodes < 0) | (nodes >= len(self.points))).any(axis=1)).any():
                 raise MeshError(
                     f"Mesh file '{self.source.path}' could not be read: the {kind} number {missing.argmax() + 1} has a "
                     f"node that is not among the {len(self.points)} vertices. {EXPORT_AGAIN}"
                 )
             blocks.append(Block(kind, nodes))
-            for label in map(int, np.unique(labels[labels != 0])):
-                members = sets.setdefault(f"tag-{label}", [np.zeros(0, np.int64) for _ in tables])
-                members[i] = np.flatnonzero(labels == label).astype(np.int64)
+            labels_of.append(rows[:, -1])
+        sets, notes = sets_by_tag(labels_of, lambda *_: "", "labels")
         note = () if self.ended else ("The file lacks the keyword End: if it was cut off, cells are missing.",)
-        return Contents(self.points, blocks, sets, notes=note)
+        return Contents(self.points, blocks, sets, notes=notes + note)

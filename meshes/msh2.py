@@ -18,6 +18,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .tags import sets_by_tag
 from .text_rows import EXPORT_AGAIN, SourceText, decoded, not_whole, numbered, shown
 
 SAVE = "Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`"
@@ -246,8 +247,7 @@ class _Msh2:
 
     def contents(self) -> Contents:
         blocks: list[Block] = []
-        sets: dict[str, list[Indices]] = {}
-        parts: list[tuple[int, Indices]] = []
+        parts: list[Indices] = []
         for type_, groups in self.groups.items():
             kind = KINDS[type_][0]
             numbers, physical, nodes = (np.concatenate(column) for column in zip(*groups, strict=True))
@@ -259,11 +259,8 @@ class _Msh2:
                     f"{int(nodes[row][places[row] < 0][0])}, which is not in the file. {EXPORT_AGAIN}"
                 )
             blocks.append(Block(kind, places))
-            parts.append((len(blocks) - 1, physical))
-        for i, physical in parts:
-            for tag in np.unique(physical[physical != 0]).tolist():
-                name = self.names.get((blocks[i].dim, tag)) or f"tag-{tag}"
-                members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
-                members[i] = np.union1d(members[i], np.flatnonzero(physical == tag)).astype(np.int64)
-        notes = (f"Not used: {', '.join(self.unused)}.",) if self.unused else ()
+            parts.append(physical)
+        sets, notes = sets_by_tag(parts, lambda tag, i: self.names.get((blocks[i].dim, tag), ""), "physical groups")
+        if self.unused:
+            notes += (f"Not used: {', '.join(self.unused)}.",)
         return Contents(self.points, blocks, sets, copies=True, notes=notes)

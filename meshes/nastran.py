@@ -19,6 +19,7 @@ import numpy as np
 
 from .contents import Block, Contents
 from .data import Indices, MeshError
+from .tags import sets_by_tag
 from .text_rows import EXPORT_AGAIN, SourceText, decoded, numbered, shown
 
 # Kinds of cells, by the number of nodes.
@@ -213,7 +214,6 @@ class _Bulk:
         ids = np.array(list(self.grids), np.int64)
         points = np.array(list(self.grids.values()), np.float64)
         blocks: list[Block] = []
-        sets: dict[str, list[Indices]] = {}
         owners: list[Indices] = []
         for kind, (numbers, properties, nodes) in self.elements.items():
             table = np.array(nodes, np.int64)
@@ -230,14 +230,9 @@ class _Bulk:
             places = numbered(ids, np.unique(self.middles))
             blocks.append(Block("vertex", places[places >= 0][:, None]))
             owners.append(np.zeros(len(blocks[-1].nodes), np.int64))
-        for i, owner in enumerate(owners):
-            for tag in map(int, np.unique(owner[owner > 0])):
-                members = sets.setdefault(self._set_name(tag), [np.zeros(0, np.int64) for _ in blocks])
-                members[i] = np.union1d(members[i], np.flatnonzero(owner == tag)).astype(np.int64)
-        return Contents(points, blocks, sets, notes=tuple(self._notes()))
-
-    def _set_name(self, number: int) -> str:
-        return self.names[number][1] if number in self.names else f"tag-{number}"
+        names = {number: name for number, (_, name) in self.names.items()}
+        sets, notes = sets_by_tag(owners, lambda tag, _: names.get(tag, ""), "properties")
+        return Contents(points, blocks, sets, notes=(*notes, *self._notes()))
 
     def _notes(self) -> Iterator[str]:
         if self.left_out:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -79,3 +79,39 @@ def _tags(key: str, values: list[Any]) -> list[Array] | None:
     if any(part.dtype.kind not in "iuU" for part in parts):
         return None
     return parts if not parts or len(np.unique(np.concatenate(parts))) <= MAX_TAGS else None
+
+
+def members_by_tag(values: Indices) -> Iterator[tuple[int, Indices]]:
+    """Numbers other than 0, and the places of each."""
+    order = np.argsort(values, kind="stable").astype(np.int64)
+    distinct, first = np.unique(values[order], return_index=True)
+    for tag, members in zip(map(int, distinct), np.split(order, first[1:]), strict=False):
+        if tag:
+            yield tag, members
+
+
+def sets_by_tag(
+    tags: list[Indices], name_of: Callable[[int, int], str], what: str
+) -> tuple[dict[str, list[Indices]], tuple[str, ...]]:
+    """Sets of cells by one whole number a cell, 0 for none; and notes.
+
+    Arguments:
+        tags: for each block one number a cell.
+        name_of: the name of a number in a block, "" where it has none: it is called "tag-7" then.
+        what: the numbers in words, for a note where those without a name are too many to mean groups.
+    """
+    sets: dict[str, list[Indices]] = {}
+    unnamed: set[int] = set()
+    for i, values in enumerate(tags):
+        for tag, members in members_by_tag(values):
+            name = name_of(tag, i)
+            if not name:
+                unnamed.add(tag)
+                name = f"tag-{tag}"
+            parts = sets.setdefault(name, [np.zeros(0, np.int64) for _ in tags])
+            parts[i] = np.union1d(parts[i], members).astype(np.int64) if len(parts[i]) else members
+    if len(unnamed) <= MAX_TAGS:
+        return sets, ()
+    numbers = {f"tag-{tag}" for tag in unnamed}
+    kept = {name: parts for name, parts in sets.items() if name not in numbers}
+    return kept, (f"Not used: {len(unnamed)} {what} without a name, too many to mean groups of cells.",)

@@ -9,6 +9,7 @@ Not by gmsh (4.13), which reads groups of gmsh's own files only (dataset 2477), 
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,7 @@ KINDS: dict[int, tuple[str, list[int]]] = {
 BEAMS = range(11, 40)  # have a line of their own before their nodes
 ONE_NODE = (121, 122, 136, 137, 138, 139, 141, 142, 151, 152, 161)  # rigid, springs, masses: left out and counted
 _WORD = re.compile(rb"\S+")
+MIN_WINDOW = 256  # elements that are compared with the first of them at once
 MAX_NODES = 1000  # of an element
 NODE_LINE = "a node has a line `number 1 1 11`, then a line `x y z`"
 ELEMENT_LINE = "an element has a line `number type property material colour nodes`, then its nodes, eight on a line"
@@ -128,14 +130,14 @@ class _Unv:
 
     def _elements(self, lines: Rows) -> None:
         """Runs of elements of one type, which have equally many lines, are taken at once."""
-        counts, line = lines.counts, 0
+        counts, line, window = lines.counts, 0, MIN_WINDOW
         while line < len(lines):
             head = self._head(lines, line)
             type_, size = int(head[1]), int(head[5])
             beam = type_ in BEAMS
             wanted = [6, *([3] if beam else []), *([8] * (size // 8) + ([size % 8] if size % 8 else []))]
             period = len(wanted)
-            room = (len(lines) - line) // period
+            room = min((len(lines) - line) // period, window)  # types may alternate: not all that is left is looked at
             if not room:
                 self.source.damaged(int(lines.offsets[line]), f"element {int(head[0])} is cut short; {ELEMENT_LINE}.")
             table = counts[line : line + room * period].reshape(room, period)
@@ -156,6 +158,7 @@ class _Unv:
             )
             self._add(type_, size, rows, int(lines.offsets[line]))
             line += run * period
+            window = 2 * window if run == room else MIN_WINDOW
 
     def _head(self, lines: Rows, line: int) -> Points:
         if lines.counts[line] != 6:
@@ -245,6 +248,12 @@ class _Unv:
         sets: dict[str, list[Indices]] = {}
         point_sets: dict[str, Indices] = {}
         lost = 0
+        numbers = np.concatenate([*owners, np.zeros(0, np.int64)])
+        starts = np.cumsum([0, *map(len, owners)])
+        if len(np.unique(numbers)) < len(numbers):
+            ordered = np.sort(numbers)
+            again = ordered[np.flatnonzero(np.diff(ordered) == 0)[0]]
+            self.source.damaged(0, f"element {again} is given twice.")
         for name, nodes, elements in self.groups:
             if len(nodes):
                 places = numbered(ids, nodes)
@@ -252,10 +261,13 @@ class _Unv:
                 point_sets[name] = np.union1d(point_sets.get(name, places[:0]), places[places >= 0]).astype(np.int64)
             if not len(elements):
                 continue
+            places = numbered(numbers, elements)
+            lost += int((places < 0).sum())
+            places = np.unique(places[places >= 0])
             members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
-            lost += int((~np.isin(elements, np.concatenate([*owners, elements[:0]]))).sum())
-            for i, numbers in enumerate(owners):
-                members[i] = np.union1d(members[i], np.flatnonzero(np.isin(numbers, elements))).astype(np.int64)
+            for i, (begin, end) in enumerate(pairwise(starts)):
+                part = places[(places >= begin) & (places < end)] - begin
+                members[i] = np.union1d(members[i], part).astype(np.int64)
         return sets, point_sets, lost
 
     def _notes(self) -> list[str]:

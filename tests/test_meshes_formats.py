@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -790,3 +791,28 @@ def test_changed_files_are_read_or_refused(tmp_path: Path, ending: str) -> None:
             refused += 1
             assert str(error).startswith(f"Mesh file '{path}'")
     assert refused > 30
+
+
+# --- never slow -------------------------------------------------------------------------------------------------------
+
+
+def test_many_properties_are_no_regions(tmp_path: Path) -> None:
+    """A property a cell, as of composites: without a name they are no groups, and the time grows linearly."""
+    count = 2000
+    cells = "".join(f"CTETRA,{i},{i},1,2,3,4\n" for i in range(1, count + 1))
+    grids = "".join(f"GRID,{number},,{x},{y},{z}\n" for number, (x, y, z) in PLACES.items())
+    (tmp_path / "part.bdf").write_text(f'BEGIN BULK\n$HMNAME PROP 5"five"\n{grids}{cells}ENDDATA\n')
+    contents = read_contents(tmp_path / "part.bdf")
+    assert {name: rows[0].tolist() for name, rows in contents.sets.items()} == {"five": [4]}
+    assert contents.notes == ("Not used: 1999 properties without a name, too many to mean groups of cells.",)
+
+
+def test_universal_file_with_types_in_turn(tmp_path: Path) -> None:
+    """40,000 elements of which no two beside each other are of one type: all are read, in time."""
+    begin = time.process_time()
+    rows = [line for i in range(20000)
+            for line in element(2 * i + 1, 111, 1, 2, 3, 4) + element(2 * i + 2, 41, 1, 2, 3)]  # fmt: skip
+    (tmp_path / "part.unv").write_text(SALOME["nodes"] + dataset(2412, *rows))
+    blocks = {block.kind: len(block.nodes) for block in read_contents(tmp_path / "part.unv").blocks}
+    assert blocks == {"tetra": 20000, "triangle": 20000}
+    assert time.process_time() - begin < 20
