@@ -39,5 +39,10 @@ def write_mesh(mesh: MeshData, path: Path) -> None:
             meshio.Mesh(points, blocks, cell_data=data, field_data=field_data).write(new, **options)
     except NotAFile as error:
         raise MeshError(f"{path} {error.strerror}; give another name") from None
-    except (SystemExit, Exception) as error:
-        raise MeshError(f"cannot save the mesh as {path}: {error}") from None
+    except OSError as error:
+        raise MeshError(f"cannot save the mesh as {path}: {error.strerror or 'it cannot be written there'}") from None
+    except (SystemExit, Exception):  # meshio raises whatever its writers raise
+        known = ", ".join(sorted(meshio.extension_to_filetypes))
+        is_known = any(path.name.lower().endswith(ending) for ending in meshio.extension_to_filetypes)
+        why = "this mesh does not fit that format" if is_known else f"its ending is of no known format ({known})"
+        raise MeshError(f"cannot save the mesh as {path}: {why}; save it as .msh, .vtu or .xdmf") from None

@@ -13,6 +13,7 @@ from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.read import read_mesh
 from fracsim.meshes.scattered.drawn import fill_outline, read_outline
+from fracsim.meshes.write import write_mesh
 
 
 def sample(dim: int) -> MeshData:
@@ -306,3 +307,25 @@ def test_a_long_outline_is_too_many_cells(tmp_path: Path) -> None:
     (tmp_path / "long.csv").write_text("0, 0\n1e10, 0\n1e10, 1e-9\n")
     with pytest.raises(MeshError, match=r"would make about 2\.0e\+11 cells"):
         fill_outline(read_outline(tmp_path / "long.csv"), 0.1)
+
+
+def test_an_outline_in_letters_of_windows(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes("# Körper\n0, 0, Süd\n1, 0\n0, 1\n".encode("cp1252"))
+    assert read_outline(tmp_path / "a.csv").groups == ("Süd", "", "")
+    (tmp_path / "a.csv").write_text("0, 0\n1, 0\n0, 1\n", encoding="utf-16")
+    with pytest.raises(MeshError, match=r"a.csv' is no text; save it as plain text: a line `x, y` for each corner"):
+        read_outline(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("part.odd", r"its ending is of no known format \(.*\.xdmf.*\); save it as .msh, .vtu or .xdmf$"),
+        ("part.svg", "this mesh does not fit that format; save it as .msh, .vtu or .xdmf$"),
+        ("link/part.vtu", "Not a directory$|File exists$"),
+    ],
+)
+def test_a_mesh_that_cannot_be_saved(tmp_path: Path, name: str, why: str) -> None:
+    (tmp_path / "link").write_text("a file")
+    with pytest.raises(MeshError, match=f"cannot save the mesh as {tmp_path / name}: .*{why}"):
+        write_mesh(sample(3), tmp_path / name)

@@ -10,6 +10,7 @@ import numpy as np
 from ..data import Indices, MeshData, MeshError, Points
 from ..parameters import affordable, check_extent, positive
 from ..plain_files import wrong_with
+from ..text_rows import decoded
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
 from .points import scatter
@@ -68,9 +69,12 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
     if wrong := wrong_with(path):
         raise MeshError(f"outline file '{path}' {wrong}.")
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise MeshError(f"outline file '{path}' cannot be read: {error}.") from None
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise MeshError(f"outline file '{path}' cannot be read: {error.strerror}.") from None
+    if b"\0" in data:
+        raise MeshError(f"outline file '{path}' is no text; save it as plain text: a line `x, y` for each corner.")
+    lines = decoded(data).splitlines()
     loops: list[list[tuple[float, float, str]]] = [[]]
     for number, line in enumerate(lines, 1):
         if words := line.partition("#")[0].replace(",", " ").split():
