@@ -161,6 +161,38 @@ def test_boxes_that_cross_are_one_body(tmp_path: Path, inside_out: bool) -> None
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(2.72, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("size", "at", "united"),
+    [
+        ((1, 1, 1), (1, 0, 0), 2.0),  # a face in common
+        ((1, 0.6, 0.6), (0.5, 0, 0.2), 1.36 - 0.5 * 0.6 * 0.6),  # tops in one plane, nodes in common
+        ((1, 1, 0.5), (1, 0, 0.25), 1.5),  # half a face in common
+    ],
+)
+def test_boxes_with_points_in_common(
+    tmp_path: Path, size: tuple[float, ...], at: tuple[float, ...], united: float
+) -> None:
+    both = joined(box((1, 1, 1)), box(size, at))  # type: ignore[arg-type]
+    path = as_blender(tmp_path / "part.obj", both)
+    with pytest.raises(Repairable, match=r"more than two triangles, the first at \("):
+        read_body(path)
+    surface = read_body(path, repair=True)
+    assert_sound(surface)
+    assert len(surface.bodies) == 1 and surface.volume == pytest.approx(united, rel=1e-9)
+    with pytest.raises(MeshError, match="more than two triangles"):  # it does not say which triangles are a part
+        read_body(as_blender(tmp_path / "part.stl", both), repair=True)
+
+
+def test_two_bars_through_each_other_were_two_bodies(tmp_path: Path) -> None:
+    """No corner of one lies within the other: read as 6 m^3 before."""
+    path = saved(tmp_path, joined(box((3, 1, 1), level=0), box((1, 3, 1), level=0)))
+    with pytest.raises(Repairable, match="cuts itself: 8 of its 24 triangles"):
+        read_body(path)
+    surface = read_body(path, repair=True)
+    assert_sound(surface)
+    assert surface.volume == pytest.approx(5.0, rel=1e-9)
+
+
 def test_rods_through_a_ball_with_a_hole(tmp_path: Path) -> None:
     """Holes first, then the union, against the volume by trimesh's winding of random points."""
     ball, rods = sphere(), (box((3, 0.3, 0.3)), box((0.3, 3, 0.3), (0.05, 0, 0.5)))

@@ -108,7 +108,7 @@ def check_file(path: Path, key: str) -> None:
         raise InputError(f'{key} = "{path}"{": there is no such file" if wrong == MISSING else f" {wrong}"}')
 
 
-REPAIR = "Or set [mesh] repair = true: it fills holes, mends what cuts itself, and says what it changed."
+REPAIR = "Or set [mesh] repair = true: it fills holes, makes parts that cross one body, and says what it changed."
 
 
 def open_surface(mesh: Mesh) -> ClosedSurface | None:

@@ -22,7 +22,7 @@ PROBES = 300  # points of a part that are looked up in another part
 
 
 class Repairable(MeshError):
-    """A surface that is open or cuts itself, which `repair` may mend."""
+    """A surface that is open, cuts itself or has edges of more than two triangles, which `repair` may mend."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def check_edges(points: Points, triangles: Indices, source: str, which: tuple[in
     for kind in which:
         wrong, what = found[kind]
         if len(wrong):
-            refused = Repairable if kind == 1 and not len(found[2][0]) else MeshError
+            refused = Repairable if 1 in which else MeshError
             raise refused(
                 f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
                 "close or mend it there (MeshLab: Filters > Remeshing > Close Holes; Blender: Mesh > Clean Up > Fill "

@@ -36,6 +36,7 @@ from .self_intersection import crossing_triangles
 MAX_CHANGE = 0.1  # of the volume of a part, or of a side of its bounding box over the longest side
 MAX_NEW = 0.25  # share of a part's area that is new triangles
 TOLD_NEW = 0.1  # the same, from which on the note says so first
+MAX_PARTS = 1000  # of a file that are looked at one by one
 DUST = 1e-3  # share of the whole area; open parts of less are left out
 UNITED = 1e-6  # share by which a union may be smaller than its largest part, or larger than all parts together
 SECONDS, SECONDS_A_TRIANGLE = 60.0, 1e-3  # that the repair may take
@@ -96,9 +97,7 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
         MeshError: an edge of more than two triangles, a part with one side only; a gross change; pymeshfix or
             manifold3d is not installed.
     """
-    points, triangles, mends = mended(points, triangles)
-    check_areas(points, triangles, source)
-    check_edges(points, triangles, source, (2,))
+    points, triangles, mends = _mended(points, triangles, source)
     triangles, shell, _ = turned_alike(triangles, source)
     crossings = crossing_triangles(points, triangles, closed=True)
     own = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
@@ -123,6 +122,34 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
     if not (dust.any() or cut.any() or torn.any() or unions):
         notes.append("[mesh] repair = true: the surface is closed and does not cut itself; its shape is as it was.")
     return *_together(parts), (*notes, *unions)
+
+
+def _mended(points: Points, triangles: Indices, source: str) -> tuple[Points, Indices, tuple[str, ...]]:
+    """As of `mending`; where an edge is in more than two triangles then, the parts of the file one by one.
+
+    Parts that cross or touch may have points at the same place, as two boxes with a common face.
+    """
+    whole, given = mended(points, triangles), (points, triangles)
+    points, triangles, notes = whole
+    if _crowded(triangles):
+        _, part = components(np.concatenate([given[1][:, :2], given[1][:, 1:]]), len(given[0]))
+        of_triangle = part[given[1][:, 0]]
+        numbers = np.unique(of_triangle)
+        if 1 < len(numbers) <= MAX_PARTS:
+            parts = [mended(*_part(given[0], given[1][of_triangle == number])) for number in numbers]
+            apart = _together([(own_points, own) for own_points, own, _ in parts])
+            # STL does not say which triangles are connected: each would be a part, and open
+            if not _crowded(apart[1]) and len(open_edges(apart[1])) <= len(open_edges(triangles)):
+                points, triangles = apart
+                notes = tuple(note for _, _, own_notes in parts for note in own_notes)
+    check_areas(points, triangles, source)
+    check_edges(points, triangles, source, (2,))
+    return points, triangles, notes
+
+
+def _crowded(triangles: Indices) -> bool:
+    """Whether an edge belongs to more than two triangles."""
+    return bool((distinct_rows(np.sort(directed_edges(triangles), axis=1))[1] > 2).any())
 
 
 Part = tuple[Points, Indices]
@@ -267,7 +294,10 @@ def _united(parts: list[Part], source: str) -> tuple[list[Part], tuple[str, ...]
         return parts, ()
     points, triangles = _together(parts)
     part = np.repeat(np.arange(len(parts)), [len(t) for _, t in parts])
-    crossings = part[crossing_triangles(points, triangles, closed=True)]
+    of_point = np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
+    crossings = np.concatenate(
+        [part[crossing_triangles(points, triangles, closed=True)], of_point[_same_place(points)]]
+    )
     crossings = np.unique(crossings[crossings[:, 0] != crossings[:, 1]], axis=0)
     count, cluster = components(crossings, len(parts))
     result, notes = [], []
@@ -280,6 +310,14 @@ def _united(parts: list[Part], source: str) -> tuple[list[Part], tuple[str, ...]
         result.append(united)
         notes.append(note)
     return result, tuple(notes)
+
+
+def _same_place(points: Points) -> Indices:
+    """Pairs of points at the same place: (k, 2)."""
+    from scipy.spatial import cKDTree
+
+    reach = JOINED * float(np.ptp(points, axis=0).max())
+    return np.asarray(cKDTree(points).query_pairs(reach, output_type="ndarray"), np.int64)
 
 
 def _union(parts: list[Part], source: str) -> tuple[Part, str]:
