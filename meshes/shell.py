@@ -77,6 +77,5 @@ def read_shell(path: str | Path, thickness: float, scale: float = 1.0) -> MeshDa
     """
     path = Path(path)
     source = f"Shell file '{path}'"
-    points, triangles, turned = read_triangles(path, scale, source)
-    notes = (f"{turned} of {len(triangles)} triangles of the shell faced the other way; turned.",) if turned else ()
+    points, triangles, notes = read_triangles(path, scale, source)
     return thickened(points, triangles, thickness, source, notes)

@@ -29,6 +29,19 @@ ipctk = pytest.importorskip("ipctk")
 Surface = tuple[Points, Indices]
 
 
+@pytest.fixture
+def own_process() -> None:
+    """The repair works in a process of its own, as it does for users."""
+
+
+@pytest.fixture(autouse=True)
+def _here(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Repair and gmsh work in this process, but where a test asks for `own_process`: starting one takes longer."""
+    if "own_process" not in request.fixturenames:
+        for module in ("repair", "fill"):
+            monkeypatch.setattr(f"fracsim.meshes.surfaces.{module}.within", lambda seconds, work, *given: work(*given))
+
+
 def of(mesh: object) -> Surface:
     return np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)  # type: ignore[attr-defined]
 
@@ -129,6 +142,7 @@ def test_holes_are_filled(tmp_path: Path, ending: str) -> None:
     assert f"to {surface.volume:.4g} m^3" in note
 
 
+@pytest.mark.usefixtures("own_process")
 def test_a_box_without_a_lid_is_closed_flat_and_filled(tmp_path: Path) -> None:
     points, triangles = box((2, 1, 1))
     path = saved(tmp_path, (points, triangles[points[triangles].mean(axis=1)[:, 0] < 0.999]))
@@ -267,6 +281,7 @@ def hollow_cross() -> Surface:
     return joined(box((2, 2, 2)), box((0.5, 0.5, 0.5)), box((3, 0.4, 0.4), (0.1, 0.05, 0.02)))
 
 
+@pytest.mark.usefixtures("own_process")
 @pytest.mark.parametrize(
     ("made", "message"),
     [

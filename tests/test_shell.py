@@ -74,6 +74,18 @@ def test_a_shell_is_read_open_or_closed(tmp_path: Path) -> None:
         read_shell(path, 0.1)
 
 
+def test_faults_of_a_shell_are_mended(tmp_path: Path) -> None:
+    """Two panes that meet at a T junction; a triangle given twice, and one without an area along the edge."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [1, 0.5, 0], [2, 0, 0], [2, 1, 0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [1, 5, 4], [4, 5, 6], [4, 6, 2], [2, 1, 0]])
+    mesh = check_mesh(read_shell(written(tmp_path / "panes.obj", points, triangles), H))
+    assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(2 * H, rel=1e-12)
+    assert len(mesh.facet_groups["rim"]) == 2 * 6 and len(mesh.cells) == 3 * 6
+    assert "given more than once" in mesh.notes[0] and "divided there" in mesh.notes[1]
+    flat = read_shell(written(tmp_path / "flat.obj", points, np.concatenate([triangles[:5], [[1, 4, 2]]])), H)
+    assert len(flat.cells) == 3 * 6 and "without an area" in flat.notes[0]
+
+
 def written(path: Path, points: Values, triangles: npt.NDArray[np.int64]) -> Path:
     """A surface file."""
     lines = [f"v {x} {y} {z}" for x, y, z in points] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]

@@ -15,7 +15,7 @@ from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
 from .enclosed import enclosed_volumes, windings
-from .mending import areas, directed_edges, flat_triangles, joined, mended
+from .mending import areas, directed_edges, flat_triangles, mended, mended_sheet
 from .polygons import triangles_of_faces
 
 PROBES = 300  # points of a part that are looked up in another part
@@ -80,16 +80,18 @@ def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
     return closed_surface(*triangles_as_given(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
 
 
-def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, int]:
-    """Points [m] and triangles of a surface, closed or open, joined at coincident points and turned alike; how many
-    were turned. MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
+def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, tuple[str, ...]]:
+    """Points [m] and triangles of a surface, closed or open, mended (see mending) and turned alike; notes of that.
+    MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
     points, triangles = triangles_as_given(path, scale, source)
     check_points(points, triangles, source)
-    points, triangles = joined(points, triangles)
+    points, triangles, notes = mended_sheet(points, triangles)
     check_areas(points, triangles, source)
     check_edges(points, triangles, source, (2,))
     triangles, _, turned = turned_alike(triangles, source)
-    return points, triangles, turned
+    if turned:
+        notes = (*notes, f"{turned} of {len(triangles)} triangles of the shell faced the other way; turned.")
+    return points, triangles, notes
 
 
 def triangles_as_given(path: Path, scale: float, source: str) -> tuple[Points, Indices]:

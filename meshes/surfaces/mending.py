@@ -39,8 +39,13 @@ def mended(points: Points, triangles: Indices) -> tuple[Points, Indices, tuple[s
     return second[0], second[1], (note, *second[2])
 
 
+def mended_sheet(points: Points, triangles: Indices) -> tuple[Points, Indices, tuple[str, ...]]:
+    """The same of a surface that may be open: triangles given twice are taken once in any case."""
+    return _mended(points, triangles, JOINED, sheet=True)
+
+
 def _mended(
-    points: Points, triangles: Indices, reach: float, copies: bool = False
+    points: Points, triangles: Indices, reach: float, copies: bool = False, sheet: bool = False
 ) -> tuple[Points, Indices, tuple[str, ...]]:
     """The same with a given reach of points that are one, as a share of the size; `copies`: kept."""
     given = points, triangles
@@ -55,7 +60,7 @@ def _mended(
     if flat.any():
         notes.append(f"{int(flat.sum())} surface triangles without an area were left out.")
     triangles, divided = _divided(points, triangles[once & ~flat], reach)
-    if len(open_edges(triangles)) and not once.all():
+    if len(open_edges(triangles)) and not once.all() and not sheet:
         return _mended(*given, reach, copies=True)  # open without them: sheets of no thickness
     if divided:
         notes.append(f"{divided} edges of the surface had corners of other triangles on them and were divided there.")

@@ -110,7 +110,7 @@ def _study(name: str, chance: random.Random) -> Data:
         return changed(BAR, mesh=None, boundary=HELD, probe=None, time={"end": 0.02}) | {"mesh": {"file": name}}
     match chance.randrange(3):
         case 0:
-            filled = {"mesh": {"surface": name, "h": 0.2, "time_limit": 10}}
+            filled = {"mesh": {"surface": name, "h": 0.2, "time_limit": 10, "repair": chance.random() < 0.5}}
             return changed(BAR, mesh=None, boundary=HELD, probe=None, time={"end": 0.02}) | filled
         case 1:
             ball = [{"name": "it", "shape": "mesh", "file": name, "at": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -1.0]}]
