@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import warnings
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from .contents import Block, Contents
 from .data import Indices, MeshError
 from .plain_files import data_elsewhere, is_hdf5, wrong_beside
 from .tags import tag_sets
-from .text_rows import shown
+from .text_rows import SourceText, decoded, shown
 
 # Endings: the format, meshio's name of it where meshio reads it line by line, and whether it is text.
 FORMATS: dict[str, tuple[str, str, bool]] = {
@@ -34,6 +35,12 @@ FORMATS: dict[str, tuple[str, str, bool]] = {
     ".f3grid": ("FLAC3D", "", False), ".ugrid": ("UGRID", "", False), ".svg": ("SVG", "", False),
     ".wkt": ("WKT", "", False),
 }  # fmt: skip
+ADVICE = (
+    "Supported are nodes with simplices, hexahedra, prisms and pyramids; export the mesh again, or in another format: "
+    "MSH 4.1 (gmsh), VTU (ParaView), MED (Salome), Abaqus (.inp)."
+)
+PLY_ADVICE = "Supported are points and faces; export the surface again, as PLY, STL or OBJ (Blender, MeshLab)."
+_PLY_HEAD = re.compile(rb"ply[ \t]*\r?\n(.*?)^[ \t]*end_header[ \t]*\r?\n", re.DOTALL | re.MULTILINE)
 _PLY_TYPES = {b"char": b"int8", b"uchar": b"uint8", b"ushort": b"uint16", b"uint": b"uint32"}
 MAX_PLY_HEAD = 65536  # bytes
 MAX_LINE_SEARCH = 1 << 26  # bytes of a file in which the line of a fault is looked for
@@ -69,8 +76,7 @@ def _refuse(path: Path, position: int | None) -> NoReturn:
             where = f" Its reader came to the end, line {len(lines)}: was the file cut off?"
     raise MeshError(
         f"Mesh file '{path}' could not be read: it is damaged, or no file of the format {format_}, or holds something "
-        f"of it that is not supported.{where} Supported are nodes with simplices, hexahedra, prisms and pyramids; "
-        "export the mesh again, or in another format: MSH 4.1 (gmsh), VTU (ParaView), MED (Salome), Abaqus (.inp)."
+        f"of it that is not supported.{where} {PLY_ADVICE if format_ == 'PLY' else ADVICE}"
     )
 
 
@@ -89,7 +95,9 @@ def _mesh(path: Path, position: list[int]) -> Any:
     elif is_hdf5(path):
         _check_hdf5(path, path)
     elif ending == ".ply":
-        with _Ending(io.BytesIO(_with_known_head(path.read_bytes()))) as file:  # type: ignore[arg-type]
+        data = path.read_bytes()
+        _check_ply(SourceText(path, data))
+        with _Ending(io.BytesIO(_with_known_head(data))) as file:  # type: ignore[arg-type]
             return meshio.read(file, "ply")
     elif FORMATS[ending][1]:
         _, name, text = FORMATS[ending]
@@ -145,6 +153,22 @@ def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:
 
 
 # --- files before meshio opens them ---------------------------------------------------------------------------------
+
+
+def _check_ply(source: SourceText) -> None:
+    """MeshError for a file without the head of PLY; with its line for text with fewer lines than declared, or words."""
+    text = source.text
+    head = _PLY_HEAD.match(text[: 2 * MAX_PLY_HEAD])
+    if not head:
+        source.refuse(0, f"`{shown(text[:80])}` does not begin the head of PLY: `ply`, ..., `end_header`. {PLY_ADVICE}")
+    if not re.search(rb"^format\s+ascii\b", head[1], re.MULTILINE):
+        return
+    declared = re.findall(rb"^element\s+(\w+)\s+(\d+)", head[1], re.MULTILINE)
+    lines = source.rows(head.end(), len(text), "the numbers of a point or a face")
+    if len(lines) < sum(int(count) for _, count in declared):
+        known = ", ".join(f"{int(count)} {decoded(word)}" for word, count in declared)
+        why = f"the file ends after {len(lines)} lines of data, and declares {known}."
+        source.refuse(len(text) - 1, f"{why} {PLY_ADVICE}")
 
 
 def _with_known_head(data: bytes) -> bytes:

@@ -793,6 +793,34 @@ def test_changed_files_are_read_or_refused(tmp_path: Path, ending: str) -> None:
     assert refused > 30
 
 
+PLY = (FILES / "p2_vertex_index.ply").read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("4 2 0 4 6\n", "", "line 23: the file ends after 13 lines of data, and declares 8 vertex, 6 face"),
+        (
+            "0.060000 0.000000 0.000000",
+            "0.060000 O.000000 0.000000",
+            "line 12: `0.060000 O.000000 .* is not what",
+        ),
+        ("end_header\n", "", "line 1: `ply` does not begin the head of PLY"),
+        (
+            "property float y\n",
+            "property floor y\n",
+            "no file of the format PLY.* as PLY, STL or OBJ .Blender, MeshLab",
+        ),
+        ("4 0 2 3 1", "4 0 2", "faces of kind quad with fewer than three corners, or with corners that do not exist"),
+    ],
+)
+def test_damaged_ply(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in PLY
+    (tmp_path / "part.ply").write_text(PLY.replace(old, new, 1))
+    with pytest.raises(MeshError, match=message):
+        read_surface(tmp_path / "part.ply")
+
+
 # --- never slow -------------------------------------------------------------------------------------------------------
 
 
