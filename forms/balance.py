@@ -4,6 +4,8 @@ Quadrature is chosen here and nowhere else: with P1 displacement F is constant i
 energy exactly. With P2 F is linear, and the rule of degree 2 (three points in a triangle, four in a tetrahedron) is
 exact for linear energies, leaves no mode of a cell without stiffness, and costs no order for any energy. Inertia is not
 here: with a lumped or constant mass matrix it is linear algebra (stepping.newton).
+
+Equations: docs/theory.md#elastic-energies.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 psi_d is the energy that damage leaves: chi psi_0 (share 1 - chi), or the edge-projected one (chi 1, share 1). s is
 Green's strain (stretch^2 - 1)/2 of the edge, or n . eps . n with the linear energy.
 
-METHOD section 4 has a shortened edge count as intact. Taken at its word that makes energy out of nothing: chi jumps
+A shortened edge that counts as intact makes energy out of nothing (docs/theory.md#rejected-alternatives): chi jumps
 back at a finite energy, one closed edge lets a cell carry tension across its open ones, and with projected strains the
 force jumps as an edge closes, since T^-1 couples it to the others (tried: Newton's method stands still at the jump). A
 spring for each edge is the least that has a continuous force: nothing while open, no jump at closing, no loss over a
@@ -15,6 +15,8 @@ length at all, and its force flips.
 With quadratic displacement F differs from point to point, and the middle of a broken edge is free. An edge is as long
 as its ends are far apart: (x_j - x_i) = F_m (X_j - X_i) with F_m in its middle, since the slope of a parabola there is
 that of its chord. F is linear in a cell, F_m = F + grad grad u . (X_m - X): each point of it knows of every edge.
+
+Equations: docs/theory.md#crack-closure.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 A strain is a sum over the edges ij of the reference cell, eps = - sum (d_ij . eps . d_ij) sym(g_i x g_j), with
 d_ij = X_j - X_i and barycentric gradients g_i (see fracture.edge_stress for the identity): T_strain^-1 without a matrix
 inverse. Broken edges are left out of the sum.
+
+Equations: docs/theory.md#edge-projected-strain.
 """
 
 from __future__ import annotations

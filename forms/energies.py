@@ -3,6 +3,8 @@
 Every energy is a frozen dataclass with Lame's parameters mu and lmbda in Pa (numbers, or UFL coefficients for
 fields) and a method `psi`. It is written on the d x d block of F, so that the same lines serve 3D and plane strain
 (F33 = 1); plane stress is the same again with the reduced lambda* of `plane_stress_lambda`, for energies that allow it.
+
+Equations: docs/theory.md#elastic-energies.
 """
 
 from __future__ import annotations

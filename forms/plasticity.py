@@ -10,6 +10,8 @@ flow, what balances is the stress that this leaves, not the trial stress before 
 s = dev tau_t of the trial stress (F_p of the start of the step), share = 1 - exp(-nu dt) of the flow rate nu, softness
 1 / (1 + K / (3 mu)) what hardening by K leaves of the return (Simo and Hughes 1998, box 3.1). The norms |s|, Y_s are of
 Cauchy stress.
+
+Equations: docs/theory.md#plasticity.
 """
 
 from __future__ import annotations

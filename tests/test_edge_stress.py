@@ -98,7 +98,7 @@ def test_carried_stress_is_the_dense_projection(dim: int, seed: int) -> None:
 @pytest.mark.parametrize("dim", DIMS)
 @given(seed=st.integers(0, 10**6), pattern=st.integers(0, 63))
 def test_intact_edges_keep_their_stress(dim: int, seed: int, pattern: int) -> None:
-    """Along an intact edge the carried stress is the full one, along a broken edge it is zero (METHOD section 3)."""
+    """Along intact edges the carried stress is the full one, along broken ones zero (docs/theory.md#edge-criterion)."""
     corners, components = simplex(dim, seed)[None], stress_components(dim, seed)[None]
     intact = flags_of(np.array([pattern]), len(local_edges(dim)))
     kept = normal_stress(carried_by(components, corners, intact), corners)

@@ -143,7 +143,7 @@ def test_corotated_stress(dim: int, data: st.DataObject) -> None:
 
 
 def neo_hookean_psi(F: Tensor) -> float:
-    """M22 eq. 25 as printed, with the parameters of METHOD section 2: mu = 4/3 mu_L, lambda = lambda_L + 5/6 mu_L."""
+    """M22 eq. 25 as printed, with mu = 4/3 mu_L, lambda = lambda_L + 5/6 mu_L (docs/theory.md#elastic-energies)."""
     mu, lmbda = 4 / 3 * MU, LAMBDA + 5 / 6 * MU
     alpha = 1 + mu / lmbda - mu / (4 * lmbda)
     trace = np.trace(F.T @ F)

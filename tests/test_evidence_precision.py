@@ -102,7 +102,7 @@ def test_stress_at_the_clamp_against_modes() -> None:
 
 
 def energy_density(energy: str, F: Values, young: float, poisson: float) -> float:
-    """psi of METHOD.md section 2, without constants."""
+    """psi of docs/theory.md#elastic-energies, without constants."""
     mu, lmbda = references.lame(young, poisson)
     if energy == "stvk":
         E = (F.T @ F - np.eye(3)) / 2

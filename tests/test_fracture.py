@@ -260,7 +260,7 @@ def test_an_unstressed_cell_keeps_its_stiffness() -> None:
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_a_pass_breaks_what_the_dense_average_says(dim: int) -> None:
-    """METHOD section 3 in full on a damaged body: stress without the share of broken edges, T^-1 diag(integrity) T s;
+    """docs/theory.md#edge-criterion, on a damaged body: stress without broken edges, T^-1 diag(integrity) T s;
     split cells out of it; volume times hat function over the cells in reach; intact edges at the strength break.
     """
     radius, strength = 0.4, 0.05

@@ -61,12 +61,12 @@ def test_split_means_not_connected(dim: int) -> None:
 
 
 def test_triangles_split_with_two_broken_edges() -> None:
-    """METHOD section 4: 2D, two broken edges."""
+    """docs/theory.md#edge-damage: 2D, two broken edges."""
     assert is_split(2).tolist() == [pattern.bit_count() >= 2 for pattern in range(8)]
 
 
 def test_tetrahedra_split_around_a_node_or_between_pairs() -> None:
-    """METHOD section 4: a node with all three edges broken, or two pairs of nodes with all four edges between them."""
+    """docs/theory.md#edge-damage: all three edges of a node, or all four edges between two pairs of nodes."""
     for pattern in range(64):
         intact = {frozenset(edge) for edge in intact_edges(3, pattern)}
         lonely = any(not any(node in edge for edge in intact) for node in range(4))

@@ -29,7 +29,6 @@ from support.demo import readme_damage, run_demo
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text()
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def test_the_study_in_the_readme_runs(tmp_path: Path) -> None:
@@ -174,19 +173,3 @@ def test_captions_of_the_readme_are_what_the_pictures_show() -> None:
         assert [int(each) for each in re.findall(r"\d+", times.group(1))] == pytest.approx(shown), name
         timed += 1
     assert timed >= 3 and coloured >= 1
-
-
-def test_files_that_the_pages_name_exist() -> None:
-    """Source files, pictures and other pages, with the headings that links go to."""
-    for page in PAGES:
-        text = page.read_text()
-        for name in re.findall(r"`((?:fracsim|forms|meshes|studies|tests)/[\w/]+\.py)`", text):
-            assert (ROOT / name).exists(), name
-        for name, _, heading in (link.partition("#") for link in re.findall(r"\]\(([^):]+)\)", text)):
-            target = page.parent / name if name else page
-            assert target.exists(), (page.name, name)
-            headings = [
-                re.sub(r"[^\w -]", "", line).lower().replace(" ", "-")
-                for line in re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)
-            ] if heading else []  # fmt: skip
-            assert not heading or heading in headings, (page.name, heading)

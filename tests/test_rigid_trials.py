@@ -1,4 +1,4 @@
-"""The experiments beside the rigid scheme say what METHOD 10 and Bao et al. say of them."""
+"""The experiments beside the rigid scheme say what docs/theory.md#rigid-materials says of them."""
 
 from __future__ import annotations
 

@@ -10,6 +10,8 @@ kind that adds and multiplies.
 
 A scheme is one file with a frozen dataclass, and one line in SCHEMES. Its fields are its keys in [time]: numbers with
 a default, their limits in `metadata` ("gt", "ge", "lt", "le").
+
+Equations: docs/theory.md#time-integration.
 """
 
 from __future__ import annotations

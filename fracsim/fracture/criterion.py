@@ -1,4 +1,4 @@
-"""Which edges fail: those whose averaged normal stress reaches their strength (METHOD section 3)."""
+"""Which edges fail: those whose averaged normal stress reaches their strength (docs/theory.md#edge-criterion)."""
 
 from __future__ import annotations
 

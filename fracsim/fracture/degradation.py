@@ -1,4 +1,5 @@
-"""What broken edges take out of the elastic energy: the two approaches of METHOD section 4.
+"""What broken edges take out of the elastic energy: two approaches (docs/theory.md#degraded-energy,
+docs/theory.md#edge-projected-strain).
 
 chi     psi_frac = chi psi, chi the share of the edges' stress that intact ones carry (M22 eq. 28), never rising
 edge    psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22 eqs. 21-22, forms.damage)

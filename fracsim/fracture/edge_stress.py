@@ -11,6 +11,8 @@ eq. 12 lacks.
 
 These are dozens of small sums for each of a few hundred cells in every step: in edge_stress.c, which is compiled where
 it is needed first, they take a tenth of the time of arrays.
+
+Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ artefact of it. So of the edges that fail those of one cell are spared for each 
     with the fewest failing edges that the node is no end of, so that the others are of one side,
     and of those the one that is loaded least,
 
-as a surface that would leave a node without a whole cell passes on its other side (METHOD section 7). What holds
-nodes of both sides is pulled apart by them and feels so itself, whatever the average says: beyond `limit` times its
-strength a cell holds no longer, and what it held may be a crumb all the same.
+as a surface that would leave a node without a whole cell passes on its other side (docs/theory.md#node-retention).
+What holds nodes of both sides is pulled apart by them and feels so itself, whatever the average says: beyond `limit`
+times its strength a cell holds no longer, and what it held may be a crumb all the same.
 """
 
 from __future__ import annotations

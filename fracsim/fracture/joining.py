@@ -9,6 +9,8 @@ for a spanning forest). So cells that have come apart stay so, and mechanics fol
 
 Nodes whose motion is prescribed are held by it, and by one another where no edge between them fails: a group of two and
 more of them, what is left on a grip that something has snapped off, may be a piece of its own.
+
+Equations: docs/theory.md#node-retention.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@
 
 so that a neighbour counts with its volume, once for each node that it shares with the cell, and the cell itself d + 1
 times. Nothing is averaged across a gap: bodies that share no node do not know of one another.
+
+Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ with reference centroids X and volumes V (M22 eq. 13). Built once; a rank holds 
 within R of its own. Where all rows would take gigabytes (fine meshes: the weights of a radius grow as h^-6), a row is
 made when a stress near it first reaches the strength. In a pass few cells pull as hard as the bound that is asked for,
 and fewer have come apart since the last one: only rows near these are looked at.
+
+Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations

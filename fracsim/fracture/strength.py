@@ -5,6 +5,8 @@
 h_e in [-1, 1) is hashed from the edge's reference mid-point; w_e is a Weibull number of mean 1 drawn from the same
 place and a seed, w = (-ln(1 - U))^(1/m) / Gamma(1 + 1/m); f_e = 1 + (ratio - 1) (n . a)^2 for the edge's reference
 direction n and the fibre a. All of them belong to the place of the edge, so that no partition changes them.
+
+Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations

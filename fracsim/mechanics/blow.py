@@ -33,6 +33,8 @@ and v by c_v / s times that; that v changes by dt M^-1 f says
 
 1 of backward Euler. So contact adds k s^2 E(u(x)) to the incremental potential, k s f to the forces and k E'' to the
 tangent: all is as for forces that balance at the level, of a contact that is stiffer by k.
+
+Equations: docs/theory.md#contact-in-a-time-step.
 """
 
 from __future__ import annotations

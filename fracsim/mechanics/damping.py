@@ -1,4 +1,7 @@
-"""Rayleigh damping a M v + b K v: drag in proportion to mass, viscosity in proportion to stiffness."""
+"""Rayleigh damping a M v + b K v: drag in proportion to mass, viscosity in proportion to stiffness.
+
+Equations: docs/theory.md#elastic-energies.
+"""
 
 from __future__ import annotations
 

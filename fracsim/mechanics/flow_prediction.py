@@ -6,6 +6,8 @@
     staggered       nothing (M22): no prediction at all
 
 Without any the stress of a yielding bar is too high by 3 mu times the strain of a step.
+
+Equations: docs/theory.md#plasticity.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@ product, and a node of debris keeps its own mass.
 Consistent is a sparse matrix with the pattern of the tangent: higher frequencies come out too high instead of too low.
 As a term of the form it would be integrated anew in every tangent; what it adds to each block of that is kept, a
 multiple of 1.
+
+Equations: docs/theory.md#quadratic-displacement.
 """
 
 from __future__ import annotations

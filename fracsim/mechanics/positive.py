@@ -6,6 +6,8 @@ Where a body buckles, tears or is squeezed, A is not positive, Newton's directio
 and CG stops. With A+ (and mass, and what touches) it goes down from anywhere, in more iterations near a solution.
 (Teran et al. 2005, Robust quasistatic finite elements and flesh simulation; here of any energy, by the eigenvalues of
 d^2 x d^2 moduli instead of a closed form.) Built when it is first asked for.
+
+Equations: docs/theory.md#newtons-method.
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the ro
 q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) where
 the body is held, however it is cut into steps, and is gone at once for nu -> infinity. Eq. 31 is the first guess of the
 root without hardening (with nu for 1 - exp(-nu dt), so that halving the step would double the flow).
+
+Equations: docs/theory.md#plasticity.
 """
 
 from __future__ import annotations

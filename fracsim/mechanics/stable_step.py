@@ -1,6 +1,8 @@
 """The stable step of explicit time integration, from bounds on how fast single cells vibrate. No DOLFINx here.
 
 No assembled body is faster than its fastest cell on its own (Irons and Treharne 1971).
+
+Equations: docs/theory.md#stable-time-step.
 """
 
 from __future__ import annotations

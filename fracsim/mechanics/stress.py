@@ -45,7 +45,7 @@ RESIDUAL_STIFFNESS = 1e-8
 
 @dataclass(frozen=True)
 class Weakening:
-    """How broken edges weaken the energy of their cells (METHOD section 4).
+    """How broken edges weaken the energy of their cells (docs/theory.md#degraded-energy).
 
     Attributes:
         approach: "chi", the energy fades; "edge", the strain is projected on intact edges.

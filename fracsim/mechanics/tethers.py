@@ -10,6 +10,8 @@ h the mean edge. So d = 0 and nothing changes as a node is tied. Forces on v and
 and opposite, with no moment, f_v = -k d and f_k = lambda_k k d (sum_k lambda_k x_k x d + d x x_v = 0), and d turns with
 the body: momentum, its moment and the energy of a rigid motion are those of a body without. The tangent is constant.
 When the cell comes apart, too, the node is tied anew and what was stored is lost.
+
+Equations: docs/theory.md#node-retention.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """The graph of a mesh: nodes joined by the edges of simplices, some of them broken.
 
 What the pattern of a cell's broken edges means is looked up in `simplices`.
+
+Equations: docs/theory.md#edge-damage.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@
 
 A middle is at rest half-way between the ends of its edge, or on the round face that it belongs to. In the input mesh it
 comes after all points, in the order of the (lower, higher) ends of its edge.
+
+Equations: docs/theory.md#quadratic-displacement.
 """
 
 from __future__ import annotations

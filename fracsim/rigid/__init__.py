@@ -1,4 +1,4 @@
-"""Stiff bodies that move rigidly, are strained by blows and break (METHOD section 10; Bao et al. 2007).
+"""Stiff bodies that move rigidly, are strained by blows and break (docs/theory.md#rigid-materials).
 
 Strain and fracture, of copies of one mesh:
 

@@ -1,4 +1,4 @@
-"""What of contact is a blow, and what a load (METHOD section 10).
+"""What of contact is a blow, and what a load (docs/theory.md#blows-and-loads).
 
 A blow: two things meet faster than resting contact explains, 2 g dt. Its impulse J, which falls into one step, acts
 over a time tau (Hertz's, or what the study says), as the force J / tau. It is passed on: what a struck body then pushes

@@ -22,6 +22,8 @@ Gauss and Seidel's sweeps cost as much as these iterations and leave up to four 
 
 What is done to each contact in each iteration is in crowd.c, compiled where it is needed first: to one half of the
 contacts and to the other, by one thread or by two.
+
+Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a blow leaves behind in a body that flows: it is dented or bent (METHOD section 10; B07 section 7.2).
+"""What a blow leaves behind in a body that flows: it is dented or bent (docs/theory.md#denting; B07 7.2).
 
 Cells whose von Mises stress q = sqrt(3/2 s : s) exceeds their yield stress k flow, with linear hardening H,
 

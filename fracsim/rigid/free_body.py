@@ -1,4 +1,4 @@
-"""The quasi-static analysis of one free body under the loads of a moment (METHOD section 10).
+"""The quasi-static analysis of one free body under the loads of a moment (docs/theory.md#free-body-analysis).
 
     K u = f - M a,   u orthogonal to the rigid modes
 

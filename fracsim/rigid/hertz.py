@@ -5,6 +5,8 @@
     1/m = 1/m_1 + 1/m_2,   1/R = 1/R_1 + 1/R_2,   E* = E / (1 - nu^2) / 2
 
 of two bodies of one stuff, that meet at a speed v; E* is twice that where one of them does not give way.
+
+Equations: docs/theory.md#blows-and-loads.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ so (turns are not linear) comes apart no faster than c_0 / 4, which hardly any e
 Where a step is taken apart (rigid.events) what else it would meet in it waits, for it may never come there: it goes on
 with what the blow left it, and what it still meets then is the next event, of a few. Things that touch are at one time
 in every event; what would meet after the last one comes to touch as the step ends, and meets in the next.
+
+Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
 
 from __future__ import annotations

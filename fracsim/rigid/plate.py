@@ -7,6 +7,8 @@ Six unknowns to a node: displacement u and rotation r, so that a point at height
 sides after a cubic deflection, beta_s = -3/2 (w_j - w_i) / l - (beta_si + beta_sj) / 4 in their middle, across them
 linear. The rotation about the normal, which neither part resists, is held to that of the membrane (T. J. R. Hughes,
 F. Brezzi 1989): rigid motions remain without energy, and no other does.
+
+Equations: docs/theory.md#shells.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ A rigid motion a = R c of the body balances the load in every rigid mode R,
 with the lumped masses M of the mesh that is solved on, so that f - M a is orthogonal to the modes to round-off and the
 strain of K u = f - M a is the same whichever u of all rigid motions is taken. B07 (sec. 5) pins three points instead:
 what the load is out of balance by then acts on these (rigid.pinned).
+
+Equations: docs/theory.md#free-body-analysis.
 """
 
 from __future__ import annotations

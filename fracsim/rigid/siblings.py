@@ -2,6 +2,8 @@
 
 Two parts that overlap by d when their body breaks may go on doing so, and come no deeper: their distance counts from d,
 which shrinks with what they part by. So pieces stay where they broke, push nothing apart, and carry one another.
+
+Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@
 the implicit midpoint rule, of second order and without a drift of the energy, found by fixed points: it converges where
 a body turns by less than about a radian a step. What turns by more than PART does so in equal parts: at a radian a step
 the energy of a flat shard goes up and down by some per cent otherwise.
+
+Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ it bends as strips of two cells, and what coarser levels leave of that CG goes o
 iterations for 98, in 0.4 of the time, by twice the steps that they have here (with an exact C 24); by these all its
 steps together take a seventh more iterations, in 0.9 of the time. A compact body takes as many as in a V cycle, and
 would pay for them.
+
+Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""External work and viscous dissipation of a step, for the energy balance of history.csv."""
+"""External work and viscous dissipation of a step, for the energy balance of history.csv.
+
+Equations: docs/theory.md#energy-balance.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Explicit steps: no system, lumped mass, and a step that the body's fastest cell allows."""
+"""Explicit steps: no system, lumped mass, and a step that the body's fastest cell allows.
+
+Equations: docs/theory.md#stable-time-step.
+"""
 
 from __future__ import annotations
 

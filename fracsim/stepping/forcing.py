@@ -15,6 +15,8 @@ what CG leaves is a share of what the tangent leaves anyhow, q_k = |r_k+1| / |r_
 the tangent is kept where with it, too, r comes to be little: it leaves 2 q of r then, the new one q^2. CG stops by the
 preconditioned residual, and under a load on an end leaves fifteen times that share of r. So the first solve is told by
 what CG left of r in the last attempt: taken for the tangent's, that let CG stop earlier from step to step.
+
+Equations: docs/theory.md#inexact-newton.
 """
 
 from __future__ import annotations

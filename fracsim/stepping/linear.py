@@ -1,6 +1,8 @@
 """K of a balance at the present u, and solving with it: one KSP, what it is preconditioned with, and factors.
 
 Newton's method (newton) asks for K at its iterates; solves by themselves are made here.
+
+Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Newton's method: an attempt to solve a balance by PETSc's SNES with line search, options from the study."""
+"""Newton's method: an attempt to solve a balance by PETSc's SNES with line search, options from the study.
+
+Equations: docs/theory.md#newtons-method.
+"""
 
 from __future__ import annotations
 

@@ -13,6 +13,8 @@ body's exact tangent is positive, too. The step ends where r = 0 as it would.
 
 Patches are what is left of the mesh's graph there. Every rank goes through the same motions; what cells say is found
 where they are.
+
+Equations: docs/theory.md#newtons-method.
 """
 
 from __future__ import annotations

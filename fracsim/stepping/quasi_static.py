@@ -7,6 +7,8 @@ the body loses on its way to the new balance: the work of the forces that are ou
     relaxed = - r . (u_after - u_before) / 2,     r the residual on free dofs as the event leaves it,
 
 to second order of the way, exactly for a linear body.
+
+Equations: docs/theory.md#quasi-static-steps.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ that steps resolve, with an error of second order, and as good as nothing for wh
 M^-1 f itself, or K after the breaks, sets slivers and cells that hang by an edge ringing: energy that was kept to 1 %
 doubled. Contact is not in K: blows (mechanics.blow) are no part of the acceleration that is carried, and what it loses
 by breaks inside a body has no resultant.
+
+Equations: docs/theory.md#time-integration.
 """
 
 from __future__ import annotations

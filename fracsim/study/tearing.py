@@ -1,4 +1,5 @@
-"""What `fracsim check` says of cracks that take an energy: whether cells and body suit Irwin's length (METHOD 12)."""
+"""What `fracsim check` says of cracks that take an energy: whether cells and body suit Irwin's length
+(docs/theory.md#fracture-energy)."""
 
 from __future__ import annotations
 

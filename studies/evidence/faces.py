@@ -2,7 +2,7 @@
 
 Two cubes pressed on each other, face to face or edge to edge (turned by 45 degrees, their edges crossing), their meshes
 not alike. What touches is another number of pairs, so that the cost is given by the step and by the pair: parallel
-faces are what detection of collisions finds hardest (METHOD section 9).
+faces are what detection of collisions finds hardest (docs/theory.md#step-limits).
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def stvk_stress(F: Values, young: float, poisson: float) -> Values:
 
 
 def neo_hookean_stress(F: Values, young: float, poisson: float) -> Values:
-    """P = m F (1 - 1/(I_C + 1)) + l (J - alpha) cof F, Smith et al. 2018 eq. 18; m, l, alpha as METHOD.md section 2."""
+    """P = m F (1 - 1/(I_C + 1)) + l (J - alpha) cof F, Smith et al. 2018 eq. 18 (docs/theory.md#elastic-energies)."""
     mu, lmbda = lame(young, poisson)
     m, volumetric = 4 / 3 * mu, lmbda + 5 / 6 * mu
     alpha = 1 + m / volumetric - m / (4 * volumetric)

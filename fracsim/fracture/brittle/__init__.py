@@ -1,4 +1,4 @@
-"""Brittle cracks as surfaces (METHOD section 7; M22 section 5.1.2, B07 section 7.1), in place of single edges.
+"""Brittle cracks as surfaces, in place of single edges (docs/theory.md#brittle-surfaces; M22 5.1.2, B07 7.1).
 
 principal  largest principal stress, its direction, and the material plane normal to it
 start      where surfaces start: the cells loaded most, no two closer than a distance

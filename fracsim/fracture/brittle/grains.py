@@ -2,6 +2,8 @@
 
 B07 cuts at the zero of (E_i - E_j) / 2, linear between nodes. The difference of the squares has the same zero, and is
 linear along an edge where the weights are equal: then the boundaries are planes exactly.
+
+Equations: docs/theory.md#brittle-surfaces.
 """
 
 from __future__ import annotations

@@ -8,6 +8,8 @@ the surface crosses gets
 
 with D_j the principal direction around the node and w_j how far it can be relied on: 1 where the stress has the
 strength and one principal stress stands out, 0 where there is no tension, so that the surface goes straight on there.
+
+Equations: docs/theory.md#brittle-surfaces.
 """
 
 from __future__ import annotations

@@ -8,5 +8,5 @@ breaking   a pass: cells are cut, soften, and let go in the end
 
 A cell is cut where stress reaches the strength, and takes the fracture energy as it opens: a tip's force has no part
 in it, or the energy would count twice. A cut edge is broken once what is cut around it carries nothing any more.
-METHOD section 12.
+docs/theory.md#cohesive-cracks has the equations.
 """

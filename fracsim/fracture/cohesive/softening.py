@@ -12,6 +12,8 @@ the time that it carries nothing it has taken, on whatever way it came there,
 The areas V / l add up to that of a flat crack, by the divergence theorem, wherever it cuts the edges. Those of the cuts
 themselves do as well, but differ from cell to cell with the place of the cut: cells that are clipped at a corner let go
 at once, and a bar of random triangles took 1.07 to 1.2 G_c. Where G_c < l psi_0 a cell lets go at r = 1.
+
+Equations: docs/theory.md#cohesive-cracks.
 """
 
 from __future__ import annotations

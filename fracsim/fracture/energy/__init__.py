@@ -21,5 +21,6 @@ row        in space, without inertia: all of a front gets on at once
 joined     the same, without those that would cut a node off
 splitting  what is left of a cell that has come apart
 
-METHOD section 12 says what was tried. A tip cell is whole and has a broken edge; a split cell has come apart.
+docs/theory.md#fracture-energy has the equations, docs/theory.md#rejected-alternatives what was tried. A tip cell is
+whole and has a broken edge; a split cell has come apart.
 """

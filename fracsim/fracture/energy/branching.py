@@ -9,6 +9,8 @@ The force of a disc in which there is another tip is neither's, and does not say
 left each other's discs they keep level, and each goes straight on, at the angle at which short branches open and do not
 slide: 27 degrees (by elements of order 2, tests/test_branching.py; 0.52 from there). But nobody waits where
 there is enough for both: the other has stopped, and would never be level again.
+
+Equations: docs/theory.md#crack-speed-and-branching.
 """
 
 from __future__ import annotations

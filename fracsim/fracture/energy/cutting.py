@@ -1,4 +1,7 @@
-"""How cracks cut cells: a line a triangle, a plane a tetrahedron, from where they came in, or through the centre."""
+"""How cracks cut cells: a line a triangle, a plane a tetrahedron, from where they came in, or through the centre.
+
+Equations: docs/theory.md#cell-cutting.
+"""
 
 from __future__ import annotations
 

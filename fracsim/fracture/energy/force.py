@@ -1,4 +1,7 @@
-"""The configurational force on a crack tip: what its advance releases for each area of crack, J/m^2."""
+"""The configurational force on a crack tip: what its advance releases for each area of crack, J/m^2.
+
+Equations: docs/theory.md#configurational-force.
+"""
 
 from __future__ import annotations
 

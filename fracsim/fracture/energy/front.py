@@ -5,6 +5,8 @@
 nu is the normal of a side in its polygon's plane, outwards. Sides that polygons share cancel, and those in the body's
 surface are left out, so that the front remains, as ragged as it is: for a flat crack a is exactly that of the smooth
 front through the same area (divergence theorem), and an advance by q e makes the area a . e.
+
+Equations: docs/theory.md#configurational-force.
 """
 
 from __future__ import annotations

@@ -14,6 +14,8 @@ K_II / K_I with the disc's size in it, and three times the scatter: 62 degrees o
 
 The force along the crack, (K_I^2 + K_II^2) / E', is of growing straight on. In pure sliding the crack that turns
 releases a third more. Where K_I < 0 the sides press on each other, and it has no part.
+
+Equations: docs/theory.md#tension-and-sliding.
 """
 
 from __future__ import annotations

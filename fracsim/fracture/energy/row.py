@@ -6,6 +6,8 @@ that lack 3 % go with it, and each leads on: cells that its cut enters are cut b
 one by one, no nearer than half of h to one another, in rounds without a solve: neighbours cut at once would not meet.
 A tip that was looked at and has less stays, wherever the others go. A front gets on by h in 1.3 to 1.9 solves, where
 it took five. Tips that are not mature go by stress, which a cell changes, and do not lead.
+
+Equations: docs/theory.md#tip-criterion.
 """
 
 from __future__ import annotations

@@ -15,6 +15,8 @@ A tip cuts a cell as it comes to it. By G >= G_c at each look it ran on at c_R a
 is let go over R / c_R: G went from 0.4 to 2.2 G_c, and at which look a crack branched was chance. Only where no other
 tip's disc lies over its own, and in steps in which a wave stays in the disc: in longer ones a crack gets on by more
 than that, and goes by G >= G_c, as one.
+
+Equations: docs/theory.md#crack-speed-and-branching.
 """
 
 from __future__ import annotations

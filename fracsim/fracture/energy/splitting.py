@@ -1,7 +1,8 @@
 """What is left of the energy of a cell that cracks have cut: all of it until it comes apart, then nothing.
 
 Where there is inertia it is let go over the time that a Rayleigh wave takes through the disc of a tip: at once, only a
-fifth of the fracture energy leaves the model, and the rest rings through the mesh (METHOD section 12).
+fifth of the fracture energy leaves the model, and the rest rings through the mesh
+(docs/theory.md#release-with-inertia).
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Which crack tips advance, and where cracks begin: the criterion of a body with a fracture energy G_c (METHOD 12).
+"""Which crack tips advance, and where cracks begin: the criterion of a body with a fracture energy G_c
+(docs/theory.md#tip-criterion).
 
 A tip advances by a cell where the configurational force over a disc of 5 h (a ball of 4 h) reaches G_c, once the crack
 behind it is as long as the disc (mature). Younger tips and whole material go by stress: its average reaches the

@@ -13,6 +13,8 @@ with |P - P_0| <= t |C grad v_0| + k (D - t |grad v_0|), k the greatest modulus 
 r is all but nothing as long as the body goes on as it did, so that the bound is close for as long as that. It takes the
 motion of the nodes around tips, and no gradient of it, stress or force. For Hooke's law of small strains, where what is
 cut has let go, and tips that go by their force: others are looked at in every pass.
+
+Equations: docs/theory.md#release-with-inertia.
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ gap that steps do not resolve swings about its rest without end. So a share of t
 
 it still gives none, a bounce of fifty steps loses 4 %, and of the swing of a stiff gap c / (2 - c) = 2/3 is left after
 a step. p is the slope of 9 c / 4 b((2 g_n + g) / 3) + (1 - 3 c / 4) b(g).
+
+Equations: docs/theory.md#contact-in-a-time-step.
 """
 
 from __future__ import annotations

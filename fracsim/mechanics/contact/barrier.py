@@ -1,4 +1,7 @@
-"""The barrier that keeps gaps open, and how far points may move before a gap could close (IPC; METHOD section 9)."""
+"""The barrier that keeps gaps open, and how far points may move before a gap could close (IPC).
+
+Equations: docs/theory.md#barrier, docs/theory.md#step-limits.
+"""
 
 from __future__ import annotations
 

@@ -8,6 +8,8 @@ every step. With the normal n_n of the start it loses as much. The barrier acts 
 
 and is right to second order. Where e is no longer small beside g, f = g (g + e / 2) / (g + e): open wherever g is.
 The start is seen from the obstacle, and goes with it.
+
+Equations: docs/theory.md#contact-in-a-time-step.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 k_p = kappa A_p / (2 D), but no more than what leaves the stable step as it is (pushing.rates); what points that are
 near each other add to the square of the highest frequency sets the step.
+
+Equations: docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ d the gap from which on it acts, k_p the stiffness of a point, s the stretch of 
 nodes' mass (carried): contact then adds `most` at most to the square of the body's highest frequency, from which the
 step is taken. Forces at the end of a step are those that the next one starts with; the work of both is taken by
 trapezia, as velocity Verlet steps do.
+
+Equations: docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ corners before an obstacle that is flat (flat). The corners' own energy A/c sum_
 Before what is flat F is 0 with all its derivatives, and nothing is counted twice; before what is round F > 0, and grows
 without bound before the facet is cut. (The largest of the b(gap_c), smoothly, in place of b(gap') is the same for a
 facet that lies flat, but not for one that is about to tilt: it made tangents of large flat faces indefinite.)
+
+Equations: docs/theory.md#facets.
 """
 
 from __future__ import annotations

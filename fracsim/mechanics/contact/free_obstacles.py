@@ -10,6 +10,8 @@ part couples all points in touch with one another; it is of rank k, the freedoms
 stored. (Without it a disk of a third of the body's mass takes 17,892 iterations in place of 127, or finds no solution.)
 Every rank finds the same poses from sums over all ranks. Free obstacles meet those that are held or driven (stops), and
 one another (mutual).
+
+Equations: docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Coulomb friction as a potential, with normal force and normal of the step's start (IPC; METHOD section 9)."""
+"""Coulomb friction as a potential, with normal force and normal of the step's start (docs/theory.md#friction)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Contact of a body with itself, and of its pieces with one another: a term of the balance (METHOD section 9).
+"""Contact of a body with itself, and of its pieces with one another: a term of the balance
+(docs/theory.md#contact).
 
 The split surface lies on rank 0, which finds what touches (pairs) and hands forces and stiffness down to the nodes:
 x = W u, f = W^T dE/dx, K = W^T d2E/dx2 W. All else stays where it is. What rank 0 does alone in a step is in the

@@ -1,4 +1,4 @@
-"""Contact of a body with obstacles: a term of the balance (METHOD section 9).
+"""Contact of a body with obstacles: a term of the balance (docs/theory.md#contact).
 
     E(u) = sum over obstacles of  int b(gap(x)) dA  +  sum over points in touch of  mu lambda f0(|s|)
 

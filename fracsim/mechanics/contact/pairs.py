@@ -13,6 +13,8 @@ each other between two flat faces as their meshes please, and from D on it would
 a factor of 1.6 to 2.8). Elements that share a point do not touch each other.
 
 The caller maps nodes to points of the surface and forces back: x = W u and W^T f; ipctk's displacement map is unused.
+
+Equations: docs/theory.md#barrier.
 """
 
 from __future__ import annotations

@@ -4,9 +4,11 @@ A gap of twice the distance of the barrier, itself 3 % of an edge, leaves no pai
 edges break, and room for a state of strain of about 1 %. With more strain, or slivers: Pairs.crowded.
 
 Every copy goes towards the mean of the nodes that it follows, so far that all walls of the crack at it recede by half
-the gap along their normals; the boundary of the body keeps its place. (A fixed share of the edge, METHOD section 9,
+the gap along their normals; the boundary of the body keeps its place. (A fixed share of the edge
 leaves walls that are aslant to their edge nearer to each other: half of the gap on a lattice, a fifth on worse
 meshes.) A point with one copy is a tip, where the sides meet, and stays.
+
+Equations: docs/theory.md#new-crack-faces.
 """
 
 from __future__ import annotations

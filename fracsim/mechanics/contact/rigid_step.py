@@ -10,6 +10,8 @@ contact enters as a blow of factor k (blow), and
 So the linear momentum that body and obstacle exchange is the same to the last digit, in 2D the angular one too, and
 without a moment the angular momentum of a body that tumbles stays as it is. In 3D a moment would act through J(w)^T
 (turn), an error of the order of the turn in a step; the momentum at the end is therefore that of the moment itself.
+
+Equations: docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations

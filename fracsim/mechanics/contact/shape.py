@@ -105,7 +105,7 @@ class Body(ABC):
         return self._moments()[0]
 
     def inertia(self, density: float) -> Values:
-        """rho (tr S 1 - S), S = int x x^T dV (METHOD section 9: free rigid bodies); in 2D rho tr S."""
+        """rho (tr S 1 - S), S = int x x^T dV (docs/theory.md#rigid-obstacles); in 2D rho tr S."""
         if self.hollow:
             raise InputError(
                 f"a hollow {type(self).__name__.lower()} has walls without thickness, so no inertia: hold it"

@@ -2,6 +2,8 @@
 
 P. A. Cundall, O. D. L. Strack: A discrete numerical model for granular assemblies. Geotechnique 29 (1979) 47-65. A
 body at rest on a slope stays there: friction that is a function of the velocity alone would let it creep.
+
+Equations: docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations

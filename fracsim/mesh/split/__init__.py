@@ -1,4 +1,4 @@
-"""The split surface of a torn body (METHOD section 8): what is drawn and what touches, never what is solved.
+"""The split surface of a torn body (docs/theory.md#split-surface): drawn and used for contact, never solved for.
 
 table     what every damage pattern does to one cell, derived once
 skeleton  numbers of the edges, facets and boundary of the input mesh

@@ -3,8 +3,8 @@
     x = mean over p of (x_p + R_p (X - X_p))
 
 with p the nodes of the point's group and R_p the polar rotation of the average deformation around p, so that turning
-pieces do not shear (METHOD section 8). With R held, the map is linear in the nodes and `weights` is its matrix: its
-transpose hands forces at the points down to the nodes, which is M22 section 4.2.
+pieces do not shear (docs/theory.md#split-surface). With R held, the map is linear in the nodes and `weights` is its
+matrix: its transpose hands forces at the points down to the nodes, which is M22 section 4.2.
 """
 
 from __future__ import annotations

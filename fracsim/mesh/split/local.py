@@ -4,7 +4,8 @@
 
 with F_p the volume average of the deformation gradient of the intact cells around p, on all ranks; the identity where
 there are none. Unlike the polar rotation of `follow` this is linear in the nodes, sum w_a = 1, and every affine motion
-is reproduced: the transpose of w hands forces down to the nodes with their resultant and their moment (METHOD 9).
+is reproduced: the transpose of w hands forces down to the nodes with their resultant and their moment
+(docs/theory.md#split-surface).
 
 Nothing is gathered. A point on the border of two ranks is there on both, each time with the area of that rank's own
 elements around it.

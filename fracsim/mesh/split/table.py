@@ -9,6 +9,8 @@ once, turned round and cut along the same diagonal m-T, with those of j. (The ot
 four triangles where both facets stay whole.) A copy of m belongs to its end node; a copy of G or T belongs to a
 connected group of the nodes of the facet or cell, under the intact edges *of that facet or cell alone*. So neighbours
 agree on a copy without asking, and every group lies in one piece of the body.
+
+Equations: docs/theory.md#split-surface.
 """
 
 from __future__ import annotations

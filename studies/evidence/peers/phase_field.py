@@ -5,7 +5,8 @@
     python -m fracsim.studies.evidence.peers.phase_field --n 40 [--pull shear] -o figures.json
 
 PhaseFieldX is a library on DOLFINx; 0.1.4 goes with DOLFINx 0.9, 0.4 does not. Its notch is a slit, along a row of
-nodes that are there twice; ours cuts the row of cells above it, since a node at the tip is a hinge (METHOD section 12).
+nodes that are there twice; ours cuts the row of cells above it, since a node at the tip is a hinge
+(docs/theory.md#cell-cutting).
 Its length scale is two cells, the least that is taken for resolved. In tension all of the energy opens its crack; in
 shear that of principal strains that are positive does (hybrid: Ambati et al. 2015), without which cracks go both ways.
 """

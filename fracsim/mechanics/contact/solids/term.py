@@ -1,4 +1,5 @@
-"""Contact of a body with solids, obstacles whose surface is read from a file: a term of the balance (METHOD section 9).
+"""Contact of a body with solids, obstacles whose surface is read from a file: a term of the balance
+(docs/theory.md#contact).
 
 As that of a body with itself (itself): the split surface lies on rank 0, which finds what touches and hands forces and
 stiffness down to the nodes. The points of a solid are no unknowns; they are where its way says at the end of a step.
