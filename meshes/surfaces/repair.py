@@ -38,6 +38,7 @@ MAX_NEW = 0.25  # share of a part's area that is new triangles
 TOLD_NEW = 0.1  # the same, from which on the note says so first
 MAX_PARTS = 1000  # of a file that are looked at one by one
 DUST = 1e-3  # share of the whole area; open parts of less are left out
+SLIVER = 1e-5  # share of the size of a union; edges shorter than this are collapsed
 UNITED = 1e-6  # share by which a union may be smaller than its largest part, or larger than all parts together
 SECONDS, SECONDS_A_TRIANGLE = 60.0, 1e-3  # that the repair may take
 BY_HAND = "Mend it by hand there (MeshLab: Filters > Cleaning and Repairing; Blender: Mesh > Clean Up)."
@@ -328,7 +329,8 @@ def _union(parts: list[Part], source: str) -> tuple[Part, str]:
         outwards = triangles if volume > 0 else triangles[:, ::-1]
         mesh = manifold3d.Mesh64(np.ascontiguousarray(points), np.ascontiguousarray(outwards, dtype=np.uint64))
         solids.append(manifold3d.Manifold(mesh))
-    whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+    size = float(np.ptp(_together(parts)[0], axis=0).max())
+    whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(SLIVER * size)
     mesh = whole.to_mesh64()
     points, triangles = np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64).reshape(-1, 3)
     place = middle_of(parts[1][0], np.arange(len(parts[1][0])))

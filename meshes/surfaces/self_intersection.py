@@ -76,21 +76,31 @@ def _children(pairs: Indices) -> Indices:
 def _crossed(points: Points, triangles: Indices, pairs: Indices, tolerance: float, margin: float) -> Mask:
     """(k,) whether an edge of one triangle of each pair passes through the other."""
     crossed = np.zeros(len(pairs), bool)
+    reaching = np.zeros(len(pairs), bool)
+    for one, other in ((0, 1), (1, 0)):  # to both sides of the other's plane: few neighbours do
+        heights = _heights(points[triangles[pairs[:, one]]], points[triangles[pairs[:, other]]])
+        reaching |= (heights.min(axis=1) < -tolerance) & (heights.max(axis=1) > tolerance)
+    straddling = np.flatnonzero(reaching)
     for one, other in ((0, 1), (1, 0)):
-        edges, faces = triangles[pairs[:, one]], triangles[pairs[:, other]]
+        edges, faces = triangles[pairs[straddling, one]], triangles[pairs[straddling, other]]
         for side in range(3):
             edge = edges[:, [side, (side + 1) % 3]]
-            free = ~(edge[:, :, None] == faces[:, None, :]).any(axis=(1, 2)) & ~crossed
-            crossed[free] = _pierces(points[edge[free]], points[faces[free]], tolerance, margin)
+            free = ~(edge[:, :, None] == faces[:, None, :]).any(axis=(1, 2)) & ~crossed[straddling]
+            crossed[straddling[free]] = _pierces(points[edge[free]], points[faces[free]], tolerance, margin)
     return crossed
+
+
+def _heights(x: Floats, faces: Floats) -> Floats:
+    """(k, e) of points (k, e, 3) over the planes of triangles (k, 3, 3)."""
+    a, b, c = faces.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
+    return np.asarray(np.einsum("kei,ki->ke", x - a[:, None], normal))
 
 
 def _pierces(edges: Floats, faces: Floats, tolerance: float, margin: float) -> Mask:
     """(k,) whether segments (k, 2, 3) pass through triangles (k, 3, 3), by the signs of the volumes they span."""
-    a, b, c = faces.transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
-    height = np.einsum("kei,ki->ke", edges - a[:, None], normal)
+    height = _heights(edges, faces)
     through = (height.min(axis=1) < -tolerance) & (height.max(axis=1) > tolerance)
     pierced = np.zeros(len(edges), bool)
     start, span = edges[through, 0], edges[through, 1] - edges[through, 0]
