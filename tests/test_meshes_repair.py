@@ -302,6 +302,14 @@ def test_a_spike_far_out_is_not_cut_off_in_silence(tmp_path: Path) -> None:
         read_body(saved(tmp_path, pushed_through(3.0)), repair=True)
 
 
+def test_what_cuts_itself_after_the_repair_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repair that leaves its surface as it was."""
+    monkeypatch.setattr(repairing, "repaired", lambda points, triangles, source: (points, triangles, ()))
+    for damaged, wrong in ((pushed_through(2.08), "cuts itself"), (without(sphere(), (0, 0, 1)), "is open")):
+        with pytest.raises(MeshError, match=rf"part.ply', repaired, {wrong}"):
+            read_body(saved(tmp_path, damaged), repair=True)
+
+
 def table(path: Path, **keys: object) -> Mesh:
     return Mesh.model_validate({"surface": path, "h": 0.5} | keys)
 

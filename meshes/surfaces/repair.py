@@ -76,13 +76,14 @@ def read_body(
         ) from None
     except Died as died:
         raise MeshError(f"{source}: the repair died ({died.how}). {BY_HAND}") from None
-    surface = closed_surface(points, triangles, source)
-    _refuse_crossings(surface, source)
+    after = f"{source}, repaired,"
+    surface = closed_surface(points, triangles, after)
+    _refuse_crossings(surface, after, closed=True)
     return replace(surface, notes=(*notes, *surface.notes))
 
 
-def _refuse_crossings(surface: ClosedSurface, source: str) -> None:
-    pairs = crossing_triangles(surface.points, surface.triangles)
+def _refuse_crossings(surface: ClosedSurface, source: str, closed: bool = False) -> None:
+    pairs = crossing_triangles(surface.points, surface.triangles, closed=closed)
     if len(pairs):
         where = middle_of(surface.points, surface.triangles[pairs[0]].ravel())
         raise Repairable(
