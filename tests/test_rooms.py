@@ -6,6 +6,7 @@ Imports are read from the source, those inside functions and under TYPE_CHECKING
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from pathlib import Path
 
@@ -13,8 +14,11 @@ import pytest
 
 import fracsim
 import fracsim.forms
+import fracsim.meshes
 
 ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
+MESHES = Path(fracsim.meshes.__file__).parent
+ARCHITECTURE = Path(__file__).parent.parent / "docs" / "architecture.md"
 LAYERS = ("mesh", "mechanics", "fracture", "stepping", "rigid", "output")  # each may use those before it
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
@@ -102,3 +106,64 @@ def test_the_study_is_for_the_way_in_alone() -> None:
     readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
     assert ways_in == {"cli.py", "run.py", "watched.py"}
     assert readers == {"study", "scene", "report"}
+
+
+# --- the drawing of docs/architecture.md ---
+
+RUN = ("run.py", "rigid_run.py", "watched.py", "process.py")  # the files of the room "run"
+EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
+
+
+def arrows() -> set[tuple[str, str]]:
+    """Arrows of the first drawing of the page, from a room to one that it imports."""
+    drawing = re.search(r"```mermaid\n(.*?)```", ARCHITECTURE.read_text(), re.DOTALL)
+    assert drawing is not None
+    lines = re.sub(r'\["[^"]*"\]', "", drawing.group(1)).splitlines()[1:]
+    return {(line.split()[0], line.split()[2]) for line in lines}
+
+
+def reachable(arrows: set[tuple[str, str]], start: str) -> set[str]:
+    """Rooms that arrows lead to from a room."""
+    found, new = set[str](), {start}
+    while new:
+        found, new = found | new, {end for first, end in arrows if first in new} - found - new
+    return found - {start}
+
+
+def imported_rooms() -> dict[str, set[str]]:
+    """Room -> rooms that it imports, from the source."""
+    folders = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
+    result = {room: rooms_of(set().union(*own(room).values())) for room in folders}
+    result["run"] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in RUN))
+    result["cli"] = of_fracsim(ROOT / "cli.py", "fracsim")
+    for room, folder in (("forms", FORMS), ("meshes", MESHES)):
+        files = [
+            (path, ".".join(["fracsim", room, *path.relative_to(folder).parent.parts])) for path in folder.rglob("*.py")
+        ]
+        result[room] = set().union(*(of_fracsim(path, package) for path, package in files))
+    of_run = {name.removesuffix(".py") for name in RUN}
+    return {room: {"run" if name in of_run else name for name in names} - {room} for room, names in result.items()}
+
+
+def of_fracsim(path: Path, package: str) -> set[str]:
+    """Rooms that a file imports."""
+    return rooms_of({name[8:] for name in imports(path, package) if name.split(".")[0] == "fracsim"})
+
+
+def test_the_drawing_of_the_rooms_is_that_of_the_imports() -> None:
+    """All rooms are drawn, imports go along arrows, arrows are imports, and no arrow could be left out."""
+    drawn, found = arrows(), imported_rooms()
+    assert {room for arrow in drawn for room in arrow} == set(found)
+    assert not [(room, names - reachable(drawn, room) - EVERYWHERE) for room, names in found.items()
+                if names - reachable(drawn, room) - EVERYWHERE]  # fmt: skip
+    assert not [(first, second) for first, second in drawn if second not in found[first]]
+    assert not [arrow for arrow in drawn if arrow[1] in reachable(drawn - {arrow}, arrow[0])]
+
+
+def test_the_page_of_rooms_has_a_row_for_each_of_them() -> None:
+    """`fracsim/NAME`, `forms` and `meshes`; the files of "run" are named below the table."""
+    page = ARCHITECTURE.read_text()
+    rows = set(re.findall(r"^\| `([\w/]+)` \|", page, re.MULTILINE))
+    folders = {f"fracsim/{path.name}" for path in ROOT.iterdir() if (path / "__init__.py").exists()}
+    assert folders | {"forms", "meshes", "studies", "tests"} <= rows
+    assert all((ARCHITECTURE.parent.parent / row).is_dir() for row in rows)
