@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, Shell
-from .surfaces.closed import read_triangles
 from .topology import Floats, boundary_facets, signed_measures
 from .words import middle_of
 
@@ -75,6 +74,8 @@ def read_shell(path: str | Path, thickness: float, scale: float = 1.0) -> MeshDa
         MeshError: the file cannot be read or holds no surface; an edge of more than two triangles, or triangles that
             cannot be turned alike; a thickness that its folds leave no room for.
     """
+    from .surfaces.closed import read_triangles  # shells of builders need no reader
+
     path = Path(path)
     source = f"Shell file '{path}'"
     points, triangles, notes = read_triangles(path, scale, source)

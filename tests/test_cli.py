@@ -39,6 +39,18 @@ finally: print('heavy:', [name for name in {(*HEAVY, *NOT_CHECKED)!r} if name in
     assert "mesh        loaf: 3D, about" in result.stdout
 
 
+@pytest.mark.parametrize("command", ["list", "check"])
+def test_no_reader_of_mesh_files_is_imported_where_none_is_read(command: str) -> None:
+    code = f"""
+import sys; sys.argv = {["fracsim", command, *(["bar-2d"] if command == "check" else [])]!r}
+from fracsim.cli import main
+try: main()
+finally: print([name for name in sys.modules if name in ("fracsim.meshes.read", "fracsim.meshes.surfaces.closed")])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
 def test_check_tells_what_is_built_and_what_is_not() -> None:
     lines = check_study(study(BAR))
     assert lines[0] == "mesh        box: 3D, about 24 cells; groups left, right, front, back, bottom, top"

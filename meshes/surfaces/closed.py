@@ -11,7 +11,6 @@ from ..components import components
 from ..contents import Block
 from ..data import Indices, MeshError, Points
 from ..parameters import LONGEST, SHORTEST
-from ..read import read_contents
 from ..topology import Floats, Mask, distinct_rows
 from ..words import middle_of
 from .enclosed import enclosed_volumes, windings
@@ -96,6 +95,8 @@ def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indic
 
 def triangles_as_given(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
     """Points [m] and triangles as they are in a file; `scale`: metres per unit of it. MeshError as of read_surface."""
+    from ..read import read_contents  # the readers of all formats: a body of a builder needs none
+
     contents = read_contents(path)
     triangles = np.concatenate(
         [np.zeros((0, 3), np.int64), *(_triangles(contents.points, block) for block in contents.blocks)]
