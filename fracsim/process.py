@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType, ModuleType
 from typing import Any, NoReturn, TextIO
 
@@ -222,16 +222,16 @@ def import_outside(*names: str) -> None:
                 importlib.import_module(name)
 
 
-def import_dolfinx() -> None:
-    """DOLFINx without dolfinx.utils, which is there for those who ask for it. InputError: its settings are no JSON.
+def import_dolfinx(*, whole: bool = False) -> None:
+    """Import DOLFINx without settings of the working folder. InputError: another version, or its settings are no JSON.
 
-    It is for callers of PETSc from Numba, and parses C declarations as it is imported: a parser, a lexer and their
-    regular expressions, 0.04 s.
+    dolfinx.utils is left out unless `whole` asks for it: it is for callers of PETSc from Numba, and parses C
+    declarations as it is imported, 0.04 s.
     """
     if "dolfinx" in sys.modules:
         return
     name = "dolfinx.utils"
-    with outside_working_folder(), kept_out(name, ModuleType(name)):
+    with outside_working_folder(), nullcontext() if whole else kept_out(name, ModuleType(name)):
         if _own:  # PETSc's handlers would end what SIGHUP and SIGQUIT meet from here on by MPI_Abort
             importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
         dolfinx = importlib.import_module("dolfinx")
@@ -240,7 +240,8 @@ def import_dolfinx() -> None:
         _read_settings("ffcx", "options")
     if _own:
         _heed_signals()  # UCX, of Open MPI, has taken SIGHUP
-    del dolfinx.utils
+    if not whole:
+        del dolfinx.utils
 
 
 def _read_settings(library: str, module: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,28 @@ def test_a_run_takes_nothing_from_the_working_folder(folder: Path) -> None:
     done = fracsim(folder, *plain, PETSC_OPTIONS=f"-log_view :{folder}/asked.txt")
     assert (done.returncode, done.stderr) == (0, "")
     assert "PETSc" in (folder / "asked.txt").read_text()
+    assert_untouched(folder)
+
+
+SCRIPT = """
+import os
+before = os.getcwd()
+from fracsim.scene import build_scene
+from fracsim.study.file import load_study
+from mpi4py import MPI
+scene = build_scene(MPI.COMM_WORLD, load_study("strip.toml"))
+state, _ = scene.stepper.advance(scene.start())
+import dolfinx
+print(state.step, os.getcwd() == before, callable(dolfinx.utils.ctypes_utils.MatSetValuesLocal))
+"""
+
+
+def test_a_script_takes_nothing_from_the_working_folder(folder: Path, tmp_path: Path) -> None:
+    """Where it imports fracsim first. Then it is in its folder again, and has the whole of DOLFINx."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    program = [sys.executable, tmp_path / "script.py"]
+    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1 True True\n", "")
     assert_untouched(folder)
 
 

@@ -15,27 +15,33 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mpi4py import MPI
+from ..process import import_dolfinx, import_outside
 
-from ..forms.schemes import Scheme
-from ..mechanics.balance import Balance
-from ..mechanics.material import MaterialFields
-from ..mechanics.supports import check_supports
-from ..mesh.domain import Domain, distribute
-from ..mesh.ranks import on_root
-from ..output.history import Probe, Probes
-from ..stepping.after_step import Breaking, Flow, Unbreakable
-from ..stepping.initial import initial_velocity
-from ..stepping.solver import Solver
-from ..stepping.state import State
-from ..stepping.stepper import Stepper, StepSizes
-from ..stepping.weakly import free_dropped
-from ..study import Study, Time
-from ..study.check import checked_mesh
-from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course
-from .breaking import breaking_of, flow_of
-from .material import material_of
-from .terms import TERMS, Parts, balance_of
+# A script that imports this room takes no settings of PETSc or DOLFINx from the working folder, as the command does.
+import_outside("mpi4py.MPI")
+import_dolfinx(whole=True)
+
+from mpi4py import MPI  # noqa: E402
+
+from ..forms.schemes import Scheme  # noqa: E402
+from ..mechanics.balance import Balance  # noqa: E402
+from ..mechanics.material import MaterialFields  # noqa: E402
+from ..mechanics.supports import check_supports  # noqa: E402
+from ..mesh.domain import Domain, distribute  # noqa: E402
+from ..mesh.ranks import on_root  # noqa: E402
+from ..output.history import Probe, Probes  # noqa: E402
+from ..stepping.after_step import Breaking, Flow, Unbreakable  # noqa: E402
+from ..stepping.initial import initial_velocity  # noqa: E402
+from ..stepping.solver import Solver  # noqa: E402
+from ..stepping.state import State  # noqa: E402
+from ..stepping.stepper import Stepper, StepSizes  # noqa: E402
+from ..stepping.weakly import free_dropped  # noqa: E402
+from ..study import Study, Time  # noqa: E402
+from ..study.check import checked_mesh  # noqa: E402
+from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course  # noqa: E402
+from .breaking import breaking_of, flow_of  # noqa: E402
+from .material import material_of  # noqa: E402
+from .terms import TERMS, Parts, balance_of  # noqa: E402
 
 if TYPE_CHECKING:
     from ..fracture.breaking import Breaking as EdgeBreaking
