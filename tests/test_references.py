@@ -110,6 +110,12 @@ def test_sections_of_the_theory_have_one_anchor_and_their_sources() -> None:
     assert not [section.split("\n")[0] for section in sections if "\nSources: " not in section]
 
 
+def test_sections_of_the_theory_are_referred_to_by_code() -> None:
+    """But for what no single line of code does: notation, the head of a group of sections, what is still open."""
+    used = {heading for path in CODE for name, heading in MENTION.findall(path.read_text()) if name == THEORY.name}
+    assert set(anchors(THEORY)) - used == {"theory", "notation", "solver", "open-questions"}
+
+
 def test_abbreviations_of_papers_are_spelled_out_once() -> None:
     """With author, year and title, before any other use."""
     text = THEORY.read_text()
