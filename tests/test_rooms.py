@@ -110,7 +110,7 @@ def test_the_study_is_for_the_way_in_alone() -> None:
 
 # --- the drawing of docs/architecture.md ---
 
-RUN = ("run.py", "rigid_run.py", "watched.py", "process.py")  # the files of the room "run"
+RUN = ("run.py", "rigid_run.py", "watched.py")  # the files of the room "run"
 EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
 
 
@@ -135,7 +135,7 @@ def imported_rooms() -> dict[str, set[str]]:
     folders = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     result = {room: rooms_of(set().union(*own(room).values())) for room in folders}
     result["run"] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in RUN))
-    result["cli"] = of_fracsim(ROOT / "cli.py", "fracsim")
+    result |= {name: of_fracsim(ROOT / f"{name}.py", "fracsim") for name in ("cli", "process")}
     for room, folder in (("forms", FORMS), ("meshes", MESHES)):
         files = [
             (path, ".".join(["fracsim", room, *path.relative_to(folder).parent.parts])) for path in folder.rglob("*.py")
