@@ -105,7 +105,8 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     levels."""
     monkeypatch.setattr(blocks, "SMALL", 0)
     monkeypatch.setattr(cycle, "SLOWLY", slowly)
-    scene = bar(dim, {})
+    small = {2: {"size": [0.6, 0.14], "h": 0.02}, 3: {"size": [0.6, 0.15, 0.15], "h": 0.05}}  # matrices are dense
+    scene = bar(dim, {}, mesh=small[dim])
     Walk(scene).advance()
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
     preconditioner.due = Due.REFRESH
