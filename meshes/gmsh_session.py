@@ -32,15 +32,20 @@ def session() -> Iterator[Any]:
     gmsh.model.add("fracsim")
     try:
         yield gmsh
-    except MeshError:
-        raise
-    except Exception as error:  # gmsh raises plain Exception
+    except Exception as error:
+        if not _is_of_gmsh(error):
+            raise
         raise MeshError(f"gmsh could not make the mesh: {str(error).strip() or 'it gave no reason'}.") from error
     finally:
         if mine:
             gmsh.finalize()
         else:
             gmsh.model.remove()
+
+
+def _is_of_gmsh(error: Exception) -> bool:
+    """Whether gmsh raised the error: gmsh raises plain Exception. Others may come of a signal, which ends the run."""
+    return type(error) is Exception
 
 
 def meshed(
@@ -91,8 +96,8 @@ def fill_volumes(gmsh: Any, sizing: Sizing) -> None:
         try:
             gmsh.model.mesh.generate(3)
             break
-        except Exception:
-            if algorithm == DELAUNAY:
+        except Exception as error:
+            if algorithm == DELAUNAY or not _is_of_gmsh(error):
                 raise
     gmsh.model.mesh.optimize("", True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from functools import cache
 from math import comb, cos, log, pi, radians, sin, tan
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fracsim.errors import Stopped
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.builders.figure import BLEND, RoundCone
 from fracsim.meshes.builders.vase import CONTROL
@@ -454,6 +456,32 @@ def test_gmsh_is_ended_after_an_error() -> None:
     with pytest.raises(MeshError, match=r"gmsh could not make the mesh: .+"), session() as g:
         g.model.mesh.setNode(77, [0, 0, 0], [])
     assert not gmsh.isInitialized()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_signal_while_gmsh_meshes_ends_the_run(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a handler raises is neither taken for a failure of gmsh, nor a reason to try another algorithm."""
+    import gmsh
+
+    generate, asked = gmsh.model.mesh.generate, []
+
+    def signalled(of: int) -> None:
+        asked.append(of)
+        if of == dim:
+            signal.raise_signal(signal.SIGUSR1)
+        generate(of)
+
+    def stop(*_: object) -> None:
+        raise Stopped("stopped by signal SIGUSR1")
+
+    monkeypatch.setattr(gmsh.model.mesh, "generate", signalled)
+    before = signal.signal(signal.SIGUSR1, stop)
+    try:
+        with pytest.raises(Stopped, match="SIGUSR1"):
+            BUILDERS["cylinder"](radius=0.1, length=0.2, h=0.1).build()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert asked.count(dim) == 1 and not gmsh.isInitialized()
 
 
 @pytest.mark.parametrize("size", [(1.0, 1.0), (1.0, 1.0, 1.0)])
