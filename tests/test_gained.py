@@ -16,9 +16,9 @@ from support.scenes import deform, make_scene
 def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> EnergyGain:
     """A watch that has seen rows of (kinetic, elastic, dissipated, work), J."""
     watch = EnergyGain(at_rest=at_rest)
-    for kinetic, elastic, dissipated, work in rows:
+    for step, (kinetic, elastic, dissipated, work) in enumerate(rows, 1):
         report: Any = SimpleNamespace(kinetic=kinetic, elastic=elastic)
-        state: Any = SimpleNamespace(dissipated=dissipated, work=work)
+        state: Any = SimpleNamespace(t=0.1 * step, dissipated=dissipated, work=work)
         watch.look(report, state)
     return watch
 
@@ -31,8 +31,23 @@ def test_losses_and_balance_are_not_told() -> None:
 def test_a_gain_is_told_with_its_share() -> None:
     """2 J of work, then 3 J held: 1 J from nowhere, a third of what is at play; even after a loss of 1 J before."""
     watch = watched([(1.0, 1.0, 0.0, 2.0), (1.0, 2.0, 0.0, 2.0)])
-    assert watch.note("newmark").startswith("the body gained 1 J of energy from nowhere, 33% of all")
+    assert watch.note("newmark").startswith("the body gained 1 J of energy from nowhere (100% of it")
+    assert "in the step to t = 0.2 s), 33% of all" in watch.note("newmark")
     assert watched([(1.0, 0.0, 0.0, 2.0), (2.0, 0.0, 0.0, 2.0)]).rise == pytest.approx(1.0)
+
+
+def test_the_step_that_gained_most_is_named() -> None:
+    """0.1 J a step of work that is held, then 4 J in the fifth step: what the energy of README's study without crumbs
+    does. Where every step gains as much, no step is named. A restart goes on with what was."""
+    held = [(0.1 * n, 0.0, 0.0, 0.1 * n) for n in range(1, 5)]
+    told = "gained 4 J of energy from nowhere (100% of it in the step to t = 0.5 s), 89% of all"
+    assert told in watched([*held, (4.5, 0.0, 0.0, 0.5)]).note("generalized-alpha")
+    assert "gained 4 J of energy from nowhere, " in watched([(n, 0.0, 0.0, 0.0) for n in range(1, 5)]).note("newmark")
+    first, again = watched(held), EnergyGain(at_rest=True)
+    again.restore(first.monitors())
+    last: Any = SimpleNamespace(kinetic=4.5, elastic=0.0), SimpleNamespace(t=0.5, dissipated=0.0, work=0.5)
+    again.look(*last)
+    assert told in again.note("generalized-alpha")
 
 
 def test_a_note_does_not_advise_what_is_so_already() -> None:
@@ -49,7 +64,7 @@ def test_round_off_is_not_told() -> None:
     scene, _ = make_scene(material={"energy": "linear", "young": 2e11, "poisson": 0.3, "density": 7800.0})
     watch = EnergyGain(at_rest=True, floor=worth_telling(scene.balance.stress))
     assert watch.floor == pytest.approx(2e11 * 1.0 * 9e-16)
-    watch.look(SimpleNamespace(kinetic=4e-14, elastic=0.0), SimpleNamespace(dissipated=0.0, work=0.0))  # type: ignore[arg-type]
+    watch.look(SimpleNamespace(kinetic=4e-14, elastic=0.0), SimpleNamespace(t=0.1, dissipated=0.0, work=0.0))  # type: ignore[arg-type]
     assert watch.rise == 4e-14 and watch.note("newmark") == ""
 
 
