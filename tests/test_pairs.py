@@ -13,7 +13,7 @@ from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
-from fracsim.mechanics.contact.pairs import Pairs
+from fracsim.mechanics.contact.pairs import VERTICES, Pairs
 from fracsim.mechanics.contact.recede import receded
 
 Values = npt.NDArray[np.float64]
@@ -113,22 +113,34 @@ def test_action_is_reaction(dim):
     assert np.abs(torque - torque.T).max() < 1e-12 * np.abs(force).sum()
 
 
-def pressure(gap: float) -> float:
-    """k |b'(gap)| of the module's equation, Pa."""
-    s = (gap / REACH) ** 2
-    return -STIFF * REACH * (2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) * 2 * gap / REACH**2 * -1
+def pressure(gap: float, reach: float = REACH) -> float:
+    """k |b'(gap)| of the module's equation for a barrier from `reach` on, Pa; 0 beyond it."""
+    s = min(gap / reach, 1.0) ** 2
+    return STIFF * reach * (2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) * 2 * gap / reach**2
 
 
 @pytest.mark.parametrize("share", [0.9, 0.55])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_pressure_does_not_depend_on_the_mesh(dim, share):
-    """Faces of area 1. In 3D points of the rim have half of the sides' area, 0.8, in 2D half of the sides' length."""
+    """Faces of area 1, by their centroids. To vertices on the rim half of the sides' area belongs, 0.8, in 2D half of
+    the sides' length; vertices are pressed from VERTICES of the distance on."""
     gap = share * REACH
     area = 1 + 0.4 if dim == 3 else 1 + 0.2
+    expected = pressure(gap) + area * pressure(gap, VERTICES * REACH)
     for counts, seeds in (((4, 4), (1, 2)), ((4, 4), (3, 3)), ((5, 13), (5, 6)), ((16, 16), (7, 8))):
         x, elements, upper = stacked(dim, gap, counts, seeds)
         force = -Pairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper]
-        assert force[:, -1].sum() == pytest.approx(area * pressure(gap), rel=1e-6)
+        assert force[:, -1].sum() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_faces_with_rims_above_one_another_press_along_their_normal(dim):
+    """Shifted by less than a centroid's distance from the rim, too. By vertices it was 0.18 F dx / g across."""
+    x, elements, upper = stacked(dim, 0.9 * REACH)
+    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
+    for shift in (0.0, 1e-6, 1e-3, -0.02):
+        force = -pairs.gradient(x + upper[:, None] * np.eye(dim)[0] * shift)[upper].sum(axis=0)
+        assert abs(force[:-1]).max() < 1e-12 * force[-1]
 
 
 def test_edges_carry_more_when_pressed_below_half_of_the_distance():

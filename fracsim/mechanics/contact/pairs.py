@@ -3,14 +3,15 @@
     E(x) = k int b(d(x)) dA,   b(d) = -D (s - 1)^2 ln s where s = (d / D)^2 < 1, 0 elsewhere   (m)
 
 with d the distance from a point of the surface to the rest of it, D the distance at which the barrier begins and k the
-stiffness in Pa. The integral is the mean of both sides over their points, each with its share of the reference area
-(2D: of length, and all per m of thickness); the pressure between parallel faces is then k |b'(d)|: 4.3 k at D / 2.
-The "improved max" set of ipctk (Li et al. 2023, Convergent IPC) counts elements near the same point once, and keeps
-E continuously differentiable.
+stiffness in Pa. The integral is the mean of both sides, with one sample point an element: the centroid, weighted with
+the reference area (2D: length, and all per m of thickness). So the pressure between parallel faces is k |b'(d)|, and
+has no tangential part where rims lie above one another (sample_points). The "improved max" set of ipctk (Li et al.
+2023, Convergent IPC) counts elements near the same point once, and keeps E continuously differentiable.
 
-In 3D a barrier between edges, for which the points know nothing of each other, begins at EDGES D: as many edges cross
-each other between two flat faces as their meshes please, and from D on it would make the pressure depend on them (by
-a factor of 1.6 to 2.8). Elements that share a point do not touch each other.
+A vertex or an edge may come near with no centroid near. Each has a barrier of its own, which begins nearer: of vertices
+at VERTICES D, of edges against edges in 3D at EDGES D. As many edges cross each other between two flat faces as their
+meshes please; from D on, the pressure would depend on them (by a factor of 1.6 to 2.8). At D / 2 the pressure is 4.3 k
+by centroids, and 2.6 k more by vertices. Elements that share a point do not touch each other.
 
 The caller maps nodes to points of the surface and forces back: x = W u and W^T f; ipctk's displacement map is unused.
 
@@ -26,11 +27,13 @@ from scipy.sparse import csr_matrix
 
 from .crossings import NONE, crossings
 from .near import KEPT, Kind, Near, longest
+from .sample_points import Centroids, Vertices, measures
 from .slip import Friction, projection
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+VERTICES = 0.8  # of the distance of the barrier, as EDGES
 EDGES = 0.5  # of the distance of the barrier
 MARGIN = 0.5  # of the distance of the barrier: how far points may move before candidates are looked for again
 MOST, WIDE = 128, 3.0  # pieces of a step, and the measure of the boxes in one
@@ -55,10 +58,12 @@ class Pairs:
         faces = (corners,) if solid else ()
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest, ipctk.edges(corners) if solid else corners, *faces)
         # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
-        kinds = [(1.0 + solid, 1.0, "fv_candidates" if solid else "ev_candidates")]
-        kinds += [(1.0, EDGES, "ee_candidates")] if solid else []
-        self._times = [times for times, _, _ in kinds]
-        made = [Kind(share * distance, times * stiffness, name) for times, share, name in kinds]
+        vertices = Vertices(self._mesh)
+        kinds: list[tuple[float, float, str, Vertices | Centroids]] = [(1.0 + solid, 1.0, "", Centroids(self._mesh))]
+        kinds += [(1.0 + solid, VERTICES, "fv_candidates" if solid else "ev_candidates", vertices)]
+        kinds += [(1.0, EDGES, "ee_candidates", vertices)] if solid else []
+        self._times = [times for times, *_ in kinds]
+        made = [Kind(share * distance, times * stiffness, name, of) for times, share, name, of in kinds]
         self._near = Near(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
@@ -69,18 +74,18 @@ class Pairs:
     def energy(self, x: Values) -> float:
         """E(x), J."""
         on = self._mesh.vertices(x)
-        return float(sum(kind.barrier(pairs, self._mesh, on) for kind, pairs in self._near.touching(on)))
+        return sum(met.energy() for met in self._near.touching(on))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
         on = self._mesh.vertices(x)
-        found = sum(kind.barrier.gradient(pairs, self._mesh, on) for kind, pairs in self._near.touching(on))
+        found = sum(met.gradient() for met in self._near.touching(on))
         return np.asarray(self._mesh.to_full_dof(found)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, the share of each pair without its negative eigenvalues."""
         on, how = self._mesh.vertices(x), projection(exact=exact)
-        found = sum(kind.barrier.hessian(pairs, self._mesh, on, how) for kind, pairs in self._near.touching(on))
+        found = sum(met.hessian(how) for met in self._near.touching(on))
         return csr_matrix(self._mesh.to_full_dof(found))
 
     def stiffen(self, stiffness: float) -> None:
@@ -96,8 +101,7 @@ class Pairs:
         return self._gap_at(self._mesh.vertices(x))
 
     def _gap_at(self, on: Values) -> float:
-        squared = [pairs.compute_minimum_distance(self._mesh, on) for _, pairs in self._near.touching(on)]
-        return float(np.sqrt(min(squared)))
+        return float(np.sqrt(min(met.least_squared_distance() for met in self._near.touching(on))))
 
     def look_along(self, x: Values, to: Values) -> None:
         """Have candidates for all the way from x to `to` (n, d), m."""
@@ -112,10 +116,10 @@ class Pairs:
         """
         on = self._mesh.vertices(x)
         parts = []
-        for kind, pairs in self._near.touching(on):
+        for met in self._near.touching(on):
             part = ipctk.TangentialCollisions()
-            part.build(self._mesh, on, pairs, kind.barrier, self._friction)
-            parts.append(part)
+            part.build(met.kind.samples.mesh, met.positions, met.pairs, met.kind.barrier, self._friction)
+            parts.append((met.kind.samples, part))
         return Friction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
 
     # --- collisions ---
@@ -166,7 +170,5 @@ class Pairs:
 
 def areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
-    side, d = x[elements[:, 1:]] - x[elements[:, :1]], x.shape[1]
-    spanned = side[:, 0] if d == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
-    measure = np.linalg.norm(spanned, axis=1)
+    measure, d = measures(x, elements), x.shape[1]
     return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)

@@ -25,6 +25,7 @@ from .before import Before, Watched, before, nearest
 from .carried import SOME
 from .near import Kind, Near, centred
 from .pairs import Pairs
+from .sample_points import Vertices
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -68,7 +69,7 @@ class Pushing(Pairs):
         self.slip: Values = np.zeros_like(rest)
         self._rate, self.width, self._elements = rate, distance, elements
         self._used = np.unique(elements)  # ipctk's points
-        kind = Kind(distance, 1.0, "ee_candidates")
+        kind = Kind(distance, 1.0, "ee_candidates", Vertices(self._mesh))
         self._near = Near(self._mesh, [kind], FARTHEST * distance, MARGIN * distance)
         self._found: ipctk.Candidates | None = None  # all of which are watched, and some close where points were then
         self._watched: Watched

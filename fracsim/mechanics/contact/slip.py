@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from .sample_points import Centroids, Vertices
+
 Values = npt.NDArray[np.float64]
 
 
@@ -23,25 +25,29 @@ class Friction:
     """Friction of lagged pairs; x (n, d) as in Pairs."""
 
     mesh: ipctk.CollisionMesh
-    parts: list[ipctk.TangentialCollisions]
+    parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
     start: Values
     potential: ipctk.FrictionPotential
 
     def energy(self, x: Values) -> float:
         """E(x), J: not stored, but the work against friction where the sliding is longer than `slip`."""
         moved = self._moved(x)
-        return float(sum(self.potential(part, self.mesh, moved) for part in self.parts))
+        return float(sum(self.potential(part, of.mesh, of.positions(moved)) for of, part in self.parts))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
         moved = self._moved(x)
-        found = sum(self.potential.gradient(part, self.mesh, moved) for part in self.parts)
+        found = sum(
+            of.gradient(self.potential.gradient(part, of.mesh, of.positions(moved))) for of, part in self.parts
+        )  # fmt: skip
         return np.asarray(self.mesh.to_full_dof(found)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, the share of each pair without its negative eigenvalues."""
         moved, how = self._moved(x), projection(exact=exact)
-        found = sum(self.potential.hessian(part, self.mesh, moved, how) for part in self.parts)
+        found = sum(
+            of.hessian(self.potential.hessian(part, of.mesh, of.positions(moved), how)) for of, part in self.parts
+        )  # fmt: skip
         return csr_matrix(self.mesh.to_full_dof(found))
 
     def _moved(self, x: Values) -> Values:

@@ -1,0 +1,145 @@
+"""Points at which the barrier between the elements of a surface is integrated: vertices, or centroids of elements.
+
+With one point at the centroid of an element, weighted with the element's measure, the barrier between two parallel
+faces presses along their normal as long as no centroid overhangs. Points on the rim press outwards as soon as aligned
+rims are shifted by dx: their tangential force is F dx / g at a gap g. A stack of mass m without friction then slides
+apart, and the speed grows at a rate of sqrt(F / (m g)).
+
+Equations: docs/theory.md#barrier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import ipctk
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix, identity, kron, vstack
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """The vertices of a surface, weighted by ipctk with their shares of the elements around them."""
+
+    mesh: ipctk.CollisionMesh
+
+    def positions(self, x: Values) -> Values:
+        """(p, d) sample points with the vertices at x (n, d), m."""
+        return x
+
+    def gradient(self, at_samples: Values) -> Values:
+        """(n d,) derivatives by the vertices of derivatives (p d,) by the sample points."""
+        return at_samples
+
+    def hessian(self, at_samples: csr_matrix) -> csr_matrix:
+        """(n d, n d) second derivatives by the vertices of those (p d, p d) by the sample points."""
+        return at_samples
+
+    def weight(self, pairs: ipctk.NormalCollisions) -> None:
+        """Give pairs their weights, which ipctk has done."""
+
+
+class Centroids:
+    """The centroids of the elements of a surface, each weighted with the measure of its element.
+
+    The sample points are the n vertices, which the elements need, and after them the m centroids.
+    """
+
+    def __init__(self, surface: ipctk.CollisionMesh) -> None:
+        self._surface = surface
+        self.elements: Ints = np.asarray(surface.faces if surface.dim == 3 else surface.edges, np.int64)
+        self._count = surface.num_vertices
+
+    @cached_property
+    def _incidence(self) -> csr_matrix:
+        """(m, n) 1 for each vertex of an element."""
+        m, corners = self.elements.shape
+        return csr_matrix(
+            (np.ones(m * corners), self.elements.reshape(-1), np.arange(0, m * corners + 1, corners)),
+            shape=(m, self._count),
+        )  # fmt: skip
+
+    @cached_property
+    def _map(self) -> csr_matrix:
+        """(n + m, n) weights of the vertices in the sample points."""
+        return vstack([identity(self._count), self._incidence / self.elements.shape[1]], format="csr")
+
+    @cached_property
+    def _map_of_dofs(self) -> csr_matrix:
+        return kron(self._map, np.eye(self._surface.dim), format="csr")
+
+    @cached_property
+    def mesh(self) -> ipctk.CollisionMesh:
+        """The surface with the centroids as points of no element."""
+        rest = np.asfortranarray(self._map @ self._surface.rest_positions)
+        faces = (self._surface.faces,) if self._surface.dim == 3 else ()
+        return ipctk.CollisionMesh(rest, self._surface.edges, *faces)
+
+    @cached_property
+    def _weights(self) -> list[float]:
+        """Measures of the elements, m^2 (2D: m), behind a 0 for each vertex."""
+        return [0.0] * self._count + list(measures(self._surface.rest_positions, self.elements))
+
+    def positions(self, x: Values) -> Values:
+        """(n + m, d) sample points with the vertices at x (n, d), m."""
+        return np.asarray(self._map @ x)
+
+    def gradient(self, at_samples: Values) -> Values:
+        """(n d,) derivatives by the vertices of derivatives ((n + m) d,) by the sample points."""
+        return np.asarray(self._map_of_dofs.T @ at_samples)
+
+    def hessian(self, at_samples: csr_matrix) -> csr_matrix:
+        """(n d, n d) second derivatives by the vertices of those by the sample points."""
+        return (self._map_of_dofs.T @ at_samples @ self._map_of_dofs).tocsr()
+
+    def weight(self, pairs: ipctk.NormalCollisions) -> None:
+        """Give pairs the measures of elements as weights: ipctk gives points of no element the measure 1."""
+        measure = self._weights
+        for pair in (*pairs.fv_collisions, *pairs.ev_collisions):
+            pair.weight *= measure[pair.vertex_id]
+        for pair in pairs.vv_collisions:
+            pair.weight *= measure[max(pair.vertex0_id, pair.vertex1_id)]
+
+    def candidates(self, start: Values, end: Values, radius: float) -> ipctk.Candidates:
+        """Centroids and elements whose boxes, grown by `radius` (m), meet on the way from start to end (n, d).
+
+        Elements that share a vertex are left out.
+        """
+        tree, solid = ipctk.LBVH(), self._surface.dim == 3
+        tree.can_vertices_collide = self._surface.can_collide
+        none = np.empty((0, 3), np.int32)
+        tree.build(start, end, none[:, :2] if solid else self._surface.edges, self._surface.faces, radius)
+        if solid:
+            ids = [(pair.face0_id, pair.face1_id) for pair in tree.detect_face_face_candidates()]
+        else:
+            ids = [(pair.edge0_id, pair.edge1_id) for pair in tree.detect_edge_edge_candidates()]
+        pairs = np.array(ids, np.int64).reshape(-1, 2)
+        centre, element = np.concatenate([pairs, pairs[:, ::-1]]).T
+        meet = self._boxes_meet(centre, element, start, end, radius)
+        numbers = zip(element[meet].tolist(), (self._count + centre[meet]).tolist(), strict=True)
+        found = ipctk.Candidates()
+        if solid:
+            found.fv_candidates = [ipctk.FaceVertexCandidate(*pair) for pair in numbers]
+        else:
+            found.ev_candidates = [ipctk.EdgeVertexCandidate(*pair) for pair in numbers]
+        return found
+
+    def _boxes_meet(self, centre: Ints, element: Ints, start: Values, end: Values, radius: float) -> Flags:
+        """(k,) whether the box of the way of a centroid and that of an element meet, both grown by `radius`."""
+        corners = np.concatenate([start[self.elements], end[self.elements]], axis=1)
+        low, high = corners.min(axis=1)[element] - 2 * radius, corners.max(axis=1)[element] + 2 * radius
+        one, other = (x[self.elements].mean(axis=1)[centre] for x in (start, end))
+        return np.asarray(np.all((np.minimum(one, other) <= high) & (np.maximum(one, other) >= low), axis=1))
+
+
+def measures(x: Values, elements: Ints) -> Values:
+    """(m,) areas of triangles, m^2, or lengths of segments, m."""
+    side = x[elements[:, 1:]] - x[elements[:, :1]]
+    spanned = side[:, 0] if x.shape[1] == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
+    return np.asarray(np.linalg.norm(spanned, axis=1))
