@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
-# of what is few: dofs in one group of points that are coupled, and directions. More is dearer than the iterations that
-# it saves
-DOFS, DIRECTIONS = 450, 64
+# dofs in one group of points that are coupled, and stiff directions in all. More of them cost more than the iterations
+# that they save: with groups of 450 dofs four plates at rest on one another (688 nodes) took 43 s where this takes 9 s
+DOFS, DIRECTIONS = 240, 64
 
 
 @dataclass(frozen=True)
