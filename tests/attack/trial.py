@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,7 @@ from typing import Any
 PATIENCE = 90.0  # s, after which a command is taken to hang: a busy machine, and kernels to compile
 MEMORY = 8 << 30  # bytes of address space of a process of a trial
 AT_ONCE = 2
+TEMPORARY = "tmp"  # of a trial: a killed mpirun leaves its session there, on which one of the same process id fails
 
 
 class Wrong(Exception):
@@ -82,6 +84,7 @@ def run_trials(kind: str, trial: Trial, numbers: Sequence[int], seed: int, folde
                 continue
             del going[child]
             end, wrong = _verdict(place, status, late)
+            shutil.rmtree(place / TEMPORARY, ignore_errors=True)
             tally.note(number, end, wrong)
             if wrong is None:
                 shutil.rmtree(place, ignore_errors=True)
@@ -98,6 +101,8 @@ def _work(trial: Trial, number: int, chance: random.Random, place: Path) -> None
     code = 1
     try:
         os.setpgid(0, 0)
+        (place / TEMPORARY).mkdir()
+        os.environ["TMPDIR"], tempfile.tempdir = str(place / TEMPORARY), None
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         with (place / "said").open("w") as said:
             os.dup2(said.fileno(), 1)
