@@ -43,7 +43,7 @@ class SourceText:
         `needed`: what a line holds, for the message: "a node is `number x y z`".
         """
         text = self.text[begin:end]
-        values = _numbers(text)
+        values = numbers_in(text)
         starts = _token_starts(text)
         if values is None or len(values) != len(starts):
             self._refuse_row(begin, end, needed)
@@ -60,7 +60,7 @@ class SourceText:
             stop = self.text.find(b"\n", begin, end)
             stop = end if stop < 0 else stop
             line = self.text[begin:stop]
-            values = _numbers(line)
+            values = numbers_in(line)
             if values is None or len(values) != len(_token_starts(line)):
                 self.damaged(begin, f"`{shown(line)}` is not what stands here: {needed}.")
             begin = stop + 1
@@ -96,7 +96,7 @@ class Rows:
         return self.values[self.begins[rows][:, None] + np.arange(count)]
 
 
-def _numbers(text: bytes) -> npt.NDArray[np.float64] | None:
+def numbers_in(text: bytes) -> npt.NDArray[np.float64] | None:
     """All numbers of a text of blanks and numbers; None where something else stands there."""
     if not text.strip():
         return np.zeros(0)

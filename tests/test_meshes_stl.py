@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.meshes import MeshError
+from fracsim.meshes import MeshError, stl
 from fracsim.meshes.read import read_contents
 from fracsim.meshes.surfaces.closed import read_surface
 
@@ -75,3 +75,31 @@ def test_damaged_files_are_named(tmp_path: Path, data: bytes, message: str) -> N
     (tmp_path / "part.stl").write_bytes(data)
     with pytest.raises(MeshError, match=message):
         read_surface(tmp_path / "part.stl")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_text_as_most_write_it_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str) -> None:
+    """Without the reader of other texts, which is slow; of 300 facets in two solids, each number at its place."""
+    monkeypatch.setattr(stl, "PART", 1000)
+    monkeypatch.setattr(stl, "_of_text", None)
+    faces = np.random.default_rng(1).random((300, 3, 3)).round(6)
+    (tmp_path / "a.stl").write_text(text(faces[:170], end=end) + text(faces[170:], end=end), newline="")
+    np.testing.assert_allclose(read_contents(tmp_path / "a.stl").points.reshape(-1, 3, 3), faces, atol=1e-6)
+
+
+@pytest.mark.parametrize("place", range(0, 300, 23))
+def test_text_in_parts_loses_no_facet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+    """A facet with a vertex of four numbers, beside one of two, and one that is cut short, wherever they stand."""
+    monkeypatch.setattr(stl, "PART", 1000)
+    lines = text(np.random.default_rng(1).random((300, 3, 3))).split("\n")
+    first = 1 + 7 * place + 2
+    for instead in (
+        {first: lines[first] + " 5", first + 1: "vertex 1 2"},
+        {first + 2: ""},
+        {first + 3: "", first + 4: ""},
+        {first: lines[first].replace(".", ",")},
+    ):
+        damaged = [instead.get(i, line) for i, line in enumerate(lines)]
+        (tmp_path / "a.stl").write_text("\n".join(damaged))
+        with pytest.raises(MeshError, match="line"):
+            read_contents(tmp_path / "a.stl")
