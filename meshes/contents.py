@@ -142,6 +142,8 @@ class Contents:
 
     def _middle_nodes(self) -> Mask:
         """(n,) whether each node is in cells, but the corner of none."""
+        if all(block.kind == block.shape for block in self.blocks):
+            return np.zeros(len(self.points), bool)
         used = [block.nodes for block in self.blocks if block.shape in CORNERS]
         corners = [block.corners for block in self.blocks if block.shape in CORNERS]
         return self._nodes_of(used) & ~self._nodes_of(corners)

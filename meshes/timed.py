@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import pickle
 import resource
@@ -12,7 +13,7 @@ import sys
 from collections.abc import Callable
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from .data import MeshError
 
@@ -40,14 +41,16 @@ def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: i
     """
     command = [sys.executable, "-P", "-m", __name__]  # -P: not a folder of the same name that lies here
     task = pickle.dumps((max(1, ceil(seconds)), memory, os.getpid(), work, arguments))
-    done = subprocess.run(command, input=task, capture_output=True, check=False)
-    if done.returncode == -signal.SIGALRM:
-        raise TimeoutError
-    if done.returncode:
-        said = done.stderr.decode(errors="replace").strip()[-300:]
-        how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
-        raise Died(how, said)
-    result, failure = pickle.loads(done.stdout)
+    with open(os.memfd_create("answer"), "rb") as answer:
+        command.append(str(answer.fileno()))
+        done = subprocess.run(command, input=task, capture_output=True, check=False, pass_fds=[answer.fileno()])
+        if done.returncode == -signal.SIGALRM:
+            raise TimeoutError
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip()[-300:]
+            how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+            raise Died(how, said)
+        result, failure = _unpacked(answer)
     if failure is not None:
         raise failure
     return result
@@ -70,10 +73,35 @@ def read_within[T](
     raise MeshError(f"Mesh file '{path}' could not be read: {why}. {advice}")
 
 
+def _pack(answer: Any, file: BinaryIO) -> None:
+    """Write an object: its arrays, each from a whole page on, then its pickle, then where these begin."""
+    arrays: list[pickle.PickleBuffer] = []
+    stream = pickle.dumps(answer, protocol=5, buffer_callback=arrays.append)
+    places = []
+    for each in arrays:
+        file.seek(-file.tell() % mmap.PAGESIZE, os.SEEK_CUR)
+        places.append((file.tell(), file.write(each.raw())))
+    begin = file.tell()
+    file.write(stream)
+    pickle.dump((begin, places), file)
+    file.write((file.tell() - begin - len(stream)).to_bytes(8))
+
+
+def _unpacked(file: BinaryIO) -> tuple[Any, Any]:
+    """The object in a file; its arrays lie in the pages of the file, without a copy, and can be written to."""
+    pages = memoryview(mmap.mmap(file.fileno(), 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE))
+    end = len(pages) - 8
+    end -= int.from_bytes(pages[end:])
+    begin, places = pickle.loads(pages[end:])
+    answer: tuple[Any, Any] = pickle.loads(pages[begin:end], buffers=[pages[at : at + size] for at, size in places])
+    return answer
+
+
 def _serve() -> None:
-    """Do the task on standard input. The kernel's alarm ends this process, also in the middle of compiled code."""
-    answer = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever is printed meanwhile is no part of the answer
+    """Do the task on standard input; the answer goes into the open file of the number on the command line.
+
+    The kernel's alarm ends this process, also in the middle of compiled code.
+    """
     seconds, memory, parent, work, arguments = pickle.load(sys.stdin.buffer)
     signal.alarm(seconds)
     if memory is not None:
@@ -87,8 +115,8 @@ def _serve() -> None:
         result = work(*arguments)
     except Exception as error:
         failure = error
-    with answer:
-        pickle.dump((result, failure), answer)
+    with open(int(sys.argv[1]), "wb") as answer:
+        _pack((result, failure), answer)
 
 
 if __name__ == "__main__":

@@ -351,3 +351,19 @@ def test_volume_mesh_is_no_surface(tmp_path: Path) -> None:
     meshio.Mesh(mesh.points, [("tetra", mesh.cells)]).write(tmp_path / "solid.vtu")
     with pytest.raises(MeshError, match="holds no triangles in space"):
         fill_surface(tmp_path / "solid.vtu", 0.1)
+
+
+def test_arrays_of_another_process_are_not_copied() -> None:
+    """They can be written to, and Python allocates no memory of their size."""
+    import tracemalloc
+
+    tracemalloc.start()
+    try:
+        values, none = within(60, np.meshgrid, np.arange(2000.0), np.arange(0))
+        ones = within(60, np.ones, (1000, 2000))
+        assert tracemalloc.get_traced_memory()[1] < 0.3 * ones.nbytes
+    finally:
+        tracemalloc.stop()
+    assert values.shape == none.shape == (0, 2000) and ones.shape == (1000, 2000) and (ones == 1).all()
+    ones[500, 3] = 2
+    assert ones.sum() == 1 + ones.size
