@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import tempfile
 import time
 import tomllib
 from pathlib import Path
@@ -45,6 +46,36 @@ def test_trials_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for number, (_, said) in ENDS.items():
         assert (tmp_path / f"some-{number}").exists() == (said is not None) == (number in wrong)
         assert said is None or said in wrong[number]
+
+
+def leaves_a_file(number: int, chance: random.Random, place: Path) -> str:
+    """A trial that fails, as a run that is killed, with something left in the temporary folder."""
+    Path(tempfile.gettempdir(), "prterun.left").touch()
+    raise trial.Wrong(f"{tempfile.gettempdir()} {os.environ['TMPDIR']}")
+
+
+def test_a_trial_has_a_temporary_folder_of_its_own(tmp_path: Path) -> None:
+    """Which goes with it: what killed runs leave there is in the way of no later one."""
+    tally = trial.run_trials("some", leaves_a_file, [0, 1], 1, tmp_path)
+    for number, wrong in tally.failures:
+        own = tmp_path / f"some-{number}" / "tmp"
+        assert wrong.startswith(f"{own} {own}") and own.parent.exists() and not own.exists()
+    assert len(tally.failures) == 2
+
+
+def test_files_of_all_formats_are_changed(tmp_path: Path) -> None:
+    """Each file is read as it is, and has the cells that were written."""
+    meshes.prepare(tmp_path)
+    goods = {good.name: good for good in meshes._GOOD}
+    assert {Path(name).suffix for name in goods} >= {
+        *(".msh", ".vtk", ".vtu", ".vtp", ".pvtu", ".vtkhdf", ".exo", ".e", ".inp", ".unv", ".bdf", ".med", ".mesh"),
+        *(".obj", ".stl", ".ply", ".off"),
+    }
+    for name in ("ascii.vtu", "binary.vtu", "raw.vtu", "zlib.vtu", "lzma.vtu", "a.vtk", "b.vtk", "a.pvtu", "a.vtkhdf"):
+        assert goods[name].cells == 12, name
+    for name in ("g2a.msh", "g2b.msh", "g4a.msh", "g4b.msh", "g.unv", "g.bdf", "g.inp"):
+        assert goods[name].cells == goods["g4b.msh"].cells > 12, name
+    assert goods["e6_tet10.e"].cells == 760 and len(list(goods["a8_main.inp"].folder.iterdir())) == 2
 
 
 def test_changes_come_of_the_seed_alone(tmp_path: Path) -> None:
