@@ -283,7 +283,7 @@ def _needed(name: str) -> Any:
         return import_module(name)
     except ImportError:
         raise MeshError(
-            f"[mesh] repair = true needs {name}, which this environment lacks: pip install fracsim[files]"
+            f"[mesh] repair = true needs {name}, which this environment lacks: pip install fracsim[repair]"
         ) from None
 
 
