@@ -329,7 +329,7 @@ def test_without_the_wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for name in ("pymeshfix", "manifold3d"):
         monkeypatch.setitem(sys.modules, name, None)
     assert read_body(saved(tmp_path, sphere())).notes == ()
-    with pytest.raises(MeshError, match=r"needs pymeshfix, .*pip install fracsim\[files\]"):
+    with pytest.raises(MeshError, match=r"needs pymeshfix, .*pip install fracsim\[repair\]"):
         repaired(*without(sphere(), (0, 0, 1)), "S")
     with pytest.raises(MeshError, match="needs manifold3d"):
         repaired(*joined(box((2, 1, 1)), box((1, 1, 1), (1, 0.3, 0.2))), "S")
