@@ -42,7 +42,13 @@ def read_stl(path: Path) -> Contents:
     """
     data = path.read_bytes()
     declared = int.from_bytes(data[80:HEAD], "little")
-    if declared and len(data) >= HEAD + TRIANGLE.itemsize * declared:  # never of text, which gives a huge number there
+    beyond = len(data) - HEAD - TRIANGLE.itemsize * declared
+    if declared and beyond >= 0:  # never of text, which gives a huge number there
+        if beyond and beyond % TRIANGLE.itemsize == 0:
+            raise MeshError(
+                f"Mesh file '{path}' could not be read: it declares {declared} triangles, and holds "
+                f"{declared + beyond // TRIANGLE.itemsize}. It is damaged; export it again."
+            )
         corners = np.frombuffer(data, TRIANGLE, declared, HEAD)["corners"].astype(np.float64)
     elif data[:4096].lstrip()[:5].lower() == b"solid" and b"\0" not in data[HEAD:4096]:
         if b"\r" in data:

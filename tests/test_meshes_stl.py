@@ -103,3 +103,14 @@ def test_text_in_parts_loses_no_facet(tmp_path: Path, monkeypatch: pytest.Monkey
         (tmp_path / "a.stl").write_text("\n".join(damaged))
         with pytest.raises(MeshError, match="line"):
             read_contents(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("declared", [1, 2, 3, 5])
+def test_binary_of_another_number_is_refused(tmp_path: Path, declared: int) -> None:
+    """Four triangles, of which fewer or more are declared; a few bytes behind them are of no matter."""
+    data = binary()
+    (tmp_path / "a.stl").write_bytes(data[:80] + struct.pack("<I", declared) + data[84:])
+    with pytest.raises(MeshError, match=f"declares {declared} triangles, and h.* 4"):
+        read_contents(tmp_path / "a.stl")
+    (tmp_path / "a.stl").write_bytes(data + bytes(12))
+    assert len(read_contents(tmp_path / "a.stl").blocks[0].nodes) == 4
