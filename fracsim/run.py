@@ -17,7 +17,7 @@ from .errors import CannotWrite, NotConverged, Stopped, one_line
 from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
 from .output.breaks import Breaks
 from .output.checkpoint import read_checkpoint, write_checkpoint
-from .output.checkpoint_file import Notes, last_checkpoint, read_notes
+from .output.checkpoint_file import Notes, checkpoint_path, last_checkpoint, read_notes, refusal
 from .output.folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
@@ -32,7 +32,7 @@ from .stepping.stepper import Abandoned, StepReport
 from .study import Study
 from .study.conditions import cracks
 from .study.file import completed, study_text
-from .watched import Watched, wants_surface
+from .watched import WATCHED, Watched, wants_surface
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,6 +92,8 @@ class Run:
     def _resume(self) -> Notes:
         """Take up the state of the checkpoint, and what it says beside it."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
+        if missing := sorted(WATCHED - notes.monitors.keys()):
+            raise refusal(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.restored()
         self.state = scene.stepper.resume(state)

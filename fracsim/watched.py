@@ -38,6 +38,13 @@ class Monitor(Protocol):
         """Its part of summary.json (rank 0)."""
 
 
+# What every checkpoint of a deformable body says of the run so far.
+WATCHED = {
+    *("smallest_J", "inverted_cells", "inverted_since", "energy_rise", "energy_scale", "energy_least"),
+    *("peak_reactions", "trouble", "wall", "cpu", "memory", "seconds"),
+}
+
+
 class Watched:
     """What is watched.
 

@@ -268,8 +268,8 @@ def _is_of(name: str, names: set[str]) -> bool:
 
 def _of_clock(clock: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -> str:
     """What is wrong with the numbers beside the time; empty: nothing."""
-    if not clock["dt"] > 0:
-        return f"dt is {clock['dt']}, not above 0"
+    if not clock["dt"] > 0 or clock["dt"] ** 2 == 0:  # what a scheme divides by
+        return f"dt is {clock['dt']}, not above 0, or too small"
     if clock["easy"] < 0 or clock["easy"] != int(clock["easy"]):
         return f"easy is {clock['easy']}, no number of steps"
     if ("u_before" in arrays) != (clock["dt_before"] > 0):

@@ -32,6 +32,7 @@ MARK = b"\nfracsim checkpoint, SHA-256 "  # of the last line, before the digest
 DIGITS = 64
 SEAL = len(MARK) + DIGITS + 1  # bytes of that line
 LARGEST = 1e150  # a number whose square overflows is as good as infinite
+MOST_STEPS = 10**8  # of a run
 _NOTES = ("study", "monitors")
 _UNREADABLE = (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
 
@@ -156,6 +157,8 @@ def _notes(file: Any) -> Notes:
     """The notes, which are TOML and JSON."""
     study, monitors = (_text(file, f"notes/{name}") for name in _NOTES)
     notes = Notes(study, json.loads(monitors))
+    if not isinstance(notes.monitors, dict):
+        raise ValueError("notes/monitors is no table")
     notes.values()
     return notes
 
@@ -242,7 +245,9 @@ def _check_clock(clock: dict[str, Any]) -> None:
             raise ValueError(f"{name} is missing")
         if clock[name] < 0:
             raise ValueError(f"{name} is {clock[name]}, less than 0")
-    if clock["step"] != int(clock["step"]) or (clock["step"] > 0) != (clock["t"] > 0):
+    if not isinstance(clock["step"], int) or clock["step"] > MOST_STEPS:
+        raise ValueError(f"step is {clock['step']}, not a whole number up to {MOST_STEPS}")
+    if (clock["step"] > 0) != (clock["t"] > 0):
         raise ValueError(f"step is {clock['step']:g} at t = {clock['t']:g} s")
 
 

@@ -149,7 +149,9 @@ EDITS: dict[str, Edit] = {
     "another mesh": number("mesh", "0123456789abcdef"),
     "an array more": lambda file: file.__setitem__("more", [1.0]),
     "a number more": number("more", 1.0), "study no TOML": linked("notes/study", "title = ["),
-    "monitors no JSON": linked("notes/monitors", "{"),
+    "monitors no JSON": linked("notes/monitors", "{"), "monitors a list": linked("notes/monitors", "[1]"),
+    "monitors of another run": linked("notes/monitors", '{"wall": 1.0}'),
+    "step of 1e9": number("step", 1e9), "step of 2^40": number("step", 2**40), "dt of 1e-300": number("dt", 1e-300),
 }  # fmt: skip
 
 
