@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from petsc4py import PETSc
 
+from fracsim.stepping.factors import Factors
 from fracsim.studies.evidence import solvers
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene
@@ -89,3 +91,27 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
     least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
     assert (least > 0) == positive == solver.linear.factors.positive
     assert 1 < solver.linear.factors.worth < 100
+
+
+def test_factors_that_could_not_be_made_are_not_kept() -> None:
+    """A singular tangent, twice: before, PETSc took the failed factors for made, and MUMPS ended in a traceback."""
+    K = PETSc.Mat().createAIJ((2, 2), nnz=2, comm=PETSc.COMM_SELF)
+    for i in range(2):
+        K.setValues(i, [0, 1], [0.0, 0.0])
+    K.assemble()
+    ksp, (b, x) = PETSc.KSP().create(PETSc.COMM_SELF), K.createVecs()
+    b.set(1.0)
+    ksp.setType("cg")
+    factors = Factors(SimpleNamespace(pc=ksp.getPC(), due=None, keep=True), symmetric=True, dofs=2, dim=2)
+    for _ in range(2):
+        with factors.of(ksp):
+            ksp.setPC(factors._pc)
+            ksp.setOperators(K)
+            ksp.solve(b, x)
+            assert ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+    K.shift(2.0)
+    with factors.of(ksp):
+        ksp.setPC(factors._pc)
+        ksp.setOperators(K)
+        ksp.solve(b, x)
+    assert x.array == pytest.approx([0.5, 0.5])

@@ -60,6 +60,8 @@ class Factors:
             ksp.setType(kind)
             ksp.setPC(iterative)
             preconditioner.pc, preconditioner.due, preconditioner.keep = iterative, Due.REBUILD, True
+            if ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
+                self.forget()  # PETSc takes them for set up the next time, and MUMPS has nothing to solve with
 
     def forget(self) -> None:
         """Give their memory back (collective)."""
