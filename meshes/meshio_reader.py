@@ -11,11 +11,13 @@ import io
 import os
 import re
 import warnings
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
 from .contents import Block, Contents
 from .data import Indices, MeshError
@@ -42,7 +44,13 @@ ADVICE = (
 PLY_ADVICE = "Supported are points and faces; export the surface again, as PLY, STL or OBJ (Blender, MeshLab)."
 _PLY_HEAD = re.compile(rb"ply[ \t]*\r?\n(.*?)^[ \t]*end_header[ \t]*\r?\n", re.DOTALL | re.MULTILINE)
 _PLY_TYPES = {b"char": b"int8", b"uchar": b"uint8", b"ushort": b"uint16", b"uint": b"uint32"}
+_PLY_BYTES = {
+    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4,
+    "int32": 4, "uint32": 4, "float": 4, "float32": 4, "int64": 8, "uint64": 8, "double": 8, "float64": 8,
+}  # fmt: skip
+SU2_NODES = {3: 2, 5: 3, 9: 4, 10: 4, 12: 8, 13: 6, 14: 5}  # of each type of element: those of VTK
 MAX_PLY_HEAD = 65536  # bytes
+MAX_PLY_FILLING = 8  # bytes behind the last face, too few for a face
 MAX_LINE_SEARCH = 1 << 26  # bytes of a file in which the line of a fault is looked for
 MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
 
@@ -92,15 +100,21 @@ def _mesh(path: Path, position: list[int]) -> Any:
         _check(path, other)
         _check_begun(path)
         _check_begun(path.parent / other)
+        _check_tetgen(path)
+        _check_tetgen(path.parent / other)
     elif is_hdf5(path):
         _check_hdf5(path, path)
     elif ending == ".ply":
         data = path.read_bytes()
         _check_ply(SourceText(path, data))
         with _Ending(io.BytesIO(_with_known_head(data))) as file:  # type: ignore[arg-type]
-            return meshio.read(file, "ply")
+            mesh = meshio.read(file, "ply")
+        _check_binary_ply(path, _with_known_head(data), mesh)
+        return mesh
     elif FORMATS[ending][1]:
         _, name, text = FORMATS[ending]
+        if name == "su2":
+            _check_su2(path)
         with _Ending(path.open("rb", buffering=0)) as file:
             stream = _Lines(file) if text else file
             try:
@@ -161,14 +175,137 @@ def _check_ply(source: SourceText) -> None:
     head = _PLY_HEAD.match(text[: 2 * MAX_PLY_HEAD])
     if not head:
         source.refuse(0, f"`{shown(text[:80])}` does not begin the head of PLY: `ply`, ..., `end_header`. {PLY_ADVICE}")
+    elements = _ply_elements(head[1])
     if not re.search(rb"^format\s+ascii\b", head[1], re.MULTILINE):
+        for element in elements:
+            if len(element.properties) > 1 and any(words[0] == "list" for words in element.properties):
+                why = f"a {element.name} has {len(element.properties)} properties, and of binary PLY only the corners"
+                source.refuse(0, f"{why} are supported; save as text, or without colours of faces. {PLY_ADVICE}")
         return
-    declared = re.findall(rb"^element\s+(\w+)\s+(\d+)", head[1], re.MULTILINE)
     lines = source.rows(head.end(), len(text), "the numbers of a point or a face")
-    if len(lines) < sum(int(count) for _, count in declared):
-        known = ", ".join(f"{int(count)} {decoded(word)}" for word, count in declared)
+    known = ", ".join(f"{element.count} {element.name}" for element in elements)
+    declared = sum(element.count for element in elements)
+    if len(lines) < declared:
         why = f"the file ends after {len(lines)} lines of data, and declares {known}."
         source.refuse(len(text) - 1, f"{why} {PLY_ADVICE}")
+    first = 0
+    for element in elements:
+        rows = slice(first, first + element.count)
+        wrong = element.widths(lines.values, lines.begins[rows], lines.ends[rows]) != lines.counts[rows]
+        if wrong.any():
+            at = int(lines.offsets[rows][wrong.argmax()])
+            line = shown(text[at : at + 80])
+            why = f"`{line}` holds more or fewer numbers than a {element.name} has by the head and by its own counts."
+            source.refuse(at, f"{why} The file declares {known}. {PLY_ADVICE}")
+        first += element.count
+    if len(lines) > declared:
+        why = f"the file declares {known}, {declared} lines of data, and holds {len(lines)}."
+        source.refuse(int(lines.offsets[declared]), f"{why} {PLY_ADVICE}")
+
+
+@dataclass(frozen=True)
+class _PlyElement:
+    """An element of the head of a PLY file, such as `vertex`.
+
+    Attributes:
+        properties: the words behind `property`: ("float", "x") or ("list", "uchar", "int", "vertex_indices").
+    """
+
+    name: str
+    count: int
+    properties: list[list[str]]
+
+    def widths(self, values: npt.NDArray[np.float64], begins: Indices, ends: Indices) -> Indices:
+        """(n,) how many numbers each line of text has to hold: one a property; of a list, its count and as many."""
+        place = begins.copy()
+        for words in self.properties:
+            if words[0] == "list":
+                counts = np.where(place < ends, values[np.minimum(place, len(values) - 1)], 0)
+                place += np.clip(np.nan_to_num(counts), 0, len(values)).astype(np.int64)
+            place += 1
+        widths: Indices = place - begins
+        return widths
+
+
+def _ply_elements(head: bytes) -> list[_PlyElement]:
+    """The elements that the head of a PLY file declares."""
+    elements: list[_PlyElement] = []
+    for line in head.splitlines():
+        words = decoded(line).split()
+        if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            elements.append(_PlyElement(words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) > 2 and elements:
+            elements[-1].properties.append(words[1:])
+    return elements
+
+
+def _check_binary_ply(path: Path, data: bytes, mesh: Any) -> None:
+    """MeshError for binary PLY, of types that meshio knows, with data behind the last face that it declares."""
+    head = _PLY_HEAD.match(data[: 2 * MAX_PLY_HEAD])
+    if not head or re.search(rb"^format\s+ascii\b", head[1], re.MULTILINE):
+        return
+    elements = _ply_elements(head[1])
+    known = ", ".join(f"{element.count} {element.name}" for element in elements)
+    begin = f"Mesh file '{path}' could not be read: "
+    end = head.end()
+    for element in elements:
+        lists = [words for words in element.properties if words[0] == "list"]
+        if not lists:
+            end += element.count * sum(_PLY_BYTES[words[0]] for words in element.properties)
+        else:
+            count, corner = _PLY_BYTES[lists[0][1]], _PLY_BYTES[lists[0][2]]
+            end += sum(len(block.data) * (count + corner * block.data.shape[1]) for block in mesh.cells)
+    if data[end:].strip(b"\0\r\n\t \x1a") or len(data) - end > MAX_PLY_FILLING:
+        raise MeshError(f"{begin}it declares {known}, and {len(data) - end} bytes are left behind them. {PLY_ADVICE}")
+
+
+def _check_su2(path: Path) -> None:
+    """MeshError where a list of SU2 holds more or fewer lines than declared, or an element of an unknown type."""
+    source = SourceText(path, _without_comments(path, b"%"))
+    heads = list(re.finditer(rb"^[ \t]*(\w+)[ \t]*=[ \t]*(\d*)[^\n]*\n?", source.text, re.MULTILINE))
+    for head, after in zip(heads, [*heads[1:], None], strict=True):
+        if head[1] not in (b"NPOIN", b"NELEM", b"MARKER_ELEMS") or not head[2]:
+            continue
+        word = decoded(head[1])
+        end = after.start() if after else len(source.text)
+        rows = source.rows(head.end(), end, "the numbers of a point or an element")
+        if word != "NPOIN" and len(rows):
+            types = rows.columns(slice(None), 1)[:, 0]
+            nodes = np.array([SU2_NODES.get(type_, -9) for type_ in types])
+            wrong = (rows.counts != nodes + 1) & (rows.counts != nodes + 2)
+            if wrong.any():
+                place = int(wrong.argmax())
+                count = int(rows.counts[place]) - 1
+                supported = ", ".join(f"{type_} ({number} nodes)" for type_, number in SU2_NODES.items())
+                why = f"an element has the type {types[place]:g} and {count} numbers behind it"
+                source.refuse(int(rows.offsets[place]), f"{why}; supported are the types {supported}. {ADVICE}")
+        if len(rows) != int(head[2]):
+            source.damaged(head.start(1), f"{word}= {int(head[2])} is declared, and {len(rows)} lines stand there.")
+
+
+def _check_tetgen(path: Path) -> None:
+    """MeshError where a file of TetGen holds more or fewer lines than declared, or lines of another length."""
+    source = SourceText(path, _without_comments(path, b"#"))
+    rows = source.rows(0, len(source.text), "the numbers of a node or an element")
+    head = rows.columns([0], int(rows.counts[0]))[0].astype(np.int64) if len(rows) else []
+    if path.suffix.lower() == ".ele" and len(head) == 3:
+        width = 1 + int(head[1]) + int(head[2])
+    elif path.suffix.lower() == ".node" and len(head) == 4:
+        width = 1 + int(head[1]) + int(head[2]) + int(head[3])
+    else:
+        return  # refused by meshio
+    if len(rows) - 1 != head[0]:
+        source.damaged(int(rows.offsets[0]), f"{head[0]} lines are declared, and {len(rows) - 1} stand there.")
+    wrong = rows.counts[1:] != width
+    if wrong.any():
+        place = 1 + int(wrong.argmax())
+        source.damaged(int(rows.offsets[place]), f"{int(rows.counts[place])} numbers stand here instead of {width}.")
+
+
+def _without_comments(path: Path, mark: bytes) -> bytes:
+    """The text of a file, with blanks in the place of comments, so that offsets stay."""
+    text = path.read_bytes().replace(b"\r", b" ")
+    return re.sub(mark + rb"[^\n]*", lambda comment: b" " * len(comment[0]), text) if mark in text else text
 
 
 def _with_known_head(data: bytes) -> bytes:

@@ -147,7 +147,7 @@ class _Msh2:
         else:
             end = self._section_end(begin, "Nodes")
             lines = self.source.rows(begin, end, NODE)
-            if len(lines) and (short := lines.counts < 4).any():
+            if len(lines) and (short := (lines.counts < 4) | (lines.counts > 4) & (not parametric)).any():
                 at = int(lines.offsets[short.argmax()])
                 self.source.damaged(at, f"this node has {int(lines.counts[short.argmax()]) - 1} coordinates; {NODE}.")
             if len(lines) != count:

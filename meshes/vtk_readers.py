@@ -6,12 +6,13 @@ of memory. What VTK says of an error is the message. Each file is compared with 
 
 from __future__ import annotations
 
+import base64
 import mmap
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from .data import Indices, MeshError, Points
 from .netcdf_size import missing_bytes
 from .plain_files import HDF5_SIGNATURE, data_elsewhere, wrong_beside
 from .tags import tag_sets
+from .text_rows import decoded
 
 Array = npt.NDArray[Any]
 
@@ -162,6 +164,7 @@ def _vtk_grid(path: Path) -> _Grid:
                 reader.ReadFromInputStringOn()
         elif kind := re.search(rb"<VTKFile\b[^>]*\btype\s*=\s*[\"'](\w*)", data[:4096]):
             pieces, cells = _declared_xml(data)
+            _check_xml_sizes(path, data)
             from vtkmodules import vtkIOXML
 
             if kind[1] not in (b"UnstructuredGrid", b"PolyData"):
@@ -203,6 +206,70 @@ def _declared_xml(data: Any) -> tuple[list[int], int | None]:
         points.append(numbers.get(b"NumberOfPoints", 0))
         cells += sum(numbers.get(b"NumberOf" + key, 0) for key in (b"Cells", b"Verts", b"Lines", b"Strips", b"Polys"))
     return points, cells
+
+
+def _check_xml_sizes(path: Path, data: Any) -> None:
+    """Refuse an XML file with arrays of points or cells that are longer than declared: VTK reads their beginning."""
+    appended = re.search(rb"<AppendedData\b[^>]*>\s*_", data)
+    text = data[: appended.start() if appended else len(data)]
+    file = _xml_attributes(re.search(rb"<VTKFile\b[^>]*>", text))
+    if appended:
+        file["appended"] = _xml_attributes(appended).get("encoding", "base64")
+    for piece in re.finditer(rb"<Piece\b[^>]*>", text):
+        counts = _xml_attributes(piece)
+        stop = text.find(b"</Piece>", piece.end())
+        for section in re.finditer(_XML_SECTION, text[piece.end() : stop if stop > 0 else len(text)]):
+            word = decoded(section[1])
+            declared = int(counts.get(f"NumberOf{word}", "0").strip() or 0)
+            for tag in re.finditer(rb"<DataArray\b[^>]*?(/?)>", section[2]):
+                array = _xml_attributes(tag)
+                if word != "Points" and array.get("Name") not in ("offsets", "types"):
+                    continue
+                if array.get("format") == "appended" and appended:
+                    offset = array.get("offset", "")
+                    begin = appended.end() + int(offset) if offset.isdigit() else len(data)
+                    values = _xml_values(data[begin : begin + 64], array, file)
+                else:
+                    values = _xml_values(b"" if tag[1] else section[2][tag.end() :], array, file)
+                if values is not None and values > declared * (3 if word == "Points" else 1):
+                    name = array.get("Name", word)
+                    one = " (3 a point)" if word == "Points" else ""
+                    _refuse(path, f"it declares {declared} {word}, and its array '{name}' holds {values} numbers{one}")
+
+
+_XML_SECTION = re.compile(rb"<(Points|Cells|Verts|Lines|Strips|Polys)>(.*?)</\1>", re.DOTALL)
+
+
+def _xml_attributes(tag: re.Match[bytes] | None) -> dict[str, str]:
+    pairs = re.findall(rb"(\w+)\s*=\s*[\"']([^\"']*)[\"']", tag[0]) if tag else []
+    return {decoded(key): decoded(value) for key, value in pairs}
+
+
+def _xml_values(text: bytes, array: dict[str, str], file: dict[str, str]) -> int | None:
+    """How many numbers an array of an XML file holds, by its text or by the sizes before its data; None: unknown.
+
+    Sizes: the number of bytes; of compressed data the number of blocks, bytes of each and of a last, shorter one.
+    """
+    if array.get("format", "ascii") == "ascii":
+        end = text.find(b"<")
+        return len(text[: end if end >= 0 else len(text)].split())
+    width = 8 if file.get("header_type") == "UInt64" else 4
+    size = width * (3 if file.get("compressor") else 1)
+    text = text.lstrip() if array["format"] == "binary" else text
+    if array["format"] == "binary" or file.get("appended") == "base64":
+        try:
+            text = base64.b64decode(text[: -(-size // 3) * 4])
+        except ValueError:
+            return None  # refused by VTK
+    order: Literal["big", "little"] = "big" if file.get("byte_order") == "BigEndian" else "little"
+    sizes = [int.from_bytes(text[i : i + width], order) for i in range(0, size, width)]
+    if len(text) < width:
+        return None
+    if len(sizes) == 3:
+        blocks, block, last = sizes
+        sizes = [(blocks - 1) * block + (last or block) if blocks else 0]
+    bits = re.fullmatch(r"U?(?:Int|Float)(8|16|32|64)", array.get("type", ""))
+    return sizes[0] * 8 // int(bits[1]) if bits else None
 
 
 def _hdf_grid(path: Path) -> _Grid:

@@ -339,6 +339,8 @@ MSH2 = (FILES / "g22param.msh").read_text()
         ("\n1 0 0 0.02 0 1\n", "\n1 0 0 O.02 0 1\n", r"line 13: `1 0 0 O.02 0 1` is not what stands here: a node is"),
         ("\n1 0 0 0.02 0 1\n", "\n1 0 0\n", "line 13: this node has 2 coordinates"),
         ("\n2 0 0 0 0 2\n", "\n1 0 0 0 0 2\n", "node 1 is listed twice"),
+        ("$ParametricNodes\n280", "$ParametricNodes\n279", "line 12: 279 nodes are declared, and 280 are there"),
+        ("$Elements\n812", "$Elements\n811", r"line \d+: 811 elements are declared, and 812 are there"),
         ("$EndElements\n", "", r"line \d+: the file ends within the section .Elements: it was cut off"),
         ("$Elements\n812", "$Elements\n813", r"line \d+: 813 elements are declared, and 812 are there"),
         ("2.2 0 8", "2.2 0 4", "line 2: `2.2 0 4` is not version"),
@@ -349,6 +351,13 @@ def test_damaged_gmsh_of_version_2(tmp_path: Path, old: str, new: str, message: 
     assert old in MSH2
     (tmp_path / "part.msh").write_text(MSH2.replace(old, new, 1))
     with pytest.raises(MeshError, match=message):
+        read_mesh(tmp_path / "part.msh")
+
+
+def test_nodes_of_gmsh_with_more_than_coordinates(tmp_path: Path) -> None:
+    """Parameters stand in a section of their own."""
+    (tmp_path / "part.msh").write_text(MSH2.replace("ParametricNodes", "Nodes"))
+    with pytest.raises(MeshError, match="line 13: this node has 5 coordinates; a node is `number x y z`"):
         read_mesh(tmp_path / "part.msh")
 
 
@@ -811,7 +820,9 @@ PLY = (FILES / "p2_vertex_index.ply").read_text()
             "property floor y\n",
             "no file of the format PLY.* as PLY, STL or OBJ .Blender, MeshLab",
         ),
-        ("4 0 2 3 1", "4 0 2", "faces of kind quad with fewer than three corners, or with corners that do not exist"),
+        ("4 0 2 3 1", "4 0 2", "line 19: `4 0 2` holds more or fewer numbers than a face has"),
+        ("4 0 2 3 1", "3 0 2 3 1", r"line 19: `3 0 2 3 1` holds more .* declares 8 vertex, 6 face"),
+        ("element face 6", "element face 5", "line 24: the file declares 8 vertex, 5 face, 13 lines .* and holds 14"),
     ],
 )
 def test_damaged_ply(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -819,6 +830,41 @@ def test_damaged_ply(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "part.ply").write_text(PLY.replace(old, new, 1))
     with pytest.raises(MeshError, match=message):
         read_surface(tmp_path / "part.ply")
+
+
+@pytest.mark.parametrize("ending", ["ply", "su2", "ele", "node"])
+@pytest.mark.parametrize("less", [1, 2])
+def test_numbers_declared_too_small(tmp_path: Path, ending: str, less: int) -> None:
+    """Of cells or nodes, in files of formats that meshio reads."""
+    box = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
+    count = len(box.points) if ending == "node" else len(box.cells)
+    path = tmp_path / f"part.{ending}"
+    cells = [("triangle", box.cells[:, :3])] if ending == "ply" else [("tetra", box.cells)]
+    meshio.Mesh(box.points, cells).write(path)
+    data = path.read_bytes()
+    assert len(read_contents(path).blocks[0].nodes) == len(box.cells)
+    head = {"ply": b"element face ", "su2": b"NELEM= "}.get(ending, b"\n")
+    old, new = (
+        head + str(number).encode() + (b"\n" if ending in ("ply", "su2") else b" ") for number in (count, count - less)
+    )
+    assert data.count(old) == 1
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(MeshError, match=rf"part.{ending}'.*{count - less}.*(declared|left behind)"):
+        read_contents(path)
+
+
+def test_elements_of_su2_of_unknown_types(tmp_path: Path) -> None:
+    box = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
+    path = tmp_path / "part.su2"
+    meshio.Mesh(box.points, [("tetra", box.cells)]).write(path)
+    lines = path.read_text().split("\n")
+    at = next(i for i, line in enumerate(lines) if line.startswith("10 ")) + 2
+    for word in ("11", "14"):
+        path.write_text("\n".join([*lines[:at], word + lines[at][2:], *lines[at + 1 :]]))
+        with pytest.raises(
+            MeshError, match=rf"line {at + 1}: an element has the type {word} and 4 numbers behind it; supported"
+        ):
+            read_contents(path)
 
 
 # --- never slow -------------------------------------------------------------------------------------------------------

@@ -58,6 +58,10 @@ def test_binary_ply_of_other_writers(tmp_path: Path, kind: str, name: str, end: 
     body += b"".join(struct.pack(f"<{length}4I", 4, *quad) for quad in QUADS)
     (tmp_path / "part.ply").write_bytes((end.join(lines) + end).encode() + body)
     assert read_surface(tmp_path / "part.ply").volume == pytest.approx(1.0)
+    lines.insert(-1, "property uchar red")
+    (tmp_path / "part.ply").write_bytes((end.join(lines) + end).encode() + body)
+    with pytest.raises(MeshError, match="a face has 2 properties, and of binary PLY only the corners are supported"):
+        read_surface(tmp_path / "part.ply")
 
 
 @pytest.mark.parametrize("seed", range(6))

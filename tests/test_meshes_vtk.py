@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -383,3 +384,37 @@ def test_a_file_that_crashes_the_reader_is_a_message(tmp_path: Path) -> None:
     (tmp_path / "bad.exo").write_bytes(data)
     with pytest.raises(MeshError, match=r"bad.exo' could not be read: "):
         read_mesh(tmp_path / "bad.exo")
+
+
+@pytest.mark.parametrize("mode", ["ascii", "binary", "raw", "base64", "zlib", "lzma"])
+@pytest.mark.parametrize("ending", ["vtu", "vtp"])
+@pytest.mark.parametrize("wide", [False, True])
+def test_xml_that_declares_too_few(tmp_path: Path, mode: str, ending: str, wide: bool) -> None:
+    """Cells and points, in all encodings: VTK reads as many as declared, and says nothing of the others."""
+    from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
+    from vtkmodules.vtkIOLegacy import vtkUnstructuredGridReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
+
+    source = vtkUnstructuredGridReader()
+    source.SetFileName(str(HERE / "v1_legacy3.vtk"))
+    if ending == "vtp":
+        skin = vtkGeometryFilter()
+        skin.SetInputConnection(source.GetOutputPort())
+    writer = vtkXMLPolyDataWriter() if ending == "vtp" else vtkXMLUnstructuredGridWriter()
+    writer.SetInputConnection((skin if ending == "vtp" else source).GetOutputPort())
+    writer.SetDataMode({"ascii": 0, "binary": 1}.get(mode, 2))
+    writer.SetEncodeAppendedData(mode == "base64")
+    writer.SetCompressorType({"zlib": 2, "lzma": 3}.get(mode, 0))
+    writer.SetHeaderType(64 if wide else 32)
+    path = tmp_path / f"part.{ending}"
+    writer.SetFileName(str(path))
+    assert writer.Write()
+    data = path.read_bytes()
+    read_contents(path)
+    for word in ("Cells" if ending == "vtu" else "Polys", "Points"):
+        number = re.search(rf'NumberOf{word}="(\d+)"'.encode(), data)
+        assert number
+        count = int(number[1])
+        path.write_bytes(data.replace(number[0], f'NumberOf{word}="{count - 1}"'.encode()))
+        with pytest.raises(MeshError, match=rf"part.{ending}' could not be read: .*\b{count - 1} {word}.*holds \d+"):
+            read_contents(path)

@@ -316,7 +316,10 @@ def _changed(data: bytes, chance: random.Random) -> bytes:
     numbers = [each.span() for each in re.finditer(rb"[-+0-9.eE]+", data[:200_000])] if chance.random() < 0.5 else []
     if numbers:
         begin, end = chance.choice(numbers[: chance.choice((20, len(numbers)))])  # sizes stand at the head
-        return data[:begin] + chance.choice(NUMBERS) + data[end:]
+        number = chance.choice((*NUMBERS, None))
+        if number is None:  # a count that is too small by one
+            number = str(int(data[begin:end]) - 1).encode() if data[begin:end].isdigit() else b"7"
+        return data[:begin] + number + data[end:]
     lines = data.split(b"\n")
     match chance.randrange(8):
         case 0:
