@@ -102,6 +102,8 @@ def _mesh(path: Path, position: list[int]) -> Any:
         _check_begun(path.parent / other)
         _check_tetgen(path)
         _check_tetgen(path.parent / other)
+    elif ending == ".ugrid":
+        return _ugrid(path)
     elif is_hdf5(path):
         _check_hdf5(path, path)
     elif ending == ".ply":
@@ -281,6 +283,23 @@ def _check_su2(path: Path) -> None:
                 source.refuse(int(rows.offsets[place]), f"{why}; supported are the types {supported}. {ADVICE}")
         if len(rows) != int(head[2]):
             source.damaged(head.start(1), f"{word}= {int(head[2])} is declared, and {len(rows)} lines stand there.")
+
+
+def _ugrid(path: Path) -> Any:
+    """meshio's mesh of UGRID; MeshError where anything stands behind the last cell that the file declares."""
+    from meshio.ugrid._ugrid import determine_file_type, read_buffer
+
+    kind = determine_file_type(str(path))
+    with path.open("r" if kind["type"] == "ascii" else "rb") as file:
+        mesh = read_buffer(file, kind)
+        behind = len(file.read().strip())
+    if behind:
+        declared = ", ".join(f"{len(block.data)} {block.type}" for block in mesh.cells)
+        raise MeshError(
+            f"Mesh file '{path}' could not be read: it declares {len(mesh.points)} points and cells ({declared}), and "
+            f"{behind} bytes are left behind them. Lists of other data are not supported. {ADVICE}"
+        )
+    return mesh
 
 
 def _check_tetgen(path: Path) -> None:

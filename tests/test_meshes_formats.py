@@ -853,6 +853,27 @@ def test_numbers_declared_too_small(tmp_path: Path, ending: str, less: int) -> N
         read_contents(path)
 
 
+@pytest.mark.parametrize(
+    ("ending", "kind"), [("ugrid", ""), ("lb8.ugrid", "<i4"), ("b8l.ugrid", ">i8"), ("lr8.ugrid", "<i4")]
+)
+def test_ugrid_that_declares_too_few(tmp_path: Path, ending: str, kind: str) -> None:
+    box = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
+    path = tmp_path / f"part.{ending}"
+    meshio.Mesh(box.points, [("tetra", box.cells)]).write(path)
+    data = path.read_bytes()
+    assert len(read_contents(path).blocks[0].nodes) == len(box.cells)
+    heads = []
+    for count in (len(box.cells), len(box.cells) - 1):
+        head = [len(box.points), 0, 0, count, 0, 0, 0]
+        heads.append(np.array(head, kind).tobytes() if kind else " ".join(map(str, head)).encode())
+    assert data.count(heads[0]) == 1
+    path.write_bytes(data.replace(*heads))
+    with pytest.raises(
+        MeshError, match=r"ugrid'.*27 points and cells \(47 tetra\), and \d+ bytes are left behind them"
+    ):
+        read_contents(path)
+
+
 def test_elements_of_su2_of_unknown_types(tmp_path: Path) -> None:
     box = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
     path = tmp_path / "part.su2"
