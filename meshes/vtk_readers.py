@@ -218,10 +218,11 @@ def _check_xml_sizes(path: Path, data: Any) -> None:
     for piece in re.finditer(rb"<Piece\b[^>]*>", text):
         counts = _xml_attributes(piece)
         stop = text.find(b"</Piece>", piece.end())
-        for section in re.finditer(_XML_SECTION, text[piece.end() : stop if stop > 0 else len(text)]):
+        for section in _XML_SECTION.finditer(text, piece.end(), stop if stop > 0 else len(text)):
             word = decoded(section[1])
             declared = int(counts.get(f"NumberOf{word}", "0").strip() or 0)
-            for tag in re.finditer(rb"<DataArray\b[^>]*?(/?)>", section[2]):
+            end = text.find(b"</" + section[1], section.end())
+            for tag in _XML_ARRAY.finditer(text, section.end(), end if end > 0 else len(text)):
                 array = _xml_attributes(tag)
                 if word != "Points" and array.get("Name") not in ("offsets", "types"):
                     continue
@@ -230,14 +231,16 @@ def _check_xml_sizes(path: Path, data: Any) -> None:
                     begin = appended.end() + int(offset) if offset.isdigit() else len(data)
                     values = _xml_values(data[begin : begin + 64], array, file)
                 else:
-                    values = _xml_values(b"" if tag[1] else section[2][tag.end() :], array, file)
+                    end_tag = tag.end() if tag[1] else text.find(b"<", tag.end())
+                    values = _xml_values(text[tag.end() : end_tag], array, file)
                 if values is not None and values > declared * (3 if word == "Points" else 1):
                     name = array.get("Name", word)
                     one = " (3 a point)" if word == "Points" else ""
                     _refuse(path, f"it declares {declared} {word}, and its array '{name}' holds {values} numbers{one}")
 
 
-_XML_SECTION = re.compile(rb"<(Points|Cells|Verts|Lines|Strips|Polys)>(.*?)</\1>", re.DOTALL)
+_XML_SECTION = re.compile(rb"<(Points|Cells|Verts|Lines|Strips|Polys)>")
+_XML_ARRAY = re.compile(rb"<DataArray\b[^>]*?(/?)>")
 
 
 def _xml_attributes(tag: re.Match[bytes] | None) -> dict[str, str]:
