@@ -14,6 +14,7 @@ from fracsim.errors import InputError
 from fracsim.meshes import MeshError
 from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.surfaces import repair as repairing
+from fracsim.meshes.surfaces import self_intersection
 from fracsim.meshes.surfaces.closed import ClosedSurface, Repairable
 from fracsim.meshes.surfaces.fill import fill_surface
 from fracsim.meshes.surfaces.repair import read_body, repaired
@@ -371,3 +372,12 @@ def test_crossings_against_ipctk(seed: int) -> None:
 def test_neighbours_and_parts_that_touch_do_not_cross() -> None:
     for surface in (sphere(4), box((1, 1, 1)), joined(box((1, 1, 1)), box((1, 1, 1), (1, 0.3, 0.2)))):
         assert len(crossing_triangles(*surface)) == 0
+
+
+def test_a_search_that_is_not_ended_is_no_sound_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, what had been found by then was taken for all of it."""
+    points = np.random.default_rng(0).random((600, 3))
+    monkeypatch.setattr(self_intersection, "MAX_PAIRS", 1000)
+    monkeypatch.setattr(self_intersection, "MAX_PAIRS_EACH", 1)
+    with pytest.raises(MeshError, match="200 triangles was not searched to the end"):
+        crossing_triangles(points, np.arange(600).reshape(-1, 3))

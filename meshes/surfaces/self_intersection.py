@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..data import Indices, Points
+from ..data import Indices, MeshError, Points
 from ..topology import Floats, Mask
 
 TOUCHING = 1e-6  # share of the surface's size; an edge that reaches less far beyond a triangle touches it only
 MARGIN = 1e-9  # of the coordinates within a triangle: what passes nearer to its boundary
 AT_ONCE = 500_000  # pairs of boxes or triangles
-MAX_PAIRS = 100_000_000  # of boxes and triangles that are compared; then the search ends
+# pairs of boxes and triangles that are compared, at least and for each triangle: a sphere of 1.3 million takes 35 each
+MAX_PAIRS, MAX_PAIRS_EACH = 100_000_000, 1000
 BITS = 20  # of a coordinate in the order of triangles along a curve
 
 
@@ -18,6 +19,9 @@ def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = Fal
     """Pairs of triangles, the lower number first, of which an edge of one passes through the other: (k, 2).
 
     An edge through the boundary of a triangle counts where `closed`. Triangles in one plane are not found.
+
+    Raises:
+        MeshError: so many triangles are near one another that the search would take too long.
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), np.int64)
@@ -25,7 +29,13 @@ def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = Fal
     tolerance = TOUCHING * float(np.ptp(points[np.unique(triangles)], axis=0).max())
     found, compared = [np.zeros((0, 2), np.int64)], 0
     stack: list[tuple[int, Indices]] = [(0, np.zeros((1, 2), np.int64))]
-    while stack and compared < MAX_PAIRS:
+    while stack:
+        if compared >= max(MAX_PAIRS, MAX_PAIRS_EACH * len(triangles)):
+            raise MeshError(
+                f"The surface of {len(triangles)} triangles was not searched to the end for triangles that pass "
+                "through one another: too many are near each other. Remove doubled parts, or make the surface coarser, for "
+                "example in MeshLab: Filters > Remeshing > Quadric Edge Collapse Decimation."
+            )
         level, pairs = stack.pop()
         if len(pairs) > AT_ONCE:
             stack += [(level, half) for half in np.array_split(pairs, 2)]
