@@ -33,8 +33,8 @@ def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = Fal
         if compared >= max(MAX_PAIRS, MAX_PAIRS_EACH * len(triangles)):
             raise MeshError(
                 f"The surface of {len(triangles)} triangles was not searched to the end for triangles that pass "
-                "through one another: too many are near each other. Remove doubled parts, or make the surface coarser, for "
-                "example in MeshLab: Filters > Remeshing > Quadric Edge Collapse Decimation."
+                "through one another: too many are near each other. Remove doubled parts, or make the surface "
+                "coarser, for example in MeshLab: Filters > Remeshing > Quadric Edge Collapse Decimation."
             )
         level, pairs = stack.pop()
         if len(pairs) > AT_ONCE:
