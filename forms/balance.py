@@ -3,7 +3,7 @@
 Quadrature is chosen here and nowhere else: with P1 displacement F is constant in a cell, so one point integrates every
 energy exactly. With P2 F is linear, and the rule of degree 2 (three points in a triangle, four in a tetrahedron) is
 exact for linear energies, leaves no mode of a cell without stiffness, and costs no order for any energy. Inertia is not
-here: with a lumped or constant mass matrix it is linear algebra (stepping.newton).
+here: with a lumped or constant mass matrix it is linear algebra (solvers.newton).
 
 Equations: docs/theory.md#elastic-energies.
 """

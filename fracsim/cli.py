@@ -63,7 +63,7 @@ def run(
     import_outside("mpi4py.MPI")
     from mpi4py import MPI
 
-    from .study.file import find_study
+    from .study.reader import find_study
 
     comm = MPI.COMM_WORLD
     path = find_study(study)
@@ -97,7 +97,7 @@ def check(study: StudyPath, set_: Set = _NONE) -> None:
     if not is_first_rank():
         return
     from .study.check import check_study
-    from .study.file import load_study
+    from .study.reader import load_study
 
     loaded = load_study(study, set_)
     print(one_line(loaded.title))
@@ -116,8 +116,8 @@ def mesh(
         return
     from .meshes.directions import preferred
     from .meshes.quality import mesh_quality
-    from .study.file import load_study
     from .study.mesh_source import build_mesh, save_mesh
+    from .study.reader import load_study
 
     data = build_mesh(load_study(study, set_).mesh)
     for note in data.notes:
@@ -160,8 +160,8 @@ def render(
     if not is_first_rank():
         return
     import_outside("pyvista")
-    from .report.pictures.look import Look, limits_of, size_of
     from .report.pictures.picture import render
+    from .report.pictures.picture_options import Look, limits_of, size_of
 
     begin_work()
     _tell_of_runs(outs)
@@ -206,7 +206,7 @@ def report(
     if not is_first_rank():
         return
     import_outside("matplotlib")
-    from .report.make import make_report
+    from .report.html_report import make_report
 
     begin_work()
     _tell_of_runs(outs)
@@ -228,7 +228,7 @@ def sweep(
     if list_ and not is_first_rank():
         return
     from .report.sweep import run_sweep
-    from .study.file import find_study
+    from .study.reader import find_study
 
     begin_work()
     path = find_study(study)
@@ -270,9 +270,9 @@ def _tell_of_runs(folders: list[Path]) -> None:
 
 def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Study:
     """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
-    from .mesh.ranks import from_root
+    from .mesh.parallel import from_root
     from .study import Study
-    from .study.file import load_study
+    from .study.reader import load_study
 
     def work() -> object:
         loaded = load_study(path, overrides)
@@ -375,7 +375,7 @@ def _end_others(message: str, code: int, *, late: bool) -> None:
     from mpi4py import MPI
 
     if MPI.COMM_WORLD.size > 1:
-        from .mesh.ranks import end_unless_all_failed
+        from .mesh.parallel import end_unless_all_failed
 
         end_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
 

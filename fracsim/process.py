@@ -172,7 +172,7 @@ def begin_run() -> None:
         signal.signal(number, signal.SIG_DFL)  # Open MPI's own handler waits for ever where the heap is damaged
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
     faulthandler.enable()
-    from .mesh.ranks import launcher
+    from .mesh.parallel import launcher
     from .output.interrupt import end_with
 
     if _is_rank() and (process := launcher(_PARENT)) is not None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped
+from .output.atomic_write import written
 from .output.checkpoint_file import (
     LARGEST,
     Notes,
@@ -24,21 +25,20 @@ from .output.checkpoint_file import (
     require,
     write_arrays,
 )
-from .output.folder import OutputClock, check_text, make_folder, missing_frames, versions
 from .output.history import History, history_columns, read_earlier
 from .output.interrupt import Interrupt
 from .output.progress import Done, Progress
 from .output.rigid_frames import RigidFrames
+from .output.run_folder import OutputClock, check_text, make_folder, missing_frames, versions
 from .output.summary import say, write_summary
-from .output.writing import written
-from .rigid.stepper import RigidReport
-from .scene.rigid import RigidScene
-from .stepping.stepper import Abandoned
+from .rigid.rigid_stepper import RigidReport
+from .scene.rigid_scene import RigidScene
+from .timestepping.stepper import Abandoned
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .rigid.copies import Copies
+    from .rigid.instances import Copies
 
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")

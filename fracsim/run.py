@@ -14,30 +14,30 @@ import numpy as np
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped, one_line
-from .mesh.ranks import end_unless_all_failed, from_root, on_root, total
-from .output.breaks import Breaks
+from .mesh.parallel import end_unless_all_failed, from_root, on_root, total
+from .monitors import WATCHED, Watched, wants_surface
+from .output.atomic_write import written
 from .output.checkpoint import read_checkpoint, write_checkpoint
 from .output.checkpoint_file import Notes, checkpoint_path, last_checkpoint, read_notes, refusal
-from .output.folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
+from .output.fracture_log import Breaks
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
 from .output.interrupt import Interrupt
 from .output.lock import FolderLock, claim
 from .output.progress import Done, Progress
+from .output.run_folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
 from .output.summary import Meter, say, write_summary
-from .output.writing import written
 from .process import import_outside
 from .scene import Scene, build_scene
-from .stepping.stepper import Abandoned, StepReport
 from .study import Study
 from .study.conditions import cracks
-from .study.file import completed, study_text
-from .watched import WATCHED, Watched, wants_surface
+from .study.reader import completed, study_text
+from .timestepping.stepper import Abandoned, StepReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .output.crack_front import CrackFront
+    from .output.crack_length import CrackFront
 
 
 class Run:
@@ -140,7 +140,7 @@ class Run:
         study = self.scene.study
         if study.fracture is None or not (study.crack or study.fracture.energy):
             return None
-        from .output.crack_front import CrackFront
+        from .output.crack_length import CrackFront
 
         assert self.breaks.record is not None
         return CrackFront(self.breaks.record, cracks(study, self.scene.domain.dim))
@@ -374,8 +374,8 @@ def _run_rigid(
     source: Path | None,
 ) -> dict[str, Any]:
     """Rigid bodies move on rank 0, and are the same on any number of ranks, which analyse them (collective)."""
-    from .rigid.waiting import tell
-    from .scene.rigid import build_rigid_scene, help_rigid
+    from .rigid.worker_ranks import tell
+    from .scene.rigid_scene import build_rigid_scene, help_rigid
 
     def work() -> dict[str, Any]:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)

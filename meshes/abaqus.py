@@ -20,8 +20,8 @@ from .abaqus_deck import KeywordBlock, number
 from .abaqus_elements import facet_columns, shape_of
 from .abaqus_model import NO_INDICES, Component, Deck, NamedSet, SetEntry, label_key, some_of
 from .abaqus_part import LocalMesh, moved, place_in
-from .contents import DIMENSIONS, Block, Contents
 from .data import Indices, Points
+from .mesh_conversion import DIMENSIONS, Block, Contents
 from .topology import Mask, distinct_rows
 
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from .data import Indices, MeshError, Points
+from .text import middle_of
 from .topology import Floats, signed_measures
-from .words import middle_of
 
 # shape -> its faces by the places of their corners, normals outwards; the corners are in the order of VTK and Gmsh
 FACES: dict[str, tuple[tuple[int, ...], ...]] = {

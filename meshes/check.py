@@ -11,8 +11,8 @@ from .components import components
 from .data import Indices, MeshData, MeshError, Points
 from .joining import bodies_of, coincident_nodes, joined_bodies
 from .parameters import LONGEST, SHORTEST
+from .text import format_point, middle_of
 from .topology import Floats, Mask, distinct_rows, facets_of, oriented, signed_measures
-from .words import format_point, middle_of
 
 SHOWN = 5  # examples in a message
 

@@ -12,9 +12,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError
 from .gmsh_session import session
+from .mesh_conversion import Block, Contents
 from .text_rows import EXPORT_AGAIN
 
 SHAPES = {"Point": "vertex", "Line": "line", "Triangle": "triangle", "Tetrahedron": "tetra"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from .data import Indices, MeshError, Points
 from .quality import POOR, radius_ratios
-from .scattered.faces import scatter_faces, scatter_plane
+from .random_points.faces import scatter_faces, scatter_plane
 from .sizing import INNER, Sizing
 from .topology import oriented
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from .components import components
 from .data import Indices, MeshData, MeshError
+from .text import format_point
 from .topology import edges_of
-from .words import format_point
 
 SAME_PLACE = 1e-6  # nodes nearer than this share of the mesh's size coincide
 

@@ -16,8 +16,8 @@ from typing import Any, NoReturn
 import h5py
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .mesh_conversion import Block, Contents
 from .plain_files import HDF5_SIGNATURE, data_elsewhere
 from .tags import members_by_tag
 from .text_rows import decoded, shown

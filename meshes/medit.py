@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .mesh_conversion import Block, Contents
 from .tags import sets_by_tag
 from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
 

@@ -19,8 +19,8 @@ from typing import Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from .contents import Block, Contents
 from .data import Indices, MeshError
+from .mesh_conversion import Block, Contents
 from .plain_files import data_elsewhere, is_hdf5, wrong_beside
 from .tags import tag_sets
 from .text_rows import SourceText, decoded, shown

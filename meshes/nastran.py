@@ -17,8 +17,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError
+from .mesh_conversion import Block, Contents
 from .tags import sets_by_tag
 from .text_rows import EXPORT_AGAIN, SourceText, decoded, numbered, shown
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError
+from .mesh_conversion import Block, Contents
 from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
 
 KINDS = {3: "triangle", 4: "quad"}

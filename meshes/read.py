@@ -7,16 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .abaqus import read_abaqus
-from .contents import Contents
 from .data import MeshData, MeshError
 from .medit import read_medit
+from .mesh_conversion import Contents
 from .meshio_reader import FORMATS, read_with_meshio
 from .msh2 import SAVE, read_msh2
 from .nastran import read_nastran
 from .obj import read_obj, read_off
 from .plain_files import wrong_with
 from .stl import read_stl
-from .timed import read_within
+from .time_limit import read_within
 from .unv import read_unv
 from .vtk_readers import ENDINGS as VTK_ENDINGS
 from .vtk_readers import read_with_vtk

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, Shell
+from .text import middle_of
 from .topology import Floats, boundary_facets, signed_measures
-from .words import middle_of
 
 LONGEST = 2.0  # times the thickness that a normal at a fold may be long
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from .contents import Block, Contents
 from .data import MeshError
+from .mesh_conversion import Block, Contents
 from .text_rows import numbers_in
 
 HEAD = 84  # bytes of a binary file before its triangles: 80 of text, 4 of their number

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .contents import Block
 from .data import Indices
+from .mesh_conversion import Block
 
 Array = npt.NDArray[Any]
 

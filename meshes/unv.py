@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .mesh_conversion import Block, Contents
 from .text_rows import Rows, SourceText, decoded, not_whole, numbered, shown
 
 OLD_NODES, NODES = (15,), (781, 2411)

@@ -17,8 +17,8 @@ from typing import Any, Literal, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from .contents import Block, Contents
 from .data import Indices, MeshError, Points
+from .mesh_conversion import Block, Contents
 from .netcdf_size import missing_bytes
 from .plain_files import HDF5_SIGNATURE, data_elsewhere, wrong_beside
 from .tags import tag_sets
@@ -57,7 +57,7 @@ def read_with_vtk(path: Path) -> Contents:
     Raises:
         MeshError: the file is damaged, of another kind, or names a file that may not be read.
     """
-    from .timed import read_within
+    from .time_limit import read_within
 
     seconds = SECONDS + SECONDS_PER_MB * path.stat().st_size / 1e6
     return read_within(path, _read, "VTK's reader", seconds, _supported(path))

@@ -56,7 +56,7 @@ def case(n: int, bare: bool) -> dict[str, Any]:
 
     from ..run import Run
     from ..scene import build_scene
-    from ..study.file import validate
+    from ..study.reader import validate
 
     PETSc.Log.begin()
     comm = MPI.COMM_WORLD
@@ -133,7 +133,7 @@ class Bare:
 
     def __init__(self, n: int, domain: Any, *, records: bool = False, in_lanes: bool = False) -> None:
         """`records`: evaluate the elastic energy of each step, too, as every run does for history.csv; `in_lanes`:
-        assemble the tangent as fracsim does (mechanics.tangent), by single entries."""
+        assemble the tangent as fracsim does (mechanics.matrix_assembly), by single entries."""
         import numpy as np
         import ufl
         from dolfinx import fem
@@ -142,10 +142,10 @@ class Bare:
 
         from ..forms.balance import elastic_energy, internal_work
         from ..forms.energies import NeoHookean, lame
-        from ..mechanics.kernels import jit_options
-        from ..mechanics.tangent import Assembly
-        from ..stepping.linear import rigid_body_modes
-        from ..stepping.preconditioner import MULTIGRID
+        from ..mechanics.jit import jit_options
+        from ..mechanics.matrix_assembly import Assembly
+        from ..solvers.linear_solver import rigid_body_modes
+        from ..solvers.preconditioner import MULTIGRID
 
         scene = study(n)
         V, mesh = domain.space, domain.mesh

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fracture.brittle.principal import tensors
-from ..rigid.breakable import Breakable
-from ..rigid.pinned import pinned
-from ..scene.rigid import build_rigid_scene
+from ..fracture.brittle.principal_stress import tensors
+from ..rigid.breakage import Breakable
+from ..rigid.pinned_analysis import pinned
+from ..scene.rigid_scene import build_rigid_scene
 from ..study import Study
 
 Values = npt.NDArray[np.float64]

@@ -16,7 +16,7 @@ import pytest
 
 from fracsim import cli
 from fracsim.study import Study
-from fracsim.study.file import study_text, validate
+from fracsim.study.reader import study_text, validate
 
 BAR = tomllib.loads("""
 title = "bar"

@@ -103,4 +103,4 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few contacts of rigid bodies, and as many as if they were a crowd."""
     if request.param == "projections":
-        monkeypatch.setattr("fracsim.rigid.pushing.CROWD", 0)
+        monkeypatch.setattr("fracsim.rigid.contact_solver.CROWD", 0)

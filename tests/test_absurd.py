@@ -19,7 +19,7 @@ from fracsim.errors import FracsimError, InputError
 from fracsim.run import run_study
 from fracsim.study import Study, TimeTable
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 from support.absurd import BASES, Data, absurd, from_files, leaves, mutated, of_builders
 from test_readme import keys_of, models_in
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.mechanics.contact.itself import SelfContact
-from fracsim.mechanics.contact.obstacles import Obstacles
+from fracsim.contact.obstacle_term import Obstacles
+from fracsim.contact.self_contact import SelfContact
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study

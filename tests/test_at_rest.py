@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.cell_energy import CellEnergy
-from fracsim.mechanics.stiffness import Stiffness
-from fracsim.stepping import patches, solver
+from fracsim.mechanics.tangent import Stiffness
+from fracsim.solvers import nonlinear_elimination, nonlinear_solver
 from support.ranks import OnRanks, Results, starting
 from support.reference import dense_tangent
 from support.scenes import make_scene, positions
@@ -44,12 +44,12 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     made: list[int] = []
     assemble = Stiffness._assemble_body
     monkeypatch.setattr(Stiffness, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
-    monkeypatch.setattr(patches, "FEW", 0.2)
+    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)
     assert scene.solver is not None and scene.solver._newton._patches is not None
     made.clear()
-    monkeypatch.setattr(solver.Solver, "damage_changed", lambda *_: None)
+    monkeypatch.setattr(nonlinear_solver.Solver, "damage_changed", lambda *_: None)
     scene, state = thrown()
     assert scene.solver is not None and scene.solver._newton._patches is None
     np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
@@ -59,7 +59,7 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
 def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """A corner that is pushed through its cell: it and its neighbours lower the potential, their forces are next to
     nothing, nothing else moves, and there K is positive."""
-    monkeypatch.setattr(patches, "FEW", 0.2)
+    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
     scene, _ = thrown(steps=0)
     balance = scene.balance
     balance.begin(0.01, 0.01, *(np.zeros(balance.owned) for _ in range(3)))
@@ -68,13 +68,13 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
     u[corner] = -0.3
     balance.displace(u.reshape(-1))
     before, high = balance.forces().copy().reshape(-1, 3), balance.potential()[0]
-    few = patches.patches_of(balance)
+    few = nonlinear_elimination.patches_of(balance)
     assert few is not None and few.rest(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, 3) - u).max(axis=1))
     touched = np.unique(scene.domain.cell_nodes[(scene.domain.cell_nodes == corner).any(axis=1)])
     assert set(touched) <= set(moved) and len(moved) < 0.7 * len(u)
     after = balance.forces().reshape(-1, 3)
-    assert np.linalg.norm(after[moved]) < patches.ENOUGH * np.linalg.norm(before)
+    assert np.linalg.norm(after[moved]) < nonlinear_elimination.ENOUGH * np.linalg.norm(before)
     assert balance.potential()[0] < high
     dofs = (3 * moved[:, None] + np.arange(3)).reshape(-1)
     K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
@@ -85,7 +85,7 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatch, dim: int) -> None:
     """A node without cells that is pulled away from where it is tied goes back: the potential, with what ties store, is
     lower, and the forces of all nodes that moved, which ties are part of, are next to nothing."""
-    monkeypatch.setattr(patches, "FEW", 0.5)
+    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.5)
     scene, state, tethers = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0})
     balance = scene.balance
     balance.begin(10.0, 10.0, state.u, np.zeros(balance.owned), np.zeros(balance.owned))
@@ -94,11 +94,13 @@ def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatc
     u[node] += 2.0
     balance.displace(u.reshape(-1))
     before, high, stored = balance.forces().copy(), balance.potential()[0], tethers.stored()
-    few = patches.patches_of(balance)
+    few = nonlinear_elimination.patches_of(balance)
     assert few is not None and few.rest(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, dim) - u).max(axis=1))
     assert node in moved
-    assert np.linalg.norm(balance.forces().reshape(-1, dim)[moved]) < patches.ENOUGH * np.linalg.norm(before)
+    assert np.linalg.norm(balance.forces().reshape(-1, dim)[moved]) < nonlinear_elimination.ENOUGH * np.linalg.norm(
+        before
+    )
     assert balance.potential()[0] < high - 0.9 * stored
 
 

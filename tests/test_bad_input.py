@@ -15,7 +15,7 @@ from cases import BAR, STRIP, changed, command, fracsim, study, write_study
 from fracsim.cli import check_folder
 from fracsim.errors import InputError
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study, validate
+from fracsim.study.reader import load_study, validate
 from support.ranks import Arrays, run_on_ranks
 
 Data = dict[str, Any]

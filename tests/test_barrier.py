@@ -7,18 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fracsim.contact.barrier import KEPT, Barrier, longest_step
+from fracsim.contact.facet_contact import Facets, between
+from fracsim.contact.friction import Friction, tangential
+from fracsim.contact.laws import Along
+from fracsim.contact.node_contact import Start, touch
+from fracsim.contact.pose import Placed, Pose
+from fracsim.contact.shapes import Box, Capsule, Plane, Shape, Sphere
+from fracsim.contact.step_limit import Motion, safe_shares
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.along import Along
-from fracsim.mechanics.contact.barrier import KEPT, Barrier, longest_step
-from fracsim.mechanics.contact.bent import Start
-from fracsim.mechanics.contact.facets import Facets, between
-from fracsim.mechanics.contact.friction import Friction, tangential
-from fracsim.mechanics.contact.motion import Motion
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.reach import safe_shares
-from fracsim.mechanics.contact.shapes import Box, Capsule, Plane, Shape, Sphere
-from fracsim.mechanics.contact.touch import touch
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
 

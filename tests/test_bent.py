@@ -6,12 +6,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mechanics.contact.barrier import Barrier
-from fracsim.mechanics.contact.bent import Start
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Box, Shape, Sphere
-from fracsim.mechanics.contact.touch import Touch, touch
+from fracsim.contact.barrier import Barrier
+from fracsim.contact.node_contact import Start, Touch, touch
+from fracsim.contact.pose import Placed, Pose
+from fracsim.contact.shapes import Box, Shape, Sphere
 from support.scenes import each_step, make_scene
 
 Values = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
-from fracsim.mechanics.blow import Blow, given
+from fracsim.mechanics.contact_time_weights import Blow, given
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]

@@ -17,16 +17,16 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from fracsim.errors import InputError
-from fracsim.fracture.energy.around import Pairs
 from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
-from fracsim.fracture.energy.cutting import fork, leave
-from fracsim.fracture.energy.mixed import gain
-from fracsim.fracture.energy.running import RunningTips, slower
-from fracsim.fracture.energy.tips import DISC
+from fracsim.fracture.energy.crack_speed import RunningTips, slower
+from fracsim.fracture.energy.cut_plane import fork, leave
+from fracsim.fracture.energy.mixed_mode import gain
+from fracsim.fracture.energy.neighbour_search import Pairs
+from fracsim.fracture.energy.tip_criterion import DISC
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
-from fracsim.study.tearing import RADIUS
+from fracsim.study.energy_checks import RADIUS
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, each_step, make_scene, make_study, march
 from support.squares import square

@@ -7,10 +7,10 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fracsim.fracture.brittle.rules import GrainRules, SurfaceRules
+from fracsim.fracture.brittle.grains import GrainRules, SurfaceRules
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.breakable import Breakable
-from fracsim.rigid.point_loads import point_loads
+from fracsim.rigid.breakage import Breakable
+from fracsim.rigid.surface_loads import point_loads
 from support.rigid import breakable, density_of, moments_of
 from support.solids import copies, lattice
 

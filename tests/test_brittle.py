@@ -14,11 +14,10 @@ from scipy.spatial.distance import cdist
 
 from cases import fracsim, write_study
 from fracsim.errors import Stopped
-from fracsim.fracture.brittle.body import Body
-from fracsim.fracture.brittle.level_set import DirectionField
-from fracsim.fracture.brittle.principal import SAME, directions, largest, material_normals, upper_bound
-from fracsim.fracture.brittle.sheet import NEAREST, settled, sides_of
-from fracsim.fracture.brittle.start import Starts
+from fracsim.fracture.brittle.crack_level_set import DirectionField
+from fracsim.fracture.brittle.principal_stress import SAME, directions, largest, material_normals, upper_bound
+from fracsim.fracture.brittle.surface_cut import NEAREST, Body, settled, sides_of
+from fracsim.fracture.brittle.surface_pass import Starts
 from fracsim.meshes.data import MeshData
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -326,7 +325,7 @@ def test_without_tension_a_curved_surface_goes_straight_on() -> None:
 
 def test_weights_are_a_share_of_the_strength() -> None:
     """Uniaxial stress of half the strength: weight 1/2 along it; equal principal stresses: direction without weight."""
-    from fracsim.fracture.brittle.body import Body
+    from fracsim.fracture.brittle.surface_cut import Body
 
     body = Body(box(2, 0.25))
     rest = np.broadcast_to(np.eye(2), (len(body.cells), 2, 2))

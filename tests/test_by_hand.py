@@ -10,18 +10,18 @@ from mpi4py import MPI
 from fracsim.forms.schemes import Newmark
 from fracsim.mechanics.balance import Balance
 from fracsim.mechanics.inertia import Inertia, LumpedMass
-from fracsim.mechanics.material import coefficient, material_fields
+from fracsim.mechanics.material_fields import coefficient, material_fields
+from fracsim.mechanics.matrix_assembly import Assembler
 from fracsim.mechanics.prescribed_motion import PrescribedMotion
 from fracsim.mechanics.stress import Stress
 from fracsim.mechanics.time_functions import constant
-from fracsim.mechanics.vectors import Assembler
 from fracsim.mesh.domain import distribute
-from fracsim.mesh.places import Group
+from fracsim.mesh.selectors import Group
 from fracsim.meshes.builders.box import Box
-from fracsim.stepping.after_step import NoFlow, Unbreakable
-from fracsim.stepping.implicit import ImplicitStepper
-from fracsim.stepping.solver import Solver
-from fracsim.stepping.stepper import StepSizes
+from fracsim.solvers.nonlinear_solver import Solver
+from fracsim.timestepping.implicit import ImplicitStepper
+from fracsim.timestepping.protocols import NoFlow, Unbreakable
+from fracsim.timestepping.stepper import StepSizes
 
 LENGTH, YOUNG, DENSITY = 2.0, 8.0, 2.0  # m, Pa, kg/m^3: waves of 2 m/s
 

@@ -52,8 +52,8 @@ main()
 CASES: dict[str, tuple[str, tuple[str, str, str], int]] = {
     "fields": ("fields.xdmf", ("fracsim.output.fields_file", "FieldsFile", "write"), 35_000),
     "xml": ("fields.xdmf", ("fracsim.output.fields_file", "", "append"), 4_500),
-    "surface": ("surface.pvd", ("fracsim.output.surface.files", "SurfaceFiles", "write"), 1_000),
-    "pieces": ("surface.pvd", ("fracsim.output.surface.files", "", "append"), 600),
+    "surface": ("surface.pvd", ("fracsim.output.surface.vtk_files", "SurfaceFiles", "write"), 1_000),
+    "pieces": ("surface.pvd", ("fracsim.output.surface.vtk_files", "", "append"), 600),
     "history": ("history.csv", ("fracsim.output.history", "", "write_all"), 700),
     "checkpoint": ("checkpoint/state.h5", ("fracsim.output.checkpoint", "", "write_arrays"), 9_000),
 }
@@ -164,7 +164,7 @@ def test_a_full_disk_in_a_rigid_run(
 ) -> None:
     """The message names a checkpoint of now, or the last good one, or says that there is none; runs go on from it."""
     pytest.importorskip("mujoco", reason="an environment made without a network")
-    from fracsim.output import rigid_frames, writing
+    from fracsim.output import atomic_write, rigid_frames
     from fracsim.run import run_study
     from test_rigid_study import study as falling
 
@@ -183,7 +183,7 @@ def test_a_full_disk_in_a_rigid_run(
                 raise OSError(28, "No space left on device")
             return work()
 
-        return writing.written(comm, path, tried)
+        return atomic_write.written(comm, path, tried)
 
     monkeypatch.setattr(rigid_frames.SurfaceFiles, "write", full)
     monkeypatch.setattr("fracsim.rigid_run.written", on_disk)

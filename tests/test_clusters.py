@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from fracsim.meshes.builders.ornament import Ornament
-from fracsim.rigid.clusters import clustered_parts, extreme
-from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.fragment_geometry import Geometry
+from fracsim.rigid.shell_clusters import clustered_parts, extreme
 
 RADIUS, THICKNESS, H = 0.04, 0.001, 0.005
 
@@ -49,7 +49,7 @@ def test_the_farthest_of_a_group_stay() -> None:
 
 def test_copies_that_are_whole_share_their_parts() -> None:
     """The arrays themselves: the engine makes them once."""
-    from fracsim.rigid.placing import Poses
+    from fracsim.rigid.instance_placement import Poses
 
     shapes = Geometry(Ornament(h=0.02).build(), Poses.at_rest(3)).shapes({})
     assert shapes.parts[0][0] is shapes.parts[2][0]

@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 from scipy.integrate import quad
 
-from fracsim.fracture.cohesive.breaking import CohesiveBreaking
+from fracsim.fracture.cohesive.cohesive_pass import CohesiveBreaking
+from fracsim.fracture.cohesive.cohesive_tips import without
 from fracsim.fracture.cohesive.softening import carried, decay, widths
-from fracsim.fracture.cohesive.tips import without
 from fracsim.scene import Scene
 from fracsim.studies import folder as packaged
 from fracsim.study.check import check_study

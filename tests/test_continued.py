@@ -14,9 +14,9 @@ from mpi4py import MPI
 from fracsim.output.interrupt import Interrupt
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from fracsim.stepping.stepper import Abandoned
 from fracsim.study import Study
-from fracsim.study.file import study_text
+from fracsim.study.reader import study_text
+from fracsim.timestepping.stepper import Abandoned
 from support.continued import CASES, differences, other, unlike
 from support.ranks import run_on_ranks
 from support.scenes import make_study
@@ -79,7 +79,7 @@ def test_rigid_bodies_go_on_the_same(tmp_path: Path, name: str) -> None:
     """Stopped before they break, and after: places, velocities, blows, loads and broken edges."""
     pytest.importorskip("mujoco", reason="an environment made without a network")
     from fracsim.rigid_run import RigidRun
-    from fracsim.scene.rigid import build_rigid_scene
+    from fracsim.scene.rigid_scene import build_rigid_scene
 
     data = Study.model_validate({
         "title": "rigid", "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.cores import LEAST, MOST, REACH, Core, Cores
-from fracsim.rigid.stepper import RigidState, RigidStepper
-from fracsim.scene.rigid import build_rigid_scene
-from fracsim.study.file import load_study
+from fracsim.rigid.core_contact import LEAST, MOST, REACH, Core, Cores
+from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
+from fracsim.scene.rigid_scene import build_rigid_scene
+from fracsim.study.reader import load_study
 from support.falling import DOWN, stepper_of
 from support.solids import copies
 from test_pieces_apart import as_placed, in_cells

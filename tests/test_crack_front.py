@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from fracsim.fracture.record import EdgeRecord
-from fracsim.output.crack_front import CrackFront
+from fracsim.fracture.edge_history import EdgeRecord
+from fracsim.output.crack_length import CrackFront
 from fracsim.study.conditions import cracks as given
 from support.scenes import make_scene
 

@@ -11,12 +11,13 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from cases import BAR, study
-from fracsim.mechanics.stiffness import Stiffness
-from fracsim.mechanics.tangent import Assembly
-from fracsim.mechanics.tied import Tied
+from fracsim.mechanics.matrix_assembly import Assembly
+from fracsim.mechanics.tangent import Stiffness
+from fracsim.mechanics.tie_matrix import Tied
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import blocks, preconditioner
-from fracsim.stepping.solver import Solver
+from fracsim.solvers import preconditioner
+from fracsim.solvers.multigrid import block_operator
+from fracsim.solvers.nonlinear_solver import Solver
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 
@@ -55,7 +56,7 @@ def test_a_thin_body_has_aggregates_of_strong_links(monkeypatch: pytest.MonkeyPa
     """A sheet of two cells that is bent takes at most 0.8 of the iterations that it takes with all links; a cube, which
     takes more of them with strong links, has all of them again. A user who asks for some keeps them."""
     monkeypatch.setattr(preconditioner, "SLOW", 5)
-    monkeypatch.setattr(blocks, "SMALL", 10**9)  # or what nobody asked for is smoothed otherwise, too
+    monkeypatch.setattr(block_operator, "SMALL", 10**9)  # or what nobody asked for is smoothed otherwise, too
     sheet, cube = ((0.15, 0.1, 0.01), 0.0048), ((0.1, 0.1, 0.1), 0.02)
     assert bent_its(*sheet, {}) < 0.8 * bent_its(*sheet, {"pc_gamg_threshold": 0.0})
     assert bent_its(*cube, {}) == bent_its(*cube, {"pc_gamg_threshold": 0.0})
@@ -84,7 +85,7 @@ def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(preconditioner, "WORTH_IT", 10.0)
     scene, by_entries = shattered(0.025, 0, {}, 3)
     assert set(smoothers(scene)) == {("jacobi", 2)}
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
     scene, by_nodes = shattered(0.025, 0, {}, 3)
     assert by_nodes[-1] <= 1.5 * by_entries[-1]
@@ -184,7 +185,7 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
     """A bar in pieces: rows of some nodes, of blocks with ties beside them or of the matrix, against products with unit
     vectors."""
     if first:
-        monkeypatch.setattr(blocks, "SMALL", 0)
+        monkeypatch.setattr(block_operator, "SMALL", 0)
     scene, _ = shattered(0.06, 10, {}, 2)
     solver, nodes = scene.solver, np.array([5, 0, 17, 40])
     assert isinstance(solver, Solver) and (solver.linear._blocks is not None) is first
@@ -209,7 +210,7 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
 def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bar in pieces, whose matrices are made anew on the way: CG and the finest level of multigrid multiply with
     blocks, to the last digits as with the tangent, be they assembled first or copied from single entries."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     if not first:
         monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)

@@ -11,8 +11,8 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 from fracsim.errors import InputError
-from fracsim.mesh.cracks import plane, polygon, segment
-from fracsim.mesh.pieces import find_pieces
+from fracsim.mesh.crack_planes import plane, polygon, segment
+from fracsim.mesh.fragments import find_pieces
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study

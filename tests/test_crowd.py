@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.contacts import Contacts
-from fracsim.rigid.crowd import Crowd, projected
+from fracsim.rigid.contact_points import Contacts
+from fracsim.rigid.contact_solver import Crowd, projected
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.model import Rules
-from fracsim.rigid.waiting import Helper
+from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.worker_ranks import Helper
 from support.falling import CUBE, DOWN, MASS, cubes
 
 Values = npt.NDArray[np.float64]
@@ -85,7 +85,7 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
 
 def test_two_threads_come_to_the_same_digits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a crowd, in as many iterations; whatever each of them was busy with."""
-    monkeypatch.setattr("fracsim.rigid.crowd.FEW", 10)
+    monkeypatch.setattr("fracsim.rigid.contact_solver.FEW", 10)
     contacts, bodies = pile(0.3)
     still = np.zeros((1, 3))
     free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))

@@ -12,11 +12,11 @@ from petsc4py import PETSc
 
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import blocks, cycle, rows, smoother
-from fracsim.stepping import linear as linear_room
-from fracsim.stepping import preconditioner as preconditioner_room
-from fracsim.stepping.linear import Linear
-from fracsim.stepping.preconditioner import Due
+from fracsim.solvers import linear_solver as linear_room
+from fracsim.solvers import preconditioner as preconditioner_room
+from fracsim.solvers.linear_solver import Linear
+from fracsim.solvers.multigrid import bcsr, block_operator, smoother, vcycle
+from fracsim.solvers.preconditioner import Due
 from support.scenes import Walk
 
 Values = npt.NDArray[np.float64]
@@ -103,8 +103,8 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     finest, also where it has stiffened by more than smoothers of before would bear; symmetric and positive. Of the
     largest eigenvalue Lanczos' method finds nine tenths at least. `slowly`: 0 where more is done with coarser
     levels."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
-    monkeypatch.setattr(cycle, "SLOWLY", slowly)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
+    monkeypatch.setattr(vcycle, "SLOWLY", slowly)
     small = {2: {"size": [0.6, 0.14], "h": 0.02}, 3: {"size": [0.6, 0.15, 0.15], "h": 0.05}}  # matrices are dense
     scene = bar(dim, {}, mesh=small[dim])
     Walk(scene).advance()
@@ -112,7 +112,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     preconditioner.due = Due.REFRESH
     assert linear.solve()
     made, pc = preconditioner._cycle, preconditioner.pc
-    assert isinstance(made, cycle.Cycle) and preconditioner.serving.handle == made.pc.handle
+    assert isinstance(made, vcycle.Cycle) and preconditioner.serving.handle == made.pc.handle
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
     sizes = [level._size for level in made._levels]
@@ -120,7 +120,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     largest = [largest_of(level) for level in made._levels]
     finest, *coarser = [level.effort for level in made._levels[::-1]]
     usual = [finest] * len(coarser)
-    assert finest == (2, 0.1, 1) and coarser == (usual if slowly else list(cycle.THOROUGH[: len(coarser)])) != []
+    assert finest == (2, 0.1, 1) and coarser == (usual if slowly else list(vcycle.THOROUGH[: len(coarser)])) != []
     inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
     at_first = [largest_eigenvalue(B, each) for B, each in zip(inverses, A[1:], strict=True)]
     assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
@@ -145,11 +145,11 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
 
 def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest.MonkeyPatch) -> None:
     """A strip that is bent slowly takes fewer iterations for it; with a block nothing more is done."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     monkeypatch.setattr(preconditioner_room, "SLOW", 99)  # aggregates stay of one kind
     strip, block, its = [3.0, 0.04, 0.02], [0.2, 0.2, 0.2], []
-    for size, slowly in ((strip, cycle.SLOWLY), (strip, 1.0), (block, cycle.SLOWLY)):
-        monkeypatch.setattr(cycle, "SLOWLY", slowly)
+    for size, slowly in ((strip, vcycle.SLOWLY), (strip, 1.0), (block, vcycle.SLOWLY)):
+        monkeypatch.setattr(vcycle, "SLOWLY", slowly)
         scene = bar(
             3, {}, mesh={"size": size, "h": 0.02, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.0, 0.0, 0.01]}],
@@ -158,14 +158,14 @@ def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest
         its.append(Walk(scene).advance().solve.krylov)
         made = linear_of(scene).preconditioner._cycle
         assert made is not None
-        assert (made._levels[-2].effort == cycle.THOROUGH[0]) == (size is strip and slowly < 1)
+        assert (made._levels[-2].effort == vcycle.THOROUGH[0]) == (size is strip and slowly < 1)
     assert its[0] < 0.8 * its[1] and its[2] < its[0]
 
 
 def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of PETSc's own cycle, which a user who names its smoother keeps, and which goes by single entries of the
     diagonal: the same motion to the solver's tolerance."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     its, u = [], []
     for given in ({}, {"mg_levels_pc_type": "jacobi"}):
         scene = bar(3, given | {"ksp_rtol": 1e-8})
@@ -181,7 +181,7 @@ def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytes
 def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six digits of K, written out, and all of how it resists what moves along as one; solves by themselves go by all
     of them."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     scene = bar(dim, {"snes_type": "newtonls"})
     Walk(scene).advance()
     linear = linear_of(scene)
@@ -205,7 +205,7 @@ def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch
 def test_what_is_rounded_is_found_by_the_next_correction(step: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same motion as with corrections in double precision, in as many iterations, also in steps so long that
     inertia has some 1e-6 of a cell's stiffness; which those are where it holds next to nothing."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     pulled = [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.02 / step, 0.0, 0.0]}]
     more = {"time": {"end": 200 * step, "scheme": "backward-euler", "step": step}, "boundary": pulled}
     its, u = [], []
@@ -224,7 +224,7 @@ def test_what_is_rounded_is_found_by_the_next_correction(step: float, monkeypatc
 def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once CG has taken longer by some iterations, the cycle is made anew on the same ones; once by more of them, or
     where edges broke, everything is."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     scene = bar(3, {})
     Walk(scene).advance()
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
@@ -244,8 +244,8 @@ def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.Mon
 
 
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blocks, "SMALL", 0)
-    monkeypatch.setattr(rows, "code", lambda *_: None)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
+    monkeypatch.setattr(bcsr, "code", lambda *_: None)
     scene = bar(3, {})
     assert Walk(scene).advance().solve.converged
     preconditioner = linear_of(scene).preconditioner

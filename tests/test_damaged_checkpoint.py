@@ -16,7 +16,7 @@ from cases import STRIP, changed, fracsim, fracsim_here, write_study
 from fracsim.errors import Exit
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 from support import damaged_checkpoint as damaged
 
 TORN: dict[str, Any] = changed(

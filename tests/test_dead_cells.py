@@ -10,12 +10,12 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
-from fracsim.mechanics.flow_prediction import Extrapolated
-from fracsim.mechanics.kernels import CellForm
-from fracsim.mechanics.stiffness import Stiffness
+from fracsim.mechanics.jit import CellForm
+from fracsim.mechanics.plasticity import Extrapolated
+from fracsim.mechanics.tangent import Stiffness
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.reference import dense_tangent
 from support.scenes import Values, make_scene, march
 from support.torn import SOFT, integrated_cells, weaken

@@ -15,17 +15,17 @@ from mpi4py import MPI
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.errors import NotConverged
-from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.breakable import Breakable, Within
+from fracsim.rigid.breakage import Breakable, Within
 from fracsim.rigid.denting import Flow, Shape, fitted, turned_strain
-from fracsim.rigid.point_loads import PointLoads
+from fracsim.rigid.surface_loads import PointLoads
 from fracsim.run import run_study
-from fracsim.scene.rigid import build_rigid_scene
-from fracsim.study.file import study_text
+from fracsim.scene.rigid_scene import build_rigid_scene
+from fracsim.study.reader import study_text
 from support.rigid import DENSITY, TIGHT, moments_of, stiffness_of
 from support.solids import lattice
 from support.vtu import frames

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 from petsc4py import PETSc
 
-from fracsim.stepping.descent import Descent
+from fracsim.solvers.line_search import Descent
 
 
 class Hill:

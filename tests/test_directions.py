@@ -12,12 +12,12 @@ from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import MeshData, MeshError
 from fracsim.meshes.directions import preferred
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.scattered.outline import Outline
-from fracsim.meshes.scattered.points import APART, scatter
+from fracsim.meshes.random_points.outline import Outline
+from fracsim.meshes.random_points.points import APART, scatter
 from fracsim.meshes.sizing import Sizing
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
-from fracsim.study.file import load_study
 from fracsim.study.mesh_source import build_mesh
+from fracsim.study.reader import load_study
 
 
 def ring(*corners: tuple[float, float], h: float, first: int = 0) -> Outline:

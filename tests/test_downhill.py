@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.stepping import solver as solver_room
-from fracsim.stepping.downhill import EXACT, PATIENCE, POSITIVE, Downhill, Way
+from fracsim.solvers import nonlinear_solver as solver_room
+from fracsim.solvers.line_search import EXACT, PATIENCE, POSITIVE, Downhill, Way
 from support.scenes import Walk
 from test_cycle import bar
 

@@ -11,11 +11,11 @@ from cases import STRIP, changed
 from fracsim.errors import InputError
 from fracsim.meshes.data import MeshError
 from fracsim.meshes.directions import preferred
-from fracsim.meshes.scattered.drawn import fill_outline, read_outline
+from fracsim.meshes.random_points.outline_file import fill_outline, read_outline
 from fracsim.meshes.topology import signed_measures
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study, validate
 from fracsim.study.mesh_source import build_mesh
+from fracsim.study.reader import load_study, validate
 
 # an L of 2 x 2 without its upper right quarter, with a square hole of 0.2; closed by hand, with a remark
 L = """

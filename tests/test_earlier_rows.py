@@ -15,7 +15,7 @@ from cases import BAR, changed, fracsim_here, write_study
 from fracsim.errors import Exit
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 LONG: dict[str, Any] = changed(BAR, time={"step": 0.01, "end": 0.12}, output={"surface": True})
 

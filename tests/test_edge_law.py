@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.fracture.breaking import Breaking
 from fracsim.fracture.edge_law import Brittle
+from fracsim.fracture.fracture_pass import Breaking
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.ranks import OnRanks

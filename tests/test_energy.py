@@ -14,12 +14,12 @@ from mpi4py import MPI
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from fracsim.fracture.energy.cutting import leave, line_cuts, points_at, through_centre
-from fracsim.fracture.energy.force import eshelby, first_piola, plateau, plateau_gradient, springs
-from fracsim.fracture.energy.mixed import Around, gain, kink, shares
-from fracsim.fracture.energy.patch import Patch
-from fracsim.fracture.energy.seen import Seen
-from fracsim.fracture.energy.tips import DISC, NEAR_TIP, CrackTips
+from fracsim.fracture.energy.configurational_force import eshelby, first_piola, plateau, plateau_gradient, springs
+from fracsim.fracture.energy.cut_plane import leave, line_cuts, points_at, through_centre
+from fracsim.fracture.energy.gradient_operators import Patch
+from fracsim.fracture.energy.mixed_mode import Around, gain, kink, shares
+from fracsim.fracture.energy.tip_criterion import DISC, NEAR_TIP, CrackTips
+from fracsim.fracture.energy.tip_fields import Seen
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import build_scene, scene_on

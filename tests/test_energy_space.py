@@ -10,13 +10,12 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from fracsim.fracture.energy.along import Alone, Along
-from fracsim.fracture.energy.around import pairs_within
-from fracsim.fracture.energy.cutting import cleave, line_cuts
-from fracsim.fracture.energy.force import plateau, plateau_gradient
-from fracsim.fracture.energy.front import advance
-from fracsim.fracture.energy.row import RowTips
-from fracsim.fracture.energy.tips import NEAR_TIP, CrackTips
+from fracsim.fracture.energy.configurational_force import plateau, plateau_gradient
+from fracsim.fracture.energy.crack_front import Alone, Along, advance
+from fracsim.fracture.energy.cut_plane import cleave, line_cuts
+from fracsim.fracture.energy.front_advance import RowTips
+from fracsim.fracture.energy.neighbour_search import pairs_within
+from fracsim.fracture.energy.tip_criterion import NEAR_TIP, CrackTips
 from fracsim.mesh.simplices import is_split
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-import fracsim.rigid.newton as newton_room
-from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
+import fracsim.rigid.contact_solver as newton_room
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.course import Course
+from fracsim.rigid.collision_detection import Finder
+from fracsim.rigid.contact_records import Touches
+from fracsim.rigid.contact_solver import CLOSE
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.finding import Finder
-from fracsim.rigid.model import Part, Rules, Stand, model_of
-from fracsim.rigid.primitives import primitive
-from fracsim.rigid.pushing import CLOSE
-from fracsim.rigid.siblings import Overlaps
-from fracsim.rigid.touches import Touches
+from fracsim.rigid.fragment_overlap import Overlaps
+from fracsim.rigid.mujoco_model import Part, Rules, Stand, model_of
+from fracsim.rigid.obstacle_shapes import primitive
+from fracsim.rigid.swept_bounds import Course
 from support.falling import CUBE, DOWN, MASS, G, cubes, floor
 
 Values = npt.NDArray[np.float64]
@@ -119,7 +119,7 @@ def test_soft_contacts_first_lead_to_the_same_hard_ones(monkeypatch: pytest.Monk
     """Sixty-four blocks that spin and fall in a heap: solved at once, and from softer contacts on, which is for crowds
     that Newton's method alone gets lost in; in one event. Slip is looked at until it changes by less than CLOSE c_0,
     which mu times is the most that the two may be apart by."""
-    monkeypatch.setattr("fracsim.rigid.striking.behind", lambda *_: False)
+    monkeypatch.setattr("fracsim.rigid.impact_step.behind", lambda *_: False)
     grid = 1.02 * np.indices((4, 4, 4)).reshape(3, -1).T + 0.53
     spin = 5.0 * np.random.default_rng(1).normal(size=(64, 3))
     falling = replace(cubes(grid.tolist()), velocity=np.tile(6.0 * DOWN / G, (64, 1)), spin=spin)

@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mechanics.contact.shapes import Sphere
+from fracsim.contact.shapes import Sphere
 from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.contact_solver import HARD
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.events import Kin
-from fracsim.rigid.model import Rules
-from fracsim.rigid.newton import HARD
-from fracsim.rigid.primitives import primitive
+from fracsim.rigid.impact_sequence import Kin
+from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.obstacle_shapes import primitive
 from support.falling import CUBE, DOWN, MASS, cubes, floor
 
 Ints = npt.NDArray[np.int64]
@@ -101,7 +101,7 @@ def test_events_of_a_step_keep_momentum_and_gain_no_energy(solver: None) -> None
 def test_other_steps_of_a_crowd_are_not_taken_apart(kin: Kin, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two blocks, one of which flies into the other over a floor behind, as if they were many: these come to the
     digits that they come to where nothing is known of what breaks."""
-    monkeypatch.setattr("fracsim.rigid.pushing.CROWD", 0)
+    monkeypatch.setattr("fracsim.rigid.contact_solver.CROWD", 0)
     bodies = cubes([[0.0, 0, 0.6], [0.3, 0, 1.8]])
     bodies = replace(bodies, velocity=np.array([[0.0, 0, 0], [0, 0, -20.0]]))
     rules = Rules(0.1, FREE)

@@ -22,7 +22,7 @@ from fracsim.studies.evidence.section import Point, Section, fitted_order, paret
 from fracsim.studies.evidence.trial import Trial
 from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
 from fracsim.study.check import build_mesh
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 POINTS = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
 
@@ -206,15 +206,15 @@ def test_flat_on_flat_is_held_against_edge_on_edge() -> None:
 
 
 def test_modules_of_other_features_are_noticed() -> None:
-    edges, average = "fracsim.mesh.edges", "fracsim.fracture.nonlocal_average"
-    modules = ["fracsim.run", "fracsim.output.surface", "fracsim.fracture.record", edges, average]
+    edges, average = "fracsim.mesh.edge_graph", "fracsim.fracture.nonlocal_average"
+    modules = ["fracsim.run", "fracsim.output.surface", "fracsim.fracture.edge_history", edges, average]
     assert ladder.strangers("elastic", 10, modules) == sorted(modules[1:])
     assert ladder.strangers("damage", 10, [edges, average]) == [average]
     assert ladder.strangers("average", 10, [edges, average]) == []
 
 
 def test_every_rung_is_a_study() -> None:
-    from fracsim.study.file import validate
+    from fracsim.study.reader import validate
 
     for name in ladder.rungs(4):
         assert validate(ladder.rung_study(name, 4), name).title.startswith("bench")

@@ -30,7 +30,7 @@ from fracsim.studies.evidence.precision import (
 )
 from fracsim.studies.evidence.trial import Trial
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 Values = npt.NDArray[np.float64]
 TRIALS = precision.trials()
@@ -396,7 +396,7 @@ def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
 
 
 def test_the_tolerances_called_default_are() -> None:
-    from fracsim.stepping.linear import DEFAULTS
+    from fracsim.solvers.linear_solver import DEFAULTS
     from fracsim.studies.evidence.precision import finite
 
     assert (DEFAULTS["snes_rtol"], DEFAULTS["ksp_rtol"]) == finite.DEFAULT

@@ -27,7 +27,7 @@ from fracsim.studies.evidence import (
 )
 from fracsim.studies.evidence.trial import Trial
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 TRIALS = [*stability.trials(), *dependence.trials()]
 

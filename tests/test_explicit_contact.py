@@ -10,11 +10,11 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from fracsim.mechanics.contact.carried import Carried
-from fracsim.mechanics.contact.explicit_free import ExplicitFreeObstacles
-from fracsim.mechanics.contact.explicit_obstacles import ExplicitObstacles
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.split.local import Following, LocalSurface
+from fracsim.contact.penalty_law import Carried
+from fracsim.contact.penalty_obstacles import ExplicitObstacles
+from fracsim.contact.penalty_rigid_obstacles import ExplicitFreeObstacles
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.split_surface.local_surface import Following, LocalSurface
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import each_step, make_scene, make_study, march, positions

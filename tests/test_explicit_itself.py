@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import eye
 
-from fracsim.mechanics.contact.explicit_itself import ExplicitSelfContact, Pushes
-from fracsim.mechanics.contact.pushing import Pushing, rates
+from fracsim.contact.penalty_point_facet import Pushing, rates
+from fracsim.contact.penalty_self_contact import ExplicitSelfContact, Pushes
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed

@@ -14,8 +14,8 @@ import pyvista
 from mpi4py import MPI
 
 from fracsim.errors import InputError
-from fracsim.output.surface.files import SurfaceFiles, quaternions
-from fracsim.output.surface.frame import Surface
+from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.vtk_files import SurfaceFiles, quaternions
 from fracsim.report.export import export
 from fracsim.run import run_study
 from fracsim.study import Study

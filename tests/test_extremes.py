@@ -11,7 +11,7 @@ from mpi4py import MPI
 from fracsim.run import run_study
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import extremes
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 from support.ranks import Arrays, OnRanks
 from support.scenes import Walk
 

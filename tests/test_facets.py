@@ -9,20 +9,16 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import block_diag
 
-from fracsim.mechanics.contact.barrier import Barrier
-from fracsim.mechanics.contact.deepest import deepest, most_above
-from fracsim.mechanics.contact.facets import Between, Facets, between
-from fracsim.mechanics.contact.friction import Friction
-from fracsim.mechanics.contact.gripped import gripped_between
-from fracsim.mechanics.contact.joined import joined
-from fracsim.mechanics.contact.obstacles import Obstacles
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose, turning
-from fracsim.mechanics.contact.push import by_point_and_pose, on_obstacle, push
-from fracsim.mechanics.contact.reach import safe_shares
-from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
-from fracsim.mechanics.contact.shares import least_over_shares
-from fracsim.mechanics.contact.touch import Touch, grip, nothing, touch
+from fracsim.contact.barrier import Barrier
+from fracsim.contact.closest_point import deepest, least_over_shares, most_above
+from fracsim.contact.facet_contact import Between, Facets, between, gripped_between, joined
+from fracsim.contact.friction import Friction
+from fracsim.contact.node_contact import Touch, grip, nothing, touch
+from fracsim.contact.obstacle_term import Obstacles
+from fracsim.contact.pose import Placed, Pose, turning
+from fracsim.contact.rigid_body import by_point_and_pose, on_obstacle, push
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from fracsim.contact.step_limit import safe_shares
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 
-from fracsim.stepping.factors import Factors
+from fracsim.solvers.direct_solver import Factors
 from fracsim.studies.evidence import solvers
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene

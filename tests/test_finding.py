@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mechanics.contact.shapes import Box, Sphere
-from fracsim.rigid.contacts import Contacts
-from fracsim.rigid.course import Course
-from fracsim.rigid.finding import Finder
-from fracsim.rigid.model import Rules, Stand, model_of
-from fracsim.rigid.primitives import primitive
-from fracsim.rigid.waiting import Helper
+from fracsim.contact.shapes import Box, Sphere
+from fracsim.rigid.collision_detection import Finder
+from fracsim.rigid.contact_points import Contacts
+from fracsim.rigid.mujoco_model import Rules, Stand, model_of
+from fracsim.rigid.obstacle_shapes import primitive
+from fracsim.rigid.swept_bounds import Course
+from fracsim.rigid.worker_ranks import Helper
 from support.falling import CUBE, DOWN, cubes, floor
 
 Values = npt.NDArray[np.float64]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import fracsim.mechanics.stiffness as stiffness_module
-from fracsim.stepping.forcing import LOOSE, LOOSEST, MOST, ROUGHEST, SHARE, SMALL, Forcing, Sparing
+import fracsim.mechanics.tangent as stiffness_module
+from fracsim.solvers.forcing_terms import LOOSE, LOOSEST, MOST, ROUGHEST, SHARE, SMALL, Forcing, Sparing
 from support.scenes import make_scene, march, positions
 from test_itself import SOFT, two_blocks
 

@@ -17,18 +17,18 @@ from scipy.stats import kstest, pearsonr
 
 from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
-from fracsim.fracture.breaking import Breaking
 from fracsim.fracture.criterion import OverloadedEdges
 from fracsim.fracture.edge_stress import Simplices
+from fracsim.fracture.fracture_pass import Breaking
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import Strength, hashed
-from fracsim.mechanics.kernels import CellExpression
-from fracsim.mesh.edges import EdgeGraph
+from fracsim.mechanics.jit import CellExpression
+from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.simplices import is_split, local_edges
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.scene import Scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.laws import T_stress, rotation
 from support.oscillator import slopes
 from support.scenes import Values, cell_corners, deform, displacement, each_step, make_scene, march, positions

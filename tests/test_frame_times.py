@@ -15,16 +15,16 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed, fracsim, study, write_study
-from fracsim.output.surface.files import SurfaceFiles
-from fracsim.output.surface.frame import Surface
+from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.export import export
-from fracsim.report.pictures.look import Look
+from fracsim.report.pictures.frames import times_shown
 from fracsim.report.pictures.picture import render
-from fracsim.report.pictures.shots import times_shown
+from fracsim.report.pictures.picture_options import Look
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
-from fracsim.stepping.stepper import SolveResult
 from fracsim.study import Study
+from fracsim.timestepping.stepper import SolveResult
 from support.solids import lattice
 
 Values = npt.NDArray[np.float64]

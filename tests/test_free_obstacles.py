@@ -11,8 +11,8 @@ import pytest
 from mpi4py import MPI
 from pydantic import ValidationError
 
+from fracsim.contact.rigid_obstacle_term import FreeObstacles
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.free_obstacles import FreeObstacles
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.output.energy_gain import EnergyGain, worth_telling
+from fracsim.output.energy_check import EnergyGain, worth_telling
 from fracsim.output.summary import trouble_in_words
 from support.scenes import deform, make_scene
 

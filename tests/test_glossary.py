@@ -10,8 +10,8 @@ from pathlib import Path
 import fracsim
 from fracsim.forms.schemes import SCHEMES
 from fracsim.output.history import COLUMNS
-from fracsim.stepping.stepper import Trouble
-from fracsim.study.running import FIELDS
+from fracsim.study.time_and_output import FIELDS
+from fracsim.timestepping.stepper import Trouble
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "docs" / "glossary.md").read_text()
@@ -22,7 +22,7 @@ CODE = set(re.findall(r"`([\w-]+)`", TEXT))
 def keys_of_summaries() -> set[str]:
     """Literal keys of the dictionaries in functions that give summary.json its figures."""
     package, keys = Path(fracsim.__file__).parent, set()
-    for name in ("run.py", "rigid_run.py", "watched.py"):
+    for name in ("run.py", "rigid_run.py", "monitors.py"):
         for function in ast.walk(ast.parse((package / name).read_text())):
             if isinstance(function, ast.FunctionDef) and function.name in ("_summary", "summary"):
                 dicts = [node for node in ast.walk(function) if isinstance(node, ast.Dict)]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from fracsim.fracture.brittle.body import Body
-from fracsim.fracture.brittle.grains import Grains, least, sow
-from fracsim.fracture.brittle.rules import GrainRules
+from fracsim.fracture.brittle.grains import GrainRules, Grains, least, sow
+from fracsim.fracture.brittle.surface_cut import Body
 from fracsim.meshes.data import MeshData
 from fracsim.study import Mesh
 from fracsim.study.mesh_source import build_mesh

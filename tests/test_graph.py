@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.mesh import parting
-from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh import incremental_fragments
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.fragments import find_pieces
 from fracsim.mesh.incidence import Incidence
-from fracsim.mesh.parting import Parting
-from fracsim.mesh.pieces import find_pieces
+from fracsim.mesh.incremental_fragments import Parting
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from fracsim.meshes.components import components
 from support.ranks import OnRanks
@@ -135,7 +135,7 @@ def test_pieces_are_followed(dim: int) -> None:
     scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.34}, fracture={"strength": 1.0})
     graph = scene.fracture.graph
     follow, counts = Parting(graph), []
-    with patch.object(parting, "find_pieces", wraps=find_pieces) as searched:
+    with patch.object(incremental_fragments, "find_pieces", wraps=find_pieces) as searched:
         for edge in np.random.default_rng(6).permutation(len(graph.broken)):
             graph.break_edges(np.arange(len(graph.broken)) == edge)
             pieces, expected = follow.look(), find_pieces(graph)
@@ -153,7 +153,7 @@ def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
     graph = scene.fracture.graph
     follow, middle = Parting(graph), graph.domain.nodes[graph.edge_nodes].mean(axis=1)
     near = [np.argsort(np.linalg.norm(middle - corner, axis=1))[:3] for corner in ([0.2, 0.2], [0.8, 0.8])]
-    with patch.object(parting, "FAR", 3), patch.object(parting, "find_pieces") as searched:
+    with patch.object(incremental_fragments, "FAR", 3), patch.object(incremental_fragments, "find_pieces") as searched:
         graph.break_edges(np.isin(np.arange(len(middle)), np.concatenate(near)))
         assert follow.look().count == 1
         alone = graph.edge_nodes[near[0][0], 0]

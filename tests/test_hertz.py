@@ -11,7 +11,7 @@ import meshio
 import numpy as np
 import pytest
 
-from fracsim.mechanics.contact.obstacles import Obstacles
+from fracsim.contact.obstacle_term import Obstacles
 from fracsim.meshes.builders.box import Box
 from support.scenes import make_scene, march, positions
 

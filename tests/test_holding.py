@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from fracsim.cli import _dust
 from fracsim.fracture.criterion import OverloadedEdges
-from fracsim.fracture.holding import LIMIT, Holding
-from fracsim.mesh.edges import EdgeGraph
+from fracsim.fracture.node_retention import LIMIT, Holding
+from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study

@@ -8,9 +8,9 @@ import meshio
 import numpy as np
 import pytest
 
+from fracsim.contact.laws import TIGHT
+from fracsim.contact.self_contact import SelfContact
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.itself import SelfContact
-from fracsim.mechanics.contact.stiffening import TIGHT
 from fracsim.meshes.builders.box import Box
 from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS

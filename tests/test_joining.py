@@ -11,15 +11,15 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.fracture.joining import Joining
-from fracsim.mechanics.tethers import Tethers
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.parts import parts_of_nodes
-from fracsim.mesh.pieces import find_pieces
+from fracsim.fracture.node_retention import Joining
+from fracsim.mechanics.node_ties import Tethers
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.facet_components import parts_of_nodes
+from fracsim.mesh.fragments import find_pieces
 from fracsim.scene import Scene
-from fracsim.stepping import blocks
-from fracsim.stepping.loose_parts import loose_parts
-from fracsim.stepping.preconditioner import Due
+from fracsim.solvers.deflation import loose_parts
+from fracsim.solvers.multigrid import block_operator
+from fracsim.solvers.preconditioner import Due
 from support.scenes import Walk, each_step, make_scene, march
 from test_cycle import by_hand, dense, written_out
 
@@ -206,7 +206,7 @@ def test_ties_beside_blocks_are_those_among_single_entries(dim: int) -> None:
 @pytest.mark.parametrize("dim", (2, 3))
 def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they are now, written out: also ties a hundred times as stiff as when multigrid was set up."""
-    monkeypatch.setattr(blocks, "SMALL", 0)
+    monkeypatch.setattr(block_operator, "SMALL", 0)
     finer = MESHES[dim] | {"h": {2: 0.6, 3: 0.7}[dim] * MESHES[dim]["h"]}
     scene, _, tethers = tied(dim, mesh=finer, solver={"snes_type": "ksponly", "ksp_rtol": 1e-8})
     linear, stiffness = scene.solver.linear, scene.balance.stiffness  # type: ignore[union-attr]

@@ -15,8 +15,8 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 
 from fracsim.errors import InputError
-from fracsim.mechanics import kernels
-from fracsim.mesh.dolfinx_calls import coordinate_element
+from fracsim.mechanics import jit
+from fracsim.mesh.dolfinx_compat import coordinate_element
 from support.damaged import DAMAGES, damage
 
 
@@ -24,40 +24,38 @@ def test_an_abandoned_compilation_is_done_again(monkeypatch: pytest.MonkeyPatch,
     """A C file without its library, as a killed process leaves it, older than anyone waits."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     options: dict[str, Any] = {"cache_dir": tmp_path / "fenics"}
-    monkeypatch.setattr(kernels, "library_folder", lambda: tmp_path / "fenics")
-    monkeypatch.setattr(kernels, "jit_options", lambda: options | {"timeout": 1})
+    monkeypatch.setattr(jit, "library_folder", lambda: tmp_path / "fenics")
+    monkeypatch.setattr(jit, "jit_options", lambda: options | {"timeout": 1})
     square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
     form = fem.Constant(square, 3.14159) * ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx
-    kernels.compile_form(form)
+    jit.compile_form(form)
     for path in (tmp_path / "fenics").iterdir():
         if path.suffix == ".c":
-            os.utime(path, (0, time.time() - 2 * kernels.PATIENCE))
+            os.utime(path, (0, time.time() - 2 * jit.PATIENCE))
         else:
             path.unlink()
-    assert fem.assemble_scalar(kernels.compile_form(form)) == pytest.approx(3.14159 / 4)
+    assert fem.assemble_scalar(jit.compile_form(form)) == pytest.approx(3.14159 / 4)
 
 
 def test_one_that_is_under_way_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A young C file belongs to a process that compiles."""
-    monkeypatch.setattr(kernels, "library_folder", lambda: tmp_path)
+    monkeypatch.setattr(jit, "library_folder", lambda: tmp_path)
     (tmp_path / "libffcx_forms_0.c").touch()
-    assert not kernels._clear_abandoned()
+    assert not jit._clear_abandoned()
     assert (tmp_path / "libffcx_forms_0.c").exists()
 
 
 def test_a_kernel_is_looked_for_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """What a process has loaded it finds without the folder that it came from; another form is not taken for it."""
-    monkeypatch.setattr(
-        kernels, "jit_options", lambda: {"cache_dir": tmp_path / "a", "cffi_extra_compile_args": ["-O0"]}
-    )
+    monkeypatch.setattr(jit, "jit_options", lambda: {"cache_dir": tmp_path / "a", "cffi_extra_compile_args": ["-O0"]})
     square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
     x = ufl.SpatialCoordinate(square)
     for power in (4, 5):
         for _ in range(2):  # compiled, then loaded
-            kernels.compile_form(x[0] ** power * ufl.dx)
+            jit.compile_form(x[0] ** power * ufl.dx)
     (tmp_path / "a").rename(tmp_path / "b")
     for power in (4, 5):
-        found = fem.assemble_scalar(kernels.compile_form(x[0] ** power * ufl.dx))
+        found = fem.assemble_scalar(jit.compile_form(x[0] ** power * ufl.dx))
         assert found == pytest.approx(1 / (power + 1))
     assert not list((tmp_path / "a").glob("*"))
 
@@ -72,13 +70,13 @@ def test_a_mesh_makes_its_cell_once() -> None:
 
 def test_an_expression_is_known_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Whatever labels ufl.variable has given since: one library for all scenes of a process, and the same slope."""
-    monkeypatch.setattr(kernels, "jit_options", lambda: {"cache_dir": tmp_path, "cffi_extra_compile_args": ["-O0"]})
+    monkeypatch.setattr(jit, "jit_options", lambda: {"cache_dir": tmp_path, "cffi_extra_compile_args": ["-O0"]})
     square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
     x = ufl.SpatialCoordinate(square)
     for _ in range(2):
         variable = ufl.variable(x)
         slope = ufl.diff(ufl.inner(variable, variable), variable)
-        values = kernels.CellExpression(MPI.COMM_SELF, square, slope, 2)()
+        values = jit.CellExpression(MPI.COMM_SELF, square, slope, 2)()
         assert sorted(values.ravel()) == pytest.approx([2 / 3, 2 / 3, 4 / 3, 4 / 3])  # 2 x of two thirds of the square
     assert len(list(tmp_path.glob("*.c"))) == 1
 
@@ -89,10 +87,10 @@ def cubic(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
 
     def compile_in(folder: Path) -> float:
         options = {"cache_dir": folder, "cffi_extra_compile_args": ["-O0"], "timeout": 3}
-        monkeypatch.setattr(kernels, "jit_options", lambda: options)
-        monkeypatch.setattr(kernels, "library_folder", lambda: folder)
+        monkeypatch.setattr(jit, "jit_options", lambda: options)
+        monkeypatch.setattr(jit, "library_folder", lambda: folder)
         square = mesh.create_unit_square(MPI.COMM_SELF, 1, 1)
-        return float(fem.assemble_scalar(kernels.compile_form(ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx)))
+        return float(fem.assemble_scalar(jit.compile_form(ufl.SpatialCoordinate(square)[0] ** 3 * ufl.dx)))
 
     assert compile_in(tmp_path / "whole") == pytest.approx(0.25)
     return tmp_path / "whole", compile_in

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics import kernels, lanes
-from fracsim.mechanics.kernels import jit_options
-from fracsim.mechanics.lanes import ExpressionLanes, MatrixLanes, ScalarLanes, VectorLanes, compiled, in_lanes
-from fracsim.mechanics.tangent import Assembly
-from fracsim.mesh import compiled as compiling
-from fracsim.mesh.dolfinx_calls import evaluate, source_of
+from fracsim.mechanics import jit, simd_kernels
+from fracsim.mechanics.jit import jit_options
+from fracsim.mechanics.matrix_assembly import Assembly
+from fracsim.mechanics.simd_kernels import ExpressionLanes, MatrixLanes, ScalarLanes, VectorLanes, compiled, in_lanes
+from fracsim.mesh import c_library as compiling
+from fracsim.mesh.dolfinx_compat import evaluate, source_of
 from support.scenes import Values, make_scene
 from test_dead_cells import damaged
 
@@ -116,7 +116,7 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
     """The same where the size of a body decides, and crushed cells are counted as before."""
     found = []
     for many in (1, 10**9):
-        monkeypatch.setattr(kernels, "MANY_CELLS", many)
+        monkeypatch.setattr(jit, "MANY_CELLS", many)
         scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.7], "h": 0.2}, fracture={"strength": 1.0})
         u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned)
         u[3] = np.nan
@@ -193,6 +193,6 @@ def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1 and told[0].startswith("fracsim: note: this run takes longer")
     assert "no-such-compiler" in told[0] and told[0].endswith("install a C compiler, or name yours in CC")
-    monkeypatch.setattr(lanes, "SOURCE", None)
+    monkeypatch.setattr(simd_kernels, "SOURCE", None)
     with pytest.raises(AttributeError):
         compiled(balance._work)

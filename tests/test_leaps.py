@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.scene import Scene
-from fracsim.stepping import leaps
+from fracsim.solvers import line_search
 from support.ranks import OnRanks, Results, starting
 from support.scenes import make_scene, positions
 
@@ -28,7 +28,7 @@ def held(scene: Scene, moves: Values, forces: Values) -> Values:
     """(n, d) what is left of moves (n, d), in mean edges, where `forces` (n, d) act."""
     y, r = scene.balance.vector.duplicate(), scene.balance.vector.duplicate()
     y.array_w[:], r.array_w[:] = scene.domain.mean_edge * moves.reshape(-1), forces.reshape(-1)
-    leaps.hold_back(scene.domain, y, r)
+    line_search.hold_back(scene.domain, y, r)
     return np.asarray(y.array_r.reshape(moves.shape) / scene.domain.mean_edge)
 
 

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, command, fracsim_here, study, swept_here, write_study
 from fracsim.errors import InputError
-from fracsim.output.own_files import FILES, NEW
+from fracsim.output.file_ownership import FILES, NEW
 from fracsim.run import Run
 from fracsim.scene import build_scene
 

@@ -10,8 +10,8 @@ import pytest
 from cases import STRIP, changed, fracsim, study
 from fracsim.errors import InputError
 from fracsim.study.check import check_study
-from fracsim.study.file import study_text, validate
-from fracsim.study.materials import MATERIALS
+from fracsim.study.material_library import MATERIALS
+from fracsim.study.reader import study_text, validate
 
 GLASS = MATERIALS["soda-lime glass"]
 

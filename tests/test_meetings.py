@@ -14,7 +14,7 @@ import pyvista
 from mpi4py import MPI
 
 from fracsim.errors import Stopped
-from fracsim.mesh.overlap import overlap
+from fracsim.mesh.interpenetration import overlap
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
@@ -191,7 +191,7 @@ def test_one_piece_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def never(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("fracsim.mesh.overlap.overlap", never)
+    monkeypatch.setattr("fracsim.mesh.interpenetration.overlap", never)
     one = begun(STRIP, tmp_path)
     assert one.watched.passing is not None
     one()

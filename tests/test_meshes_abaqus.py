@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fracsim.meshes import MeshData, MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.contents import Contents
+from fracsim.meshes.mesh_conversion import Contents
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.topology import signed_measures
 

@@ -13,7 +13,7 @@ import pytest
 
 from fracsim.meshes import MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.contents import Block, Contents
+from fracsim.meshes.mesh_conversion import Block, Contents
 from fracsim.meshes.read import read_mesh
 from fracsim.meshes.topology import signed_measures
 

@@ -19,7 +19,7 @@ from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.read import read_contents
 from fracsim.meshes.surfaces.closed import closed_surface, read_surface
 from fracsim.meshes.surfaces.fill import expected_cells, fill_closed, fill_surface
-from fracsim.meshes.timed import within
+from fracsim.meshes.time_limit import within
 from fracsim.meshes.topology import boundary_facets, signed_measures
 
 Shell = tuple[Points, Indices]

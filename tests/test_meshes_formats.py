@@ -27,7 +27,7 @@ from fracsim.meshes.check import check_mesh
 from fracsim.meshes.msh2 import KINDS
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.surfaces.closed import read_surface
-from fracsim.meshes.timed import read_within
+from fracsim.meshes.time_limit import read_within
 
 FILES = Path(__file__).parent / "meshes"
 BAR = 0.1 * 0.02 * 0.02

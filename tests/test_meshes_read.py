@@ -11,8 +11,8 @@ import pytest
 
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
+from fracsim.meshes.random_points.outline_file import fill_outline, read_outline
 from fracsim.meshes.read import read_mesh
-from fracsim.meshes.scattered.drawn import fill_outline, read_outline
 from fracsim.meshes.write import write_mesh
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mesh.split.build import split
-from fracsim.mesh.split.moments import Moments, moments
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.polyhedron_moments import Moments, moments
 from fracsim.meshes.topology import signed_measures
 from support.solids import cloud, lattice, patterns, separated, torn
 

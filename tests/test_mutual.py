@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mechanics.contact.barrier import Barrier
-from fracsim.mechanics.contact.free_obstacles import FreeObstacles
-from fracsim.mechanics.contact.obstacle import Obstacle
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.push import between_two
-from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Shape, Sphere
-from fracsim.mechanics.contact.stop import Stop
+from fracsim.contact.barrier import Barrier
+from fracsim.contact.obstacle import Obstacle
+from fracsim.contact.obstacle_pairs import Stop
+from fracsim.contact.pose import Pose
+from fracsim.contact.rigid_body import between_two
+from fracsim.contact.rigid_obstacle_term import FreeObstacles
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]

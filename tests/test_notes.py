@@ -15,13 +15,13 @@ from mpi4py import MPI
 from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError
 from fracsim.scene import build_scene
-from fracsim.study.at_start import least_coordinates
 from fracsim.study.check import check_study, checked_mesh
-from fracsim.study.file import load_study, validate
-from fracsim.study.materials import MATERIALS
+from fracsim.study.material_library import MATERIALS
 from fracsim.study.mesh_source import build_mesh
-from fracsim.study.steps import QUADRATIC, explicit_step
-from fracsim.study.units import questions
+from fracsim.study.overlap_checks import least_coordinates
+from fracsim.study.reader import load_study, validate
+from fracsim.study.step_checks import QUADRATIC, explicit_step
+from fracsim.study.unit_checks import questions
 
 HELD = [{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}]
 
@@ -204,7 +204,7 @@ def test_the_step_that_check_tells_is_the_one_that_is_taken(base: dict[str, Any]
 
 
 def test_quadratic_cells_have_the_bound_of_the_stepper() -> None:
-    from fracsim.stepping.frequencies import gain
+    from fracsim.timestepping.stable_time_step import gain
 
     assert {dim: gain(dim) for dim in (2, 3)} == pytest.approx(QUADRATIC, rel=1e-3)
 

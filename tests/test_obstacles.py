@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
+from fracsim.contact.obstacle_term import Obstacles
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.obstacles import Obstacles
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.split.local import Following, LocalSurface
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.split_surface.local_surface import Following, LocalSurface
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from support.resumed import assert_alike, going_stopped_resumed

@@ -11,14 +11,13 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
-from fracsim.mechanics.contact.drawing import Drawing
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Plane, Sphere
+from fracsim.contact.drawing import Drawing
+from fracsim.contact.pose import Placed, Pose
+from fracsim.contact.shapes import Plane, Sphere
 from fracsim.output.surface.collection import read_entries
-from fracsim.report.pictures.look import Look
-from fracsim.report.pictures.obstacles import COLOUR
+from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import render
+from fracsim.report.pictures.picture_options import Look
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study

@@ -15,13 +15,13 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 
 import xdmf_reader
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.split.local import LocalSurface
-from fracsim.output.breaks import Breaks
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.split_surface.local_surface import LocalSurface
+from fracsim.output.fracture_log import Breaks
 from fracsim.run import run_study
-from fracsim.stepping.frequencies import cell_frequencies
 from fracsim.studies.evidence.precision.manufactured import errors, solved
 from fracsim.study.check import check_study
+from fracsim.timestepping.stable_time_step import cell_frequencies
 from support.scenes import make_scene, make_study, march
 
 Values = npt.NDArray[np.float64]

@@ -22,12 +22,12 @@ from mpi4py import MPI
 import xdmf_reader
 from cases import BAR, STRIP, command, study, write_study
 from fracsim.output.surface.vtu import write_vtu
-from fracsim.report.pictures.colouring import select
-from fracsim.report.pictures.shots import Shot, find_frames, load
+from fracsim.report.pictures.colour_maps import select
+from fracsim.report.pictures.frames import Shot, find_frames, load
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
-from fracsim.study.file import load_study
+from fracsim.study.reader import load_study
 from support import vtu
 from support.strained import strained, stress
 
@@ -335,7 +335,7 @@ def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
 
 def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
     """Not on which other pieces there are, so that it stays from frame to frame; the palette of 20 starts again."""
-    from fracsim.report.pictures.colouring import colours
+    from fracsim.report.pictures.colour_maps import colours
 
     ten, zero, twenty = colours(np.array([10.0, 0.0, 20.0]), None, "#000000").tolist()
     assert zero == twenty != ten == colours(np.array([10.0]), None, "#000000")[0].tolist()

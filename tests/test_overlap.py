@@ -6,10 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mechanics.contact.overlap import depth
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Box, Plane, Shape, Sphere
+from fracsim.contact.initial_overlap import depth
+from fracsim.contact.pose import Placed, Pose
+from fracsim.contact.shapes import Box, Plane, Shape, Sphere
 from support.shapes import ALL, BODIES
 
 Values = npt.NDArray[np.float64]

@@ -7,14 +7,14 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial import Delaunay
 
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
 from fracsim.meshes.builders.cylinder import Cylinder, Disk
 from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
-from fracsim.mechanics.contact.pairs import VERTICES, Pairs
-from fracsim.mechanics.contact.recede import receded
+from fracsim.contact.crack_wall_offset import receded
+from fracsim.contact.ipc_pairs import VERTICES, Pairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from fracsim.scene import Scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.scenes import make_scene, make_study, march
 
 MESH = {"builder": "box", "size": [1.0, 0.5], "h": 0.125, "pattern": "unstructured"}

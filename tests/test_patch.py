@@ -17,7 +17,7 @@ from fracsim.forms.energies import ENERGIES
 from fracsim.meshes.topology import boundary_facets
 from fracsim.output.fields import Frames
 from fracsim.scene import Scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.laws import law_of
 from support.scenes import Values, at_nodes, each_step, make_scene, march, mesh_of, positions
 

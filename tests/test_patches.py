@@ -7,10 +7,9 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.blows import _radius
 from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.patches import patches
-from fracsim.rigid.point_loads import point_loads
+from fracsim.rigid.impact_detection import _radius
+from fracsim.rigid.surface_loads import patches, point_loads
 from support.rigid import stiffness_of
 from support.solids import lattice
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cases import STRIP, changed, fracsim, write_study
-from fracsim.mechanics.tethers import Ties
+from fracsim.mechanics.node_ties import Ties
 from support.reference import gradients
 from test_cycle import dense
 from test_joining import tied

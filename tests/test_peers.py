@@ -16,7 +16,7 @@ from fracsim.scene import build_scene
 from fracsim.studies.evidence import peers
 from fracsim.studies.evidence.peers import akantu, akantu_static, linear_step, phase_field, start_up
 from fracsim.studies.evidence.precision import brazilian, common, statics
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 without = pytest.mark.skipif(akantu.interpreter() is None, reason=akantu.ABSENT)
 

@@ -13,17 +13,17 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.errors import InputError
-from fracsim.mechanics.drawn import Drawn
+from fracsim.mechanics.surface_data import Drawn
 from fracsim.output.fields_file import Field
-from fracsim.output.surface.files import SurfaceFiles
-from fracsim.output.surface.frame import Surface
-from fracsim.report.pictures.lettering import in_seconds, in_words, lettered, nice
-from fracsim.report.pictures.look import SIZE, Look, limits_of, size_of
-from fracsim.report.pictures.obstacles import COLOUR
+from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.vtk_files import SurfaceFiles
+from fracsim.report.pictures.annotations import in_seconds, in_words, lettered, nice
+from fracsim.report.pictures.material_looks import SKINS
+from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import GAP, render, tiled
-from fracsim.report.pictures.rims import opening
-from fracsim.report.pictures.skins import SKINS
-from fracsim.study.running import LOOKS
+from fracsim.report.pictures.picture_options import SIZE, Look, limits_of, size_of
+from fracsim.report.pictures.renderer import opening
+from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 
 Pixels = npt.NDArray[np.int64]

@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.mesh.small_matrices import barycentric_gradients
-from fracsim.mesh.split.build import split
-from fracsim.rigid.stepper import RigidState, RigidStepper
-from fracsim.scene.rigid import build_rigid_scene
-from fracsim.study.file import load_study
+from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
+from fracsim.scene.rigid_scene import build_rigid_scene
+from fracsim.study.reader import load_study
 from support.falling import DOWN, stepper_of
 from support.solids import copies
 from test_struck_bodies import bar

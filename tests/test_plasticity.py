@@ -12,14 +12,13 @@ from scipy.optimize import brentq
 
 from fracsim.forms.energies import ENERGIES
 from fracsim.forms.schemes import SCHEMES
-from fracsim.mechanics.flow_prediction import Implicit
-from fracsim.mechanics.plasticity import WEAKEST
+from fracsim.mechanics.plasticity import WEAKEST, Implicit
 from fracsim.mechanics.return_mapping import CLOSE
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.output.fields import Frames
 from fracsim.scene import Scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.laws import law_of, rotation
 from support.oscillator import slopes
 from support.scenes import Values, deform, each_step, make_scene, march

@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.plate import Plates
+from fracsim.rigid.shell_triangles import Plates
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

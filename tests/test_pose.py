@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fracsim.mechanics.contact.placed import Placed, second_order_turn
-from fracsim.mechanics.contact.pose import Pose, turning
-from fracsim.mechanics.contact.shapes import Shape
+from fracsim.contact.pose import Placed, Pose, second_order_turn, turning
+from fracsim.contact.shapes import Shape
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
 

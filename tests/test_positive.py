@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.positive import made_positive
-from fracsim.stepping import newton
+from fracsim.mechanics.psd_projection import made_positive
+from fracsim.solvers import newton
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
 

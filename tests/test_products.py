@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.inertia import InBlocks
-from fracsim.mechanics.tangent import Assembly
+from fracsim.mechanics.matrix_assembly import Assembly
 from test_dead_cells import damaged
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.mesh.places import Group
+from fracsim.mesh.selectors import Group
 from fracsim.scene import Scene
-from fracsim.stepping.stepper import StepReport
+from fracsim.timestepping.stepper import StepReport
 from support.scenes import DIRECT, Walk, each_step, make_scene, march
 
 PLATE: dict[str, Any] = {

@@ -11,16 +11,14 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
+from fracsim.contact.mesh_obstacles import Facings, Standing
+from fracsim.contact.mesh_rigid_body import FreeSolid
+from fracsim.contact.mesh_rigid_term import FreeSolids
+from fracsim.contact.pose import Pose
+from fracsim.contact.rigid_body import of_points
+from fracsim.contact.shapes import Box
+from fracsim.contact.triangle_mesh_shape import Solid, depth, distances, is_inside, refined
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.box import Box
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.push import of_points
-from fracsim.mechanics.contact.solids.facing import Facings, Standing
-from fracsim.mechanics.contact.solids.free import FreeSolid
-from fracsim.mechanics.contact.solids.free_term import FreeSolids
-from fracsim.mechanics.contact.solids.inside import depth, distances, is_inside
-from fracsim.mechanics.contact.solids.refined import refined
-from fracsim.mechanics.contact.solids.solid import Solid
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study

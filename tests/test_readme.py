@@ -17,14 +17,14 @@ from pydantic import BaseModel
 
 from cases import fracsim
 from fracsim.output.fields_file import read_times
-from fracsim.report.pictures.shots import Shot, load
+from fracsim.report.pictures.frames import Shot, load
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import gallery
 from fracsim.study import Study, TimeTable
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study, validate
 from fracsim.study.mesh_source import BESIDE, NEEDED
+from fracsim.study.reader import load_study, validate
 from support.demo import readme_damage, run_demo
 
 ROOT = Path(__file__).parent.parent

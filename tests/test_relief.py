@@ -7,11 +7,11 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fracsim.fracture.brittle.principal import tensors
+from fracsim.fracture.brittle.principal_stress import tensors
 from fracsim.mesh.domain import Domain
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.free_body import FreeBody
-from fracsim.rigid.pinned import pinned, pins
+from fracsim.rigid.free_body_analysis import FreeBody
+from fracsim.rigid.pinned_analysis import pinned, pins
 from support.rigid import DENSITY, section_mean, stiffness_of, whole_body
 from support.scenes import make_scene, march
 from support.solids import lattice

@@ -7,8 +7,8 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-import fracsim.stepping.petsc_options  # noqa: F401
-from fracsim.stepping.rigid_modes import rigid_modes
+import fracsim.solvers.petsc_options  # noqa: F401
+from fracsim.solvers.rigid_body_modes import rigid_modes
 
 SIZE = 1001
 FAR = 4000

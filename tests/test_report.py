@@ -17,7 +17,7 @@ import pytest
 from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, swept_here, write_study
 from fracsim.errors import FalseClaim, InputError
 from fracsim.report.content import Claim, Picture, Plot, Section, Series, Table, from_data, to_data
-from fracsim.report.make import make_report
+from fracsim.report.html_report import make_report
 from fracsim.report.page import write_page
 from fracsim.report.runs import find_runs, flattened
 
@@ -238,7 +238,7 @@ def test_evidence_is_shown_without_importing_a_study(tmp_path: Path) -> None:
 import sys
 from pathlib import Path
 from fracsim.errors import FalseClaim
-from fracsim.report.make import make_report
+from fracsim.report.html_report import make_report
 try:
     make_report([Path({str(tmp_path)!r})], references=[])
 except FalseClaim:

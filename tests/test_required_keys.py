@@ -16,8 +16,8 @@ from fracsim.meshes import BUILDERS
 from fracsim.study import Study, Table
 from fracsim.study.body import Mesh
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
-from fracsim.study.moving import Body
+from fracsim.study.reader import validate
+from fracsim.study.rigid_bodies import Body
 from fracsim.study.values import TimeTable
 
 Data = dict[str, Any]

@@ -26,11 +26,11 @@ from mpi4py import MPI
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.output.fields import Frames
-from fracsim.output.same_study import differences
+from fracsim.output.run_folder import differences
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
-from fracsim.study.file import completed, study_text
 from fracsim.study.mesh_source import build_mesh, save_mesh
+from fracsim.study.reader import completed, study_text
 
 Data = dict[str, Any]
 Values = npt.NDArray[Any]
@@ -371,9 +371,9 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-FRAMES, SURFACE = "output.frame_files", "output.surface.output"
+FRAMES, SURFACE = "output.frame_files", "output.surface.surface_output"
 OPENING = ("run.make_folder", "run.History", f"{FRAMES}.Frames", f"{FRAMES}.FieldsFile", f"{SURFACE}.SurfaceFiles",
-           f"{SURFACE}.Surface", "run.OutputClock", "output.writing.os.replace")  # fmt: skip
+           f"{SURFACE}.Surface", "run.OutputClock", "output.atomic_write.os.replace")  # fmt: skip
 
 
 def contents(folder: Path) -> frozenset[tuple[Path, bytes]]:

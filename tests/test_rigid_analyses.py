@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from fracsim.rigid.analyses import serve
-from fracsim.rigid.waiting import LENT
+from fracsim.rigid.parallel_analyses import serve
+from fracsim.rigid.worker_ranks import LENT
 
 
 class Script:
@@ -49,7 +49,7 @@ def test_a_rank_that_cannot_make_its_mesh_tells(monkeypatch: pytest.MonkeyPatch,
 
     said = [Message, Message, None] if begin else []
     comm: Any = Script(begin, *said)
-    monkeypatch.setattr("fracsim.rigid.analyses.gather", lambda comm, value: comm.gather(value))
+    monkeypatch.setattr("fracsim.rigid.parallel_analyses.gather", lambda comm, value: comm.gather(value))
     serve(comm, make)
     assert [str(answer) for answer in comm.answers] == ["no mesh here"] * (2 if begin else 0)
     assert not comm.said

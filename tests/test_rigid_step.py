@@ -9,18 +9,16 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import expm
 
+from fracsim.contact.barrier import Barrier
+from fracsim.contact.friction import Friction
+from fracsim.contact.node_contact import grip, touch
+from fracsim.contact.obstacle import FreeObstacle
+from fracsim.contact.offset_shape import Shifted
+from fracsim.contact.pose import Placed, bend, jacobian
+from fracsim.contact.rigid_body import Push, RigidStep, push
+from fracsim.contact.shapes import Sphere
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme
-from fracsim.mechanics.blow import Blow
-from fracsim.mechanics.contact.barrier import Barrier
-from fracsim.mechanics.contact.free_obstacle import FreeObstacle
-from fracsim.mechanics.contact.friction import Friction
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.push import Push, push
-from fracsim.mechanics.contact.rigid_step import RigidStep
-from fracsim.mechanics.contact.shapes import Sphere
-from fracsim.mechanics.contact.shifted import Shifted
-from fracsim.mechanics.contact.touch import grip, touch
-from fracsim.mechanics.contact.turn import bend, jacobian
+from fracsim.mechanics.contact_time_weights import Blow
 
 Values = npt.NDArray[np.float64]
 SCHEMES: list[Scheme] = [BackwardEuler(), Newmark(), GeneralizedAlpha()]

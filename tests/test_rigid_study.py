@@ -17,16 +17,16 @@ from mpi4py import MPI
 
 from cases import fracsim_here
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
-from fracsim.fracture.brittle.rules import SurfaceRules
-from fracsim.mesh.topology import MeshTopology
-from fracsim.rigid.analyses import Analyses, Strike, opened_by
-from fracsim.rigid.copies import Copies
-from fracsim.rigid.placing import Place, Poses
+from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.mesh.input_topology import MeshTopology
+from fracsim.rigid.instance_placement import Place, Poses
+from fracsim.rigid.instances import Copies
+from fracsim.rigid.parallel_analyses import Analyses, Strike, opened_by
 from fracsim.run import run_study
 from fracsim.studies import folder
 from fracsim.study import Study
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study, study_text
+from fracsim.study.reader import load_study, study_text
 from support.rigid import breakable
 from support.solids import copies, lattice
 from support.vtu import frames
@@ -349,7 +349,7 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one(monkeypatch: pytest
     alone, first, second = (Copies.of(breakable(mesh, 2e4, SurfaceRules(5))) for _ in range(3))
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     comm = OtherRank(second)
-    monkeypatch.setattr("fracsim.rigid.analyses.gather", lambda comm, value: comm.gather(value))
+    monkeypatch.setattr("fracsim.rigid.parallel_analyses.gather", lambda comm, value: comm.gather(value))
     serial, spread = Analyses(alone), Analyses(first, comm, "begin")  # type: ignore[arg-type]
     for size in (1e4, 3e4):
         force = size * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])

@@ -19,18 +19,27 @@ import fracsim.meshes
 ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
 MESHES = Path(fracsim.meshes.__file__).parent
 ARCHITECTURE = Path(__file__).parent.parent / "docs" / "architecture.md"
-LAYERS = ("mesh", "mechanics", "fracture", "stepping", "rigid", "output")  # each may use those before it
+# rooms of a floor do not know one another; they may use the floors before theirs
+FLOORS = ({"mesh"}, {"mechanics"}, {"contact", "fracture", "solvers"}, {"timestepping"}, {"rigid"}, {"output"})
+LAYERS = tuple(room for floor in FLOORS for room in sorted(floor))
+# Newton's method returns the stepper's SolveResult: file -> what it uses of a floor above
+ABOVE = {"solvers/newton.py": {"timestepping.stepper"}, "solvers/nonlinear_solver.py": {"timestepping.stepper"}}
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
-WITHOUT_DOLFINX = {"mesh.bodies", "mesh.names", "mesh.cracks", "mesh.places", "mechanics.time_functions"}
-WITHOUT_DOLFINX |= {"mesh.small_matrices", "mechanics.stable_step", "rigid.placing"}
-CONTACT = "axes ball box corner cylinder moments obstacle outlines overlap placed plane pose shape shapes solids.inside"
-WITHOUT_DOLFINX |= {f"mechanics.contact.{name}" for name in CONTACT.split()}
+WITHOUT_DOLFINX = {
+    "mesh.connected_bodies",
+    "mesh.selectors",
+    "mesh.crack_planes",
+    "mechanics.time_functions",
+}
+WITHOUT_DOLFINX |= {"mesh.small_matrices", "mechanics.stability_limit", "rigid.instance_placement"}
+CONTACT = "initial_overlap obstacle pose shape_base shapes tessellation triangle_mesh_shape"
+WITHOUT_DOLFINX |= {f"contact.{name}" for name in CONTACT.split()}
 # a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {
-    "shots": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},
-    "colouring": {"output.fields_file"},
-    "sweep": {"study.check", "study.file", "output.lock", "output.own_files"},
+    "frames": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},
+    "colour_maps": {"output.fields_file"},
+    "sweep": {"study.check", "study.reader", "output.lock", "output.file_ownership"},
 }
 
 
@@ -54,7 +63,8 @@ def own(room: str) -> dict[str, set[str]]:
     for path in sorted((ROOT / room).rglob("*.py")):
         package = ".".join(["fracsim", *path.relative_to(ROOT).parent.parts])
         names = {name for name in imports(path, package) if name.split(".")[0] == "fracsim"}
-        result[path.relative_to(ROOT).as_posix()] = {name.removeprefix("fracsim").strip(".") for name in names}
+        file = path.relative_to(ROOT).as_posix()
+        result[file] = {name.removeprefix("fracsim").strip(".") for name in names} - ABOVE.get(file, set())
     assert result
     return result
 
@@ -66,7 +76,8 @@ def rooms_of(names: set[str]) -> set[str]:
 
 @pytest.mark.parametrize("room", LAYERS)
 def test_physics_knows_nothing_above_it(room: str) -> None:
-    allowed = BELOW | set(LAYERS[: LAYERS.index(room) + 1])
+    number = next(i for i, floor in enumerate(FLOORS) if room in floor)
+    allowed = BELOW | {room}.union(*FLOORS[:number])
     beyond = {file: rooms_of(names) - allowed for file, names in own(room).items()}
     assert not {file: names for file, names in beyond.items() if names}
 
@@ -104,13 +115,13 @@ def test_the_study_is_for_the_way_in_alone() -> None:
     ways_in = {file for file, names in of_root.items() if "study" in rooms_of(names)}
     rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
-    assert ways_in == {"cli.py", "run.py", "watched.py"}
+    assert ways_in == {"cli.py", "run.py", "monitors.py"}
     assert readers == {"study", "scene", "report"}
 
 
 # --- the drawing of docs/architecture.md ---
 
-RUN = ("run.py", "rigid_run.py", "watched.py")  # the files of the room "run"
+RUN = ("run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
 EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
 
 

@@ -12,8 +12,8 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.model import Rules
-from fracsim.rigid.siblings import Overlaps
+from fracsim.rigid.fragment_overlap import Overlaps
+from fracsim.rigid.mujoco_model import Rules
 from support.falling import CUBE, DOWN, cubes
 
 Values = npt.NDArray[np.float64]
@@ -22,8 +22,8 @@ STEP, SPEED = 0.02, 5.0
 
 def struck(monkeypatch: pytest.MonkeyPatch, farther: float) -> tuple[Bodies, Overlaps]:
     """Two pieces that lie in one another by 0.3 m from birth and fly on together; a third block strikes the one ahead
-    half-way through the step. `farther`: times what was thought, see rigid.course."""
-    monkeypatch.setattr("fracsim.rigid.course.FARTHER", farther)
+    half-way through the step. `farther`: times what was thought, see rigid.swept_bounds."""
+    monkeypatch.setattr("fracsim.rigid.swept_bounds.FARTHER", farther)
     bodies = cubes([[0.0, 0.0, 0.0], [0.7, 0.05, 0.0], [1.8, 0.0, 0.05]])
     velocity: Values = np.array([[SPEED, 0, 0], [SPEED, 0, 0], [-SPEED, 0, 0]])
     engine = Engine(bodies, [[CUBE]] * 3, [], Rules(STEP, 0 * DOWN), Overlaps.new(np.array([[0, 1]])))

@@ -9,10 +9,8 @@ import meshio
 import numpy as np
 import pytest
 
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Sphere
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.ball import Capsule, Sphere
-from fracsim.mechanics.contact.box import Box
-from fracsim.mechanics.contact.cylinder import Cylinder
 from support.scenes import Walk, displacement, make_scene, march
 
 G = 9.81

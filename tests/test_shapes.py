@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
+from fracsim.contact.shapes import SHAPES, Box, Capsule, Cylinder, Plane, Shape, Sphere
 from fracsim.errors import InputError
-from fracsim.mechanics.contact.shapes import SHAPES, Box, Capsule, Cylinder, Plane, Shape, Sphere
 from support.shapes import ALL, BODIES, HOLLOW, differences, enclosed, facing, points, sampled
 
 EPS = np.finfo(float).eps

@@ -10,15 +10,15 @@ import pytest
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.fracture.brittle.rules import SurfaceRules
-from fracsim.mesh.topology import MeshTopology
+from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.mesh.input_topology import MeshTopology
 from fracsim.meshes.builders.ornament import Ornament
-from fracsim.rigid.copies import Copies
-from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.fragment_geometry import Geometry
 from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.model import Rules
-from fracsim.rigid.placing import Place, Poses
-from fracsim.rigid.stepper import RigidState, RigidStepper
+from fracsim.rigid.instance_placement import Place, Poses
+from fracsim.rigid.instances import Copies
+from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
 from support.rigid import DENSITY, breakable
 
 Ints = npt.NDArray[np.int64]

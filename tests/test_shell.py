@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fracsim.errors import InputError
-from fracsim.fracture.brittle.principal import tensors
-from fracsim.fracture.brittle.rules import GrainRules, SurfaceRules
+from fracsim.fracture.brittle.grains import GrainRules, SurfaceRules
+from fracsim.fracture.brittle.principal_stress import tensors
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.shell import read_shell, thickened
 from fracsim.meshes.topology import signed_measures
-from fracsim.rigid.geometry import Geometry
-from fracsim.rigid.hulls import Solid
+from fracsim.rigid.convex_decomposition import Solid
+from fracsim.rigid.fragment_geometry import Geometry
 from fracsim.study.check import check_study
 from support.rigid import DENSITY, breakable, moments_of, shell_of
 from test_plate import pane

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.mesh.split.build import split
-from fracsim.mesh.split.laid import laid
-from fracsim.mesh.split.places import whole
-from fracsim.mesh.split.skeleton import Skeleton
-from fracsim.mesh.split.solid import is_same_solid, split_of_pieces
+from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.fragment_surface import is_same_solid, laid, split_of_pieces
+from fracsim.mesh.split_surface.surface_map import whole
 from fracsim.meshes.topology import signed_measures
 from support.solids import assert_closed, cloud, components, enclosed, lattice, patterns, separated, torn
 

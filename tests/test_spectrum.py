@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.spectrum import Values, deviatoric_power, eigenvalues, times
+from fracsim.mechanics.tensor_functions import Values, deviatoric_power, eigenvalues, times
 from support.laws import rotation
 
 EPS = np.finfo(float).eps

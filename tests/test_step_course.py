@@ -12,9 +12,9 @@ from fracsim.errors import InputError
 from fracsim.mechanics.time_functions import Tabulated
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from fracsim.stepping.stepper import StepSizes
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
+from fracsim.timestepping.stepper import StepSizes
 from support.scenes import make_study
 
 TABLE = {"time": [0.0, 0.1, 0.15, 0.3, 0.301], "value": [0.02, 0.02, 0.05, 0.05, 0.01]}

@@ -10,7 +10,7 @@ import pytest
 
 from fracsim.forms.schemes import BackwardEuler, Newmark
 from fracsim.scene import Scene, make_scheme
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 from support.oscillator import exact, run, slopes
 from support.reference import lumped_mass, modes, stiffness
 from support.scenes import DIRECT, Values, each_step, make_scene, march, positions

@@ -8,8 +8,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix, random_array
 
-from fracsim.mechanics.stiff import DIRECTIONS, DOFS, Stiff, stiff_directions
-from fracsim.stepping.woodbury import Woodbury
+from fracsim.mechanics.low_rank_springs import DIRECTIONS, DOFS, Stiff, stiff_directions
+from fracsim.solvers.low_rank import Woodbury
 
 RANDOM = np.random.default_rng(5)
 

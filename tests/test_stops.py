@@ -9,14 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mechanics.contact.barrier import Barrier
-from fracsim.mechanics.contact.free_obstacles import FreeObstacles
-from fracsim.mechanics.contact.obstacle import Obstacle
-from fracsim.mechanics.contact.overlap import depth
-from fracsim.mechanics.contact.placed import Placed
-from fracsim.mechanics.contact.pose import Pose
-from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
-from fracsim.mechanics.contact.stops import Stops
+from fracsim.contact.barrier import Barrier
+from fracsim.contact.initial_overlap import depth
+from fracsim.contact.obstacle import Obstacle
+from fracsim.contact.obstacle_pairs import Stops
+from fracsim.contact.pose import Placed, Pose
+from fracsim.contact.rigid_obstacle_term import FreeObstacles
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
 from support.scenes import each_step, make_scene
 
 Values = npt.NDArray[np.float64]

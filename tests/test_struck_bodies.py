@@ -10,17 +10,17 @@ import pytest
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mechanics.contact.obstacle import Obstacle
-from fracsim.mechanics.contact.shapes import Sphere
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.contact.obstacle import Obstacle
+from fracsim.contact.shapes import Sphere
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.blows import Blows, Strain, _rows
+from fracsim.rigid.convex_decomposition import Solid, convex_parts
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.fragment_geometry import Geometry
 from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.hulls import Solid, convex_parts
-from fracsim.rigid.model import Rules
-from fracsim.rigid.stepper import RigidState, RigidStepper
+from fracsim.rigid.impact_detection import Blows, Strain, _rows
+from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
 from support.falling import CUBE, DOWN, MASS, G, cubes, floor, stepper_of
 from support.rigid import DENSITY, section_mean
 from support.solids import copies, lattice, patterns, separated

@@ -17,7 +17,7 @@ from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import folder
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study
+from fracsim.study.reader import load_study
 
 STUDIES = sorted(folder().glob("*.toml"))
 # study -> its cell size for a run of a second or so

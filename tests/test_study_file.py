@@ -14,8 +14,8 @@ from cases import BAR, STRIP, changed, study, write_study
 from fracsim.errors import InputError
 from fracsim.studies import folder
 from fracsim.study import Study
-from fracsim.study.file import find_study, load_study, study_text, validate
 from fracsim.study.mesh_source import find_builder
+from fracsim.study.reader import find_study, load_study, study_text, validate
 
 Data = dict[str, Any]
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.mesh.split.build import Split, split
-from fracsim.mesh.split.follow import Rotations
-from fracsim.mesh.split.skeleton import CRACK, Skeleton
-from fracsim.mesh.split.smooth import KEPT, smooth_cuts
+from fracsim.mesh.split_surface.closed_surface import Split, split
+from fracsim.mesh.split_surface.entity_numbering import CRACK, Skeleton
+from fracsim.mesh.split_surface.smooth_cuts import KEPT, smooth_cuts
+from fracsim.mesh.split_surface.surface_motion import Rotations
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import boundary_facets, signed_measures
 from support.solids import (

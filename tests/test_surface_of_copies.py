@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mesh.split.skeleton import Skeleton
-from fracsim.output.surface.copies import SurfaceOfCopies
-from fracsim.output.surface.frame import Surface
-from fracsim.rigid.placing import Place, Poses, placed
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.instance_surface import SurfaceOfCopies
+from fracsim.rigid.instance_placement import Place, Poses, placed
 from support.solids import lattice, patterns, separated
 
 Values = npt.NDArray[np.float64]

@@ -12,12 +12,12 @@ import pytest
 import pyvista
 
 from fracsim.errors import NotConverged
-from fracsim.fracture.record import cut_by_forces
+from fracsim.fracture.edge_history import cut_by_forces
 from fracsim.meshes.data import MeshData
 from fracsim.output.fields_file import Field
-from fracsim.output.surface.files import SurfaceFiles, columns
-from fracsim.output.surface.fragments import PieceNames, fragments
-from fracsim.output.surface.frame import FARTHEST, Frame, Surface
+from fracsim.output.surface.body_surface import FARTHEST, Frame, Surface
+from fracsim.output.surface.fragment_table import PieceNames, fragments
+from fracsim.output.surface.vtk_files import SurfaceFiles, columns
 from support.ranks import OnRanks
 from support.solids import Values, lattice, patterns, separated
 from support.torn import SURFACES

@@ -14,11 +14,11 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError, Stopped
-from fracsim.report.pictures.body import exploded
-from fracsim.report.pictures.colouring import select, shown_range
-from fracsim.report.pictures.look import Look
+from fracsim.report.pictures.colour_maps import select, shown_range
+from fracsim.report.pictures.frame_geometry import exploded
+from fracsim.report.pictures.frames import Shot, find_frames, load
 from fracsim.report.pictures.picture import render
-from fracsim.report.pictures.shots import Shot, find_frames, load
+from fracsim.report.pictures.picture_options import Look
 from fracsim.run import Run
 from fracsim.scene import build_scene
 

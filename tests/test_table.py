@@ -14,7 +14,7 @@ from fracsim.studies.evidence import rows
 from fracsim.studies.table import SCENES, SLOW, overrides, row, words
 from fracsim.study import Study
 from fracsim.study.check import check_study
-from fracsim.study.file import load_study
+from fracsim.study.reader import load_study
 
 
 def expected_cells(study: Study) -> int:

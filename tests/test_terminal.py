@@ -17,7 +17,7 @@ from fracsim.errors import InputError
 from fracsim.meshes import BUILDERS
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 # sets the title of a window, clears the screen, begins a line anew, turns the direction of writing
 EVIL = "a\x1b]0;b\x07\x1b[2J\rc\x9b31md\u202ee\nf"
@@ -65,7 +65,7 @@ import sys
 from unittest import mock
 from fracsim import cli, process
 sys.argv = ["fracsim", "check", "x"]
-with mock.patch("fracsim.study.file.load_study", side_effect=RuntimeError({EVIL!r})):
+with mock.patch("fracsim.study.reader.load_study", side_effect=RuntimeError({EVIL!r})):
     cli.main(process.begin_process)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False, cwd=tmp_path)

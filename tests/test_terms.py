@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import fracsim.scene as scene_module
-from fracsim.mechanics.kernels import CellForm
+from fracsim.mechanics.jit import CellForm
 from fracsim.scene import build_scene
 from support.oscillator import exact
 from support.reference import stiffness

@@ -17,7 +17,7 @@ from fracsim.errors import InputError
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 Data = dict[str, Any]
 Values = npt.NDArray[np.float64]

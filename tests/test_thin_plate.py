@@ -11,14 +11,14 @@ import trimesh
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mesh.split.build import split
+from fracsim.mesh.split_surface.closed_surface import split
 from fracsim.rigid.bodies import Bodies
+from fracsim.rigid.contact_records import Touches
+from fracsim.rigid.contact_solver import HARD
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.model import SLOW
-from fracsim.rigid.newton import HARD
-from fracsim.rigid.stepper import RigidState, RigidStepper
-from fracsim.rigid.touches import Touches
-from fracsim.scene.rigid import RigidScene, build_rigid_scene
+from fracsim.rigid.mujoco_model import SLOW
+from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
+from fracsim.scene.rigid_scene import RigidScene, build_rigid_scene
 from test_rigid_study import study
 
 Values = npt.NDArray[np.float64]
@@ -85,7 +85,7 @@ def depths(stepper: RigidStepper, bodies: Bodies) -> Values:
 def assert_step(before: RigidState, after: RigidState, touches: Touches, speed: float) -> None:
     """No energy is gained; both momenta change by what the anvil gave. Momentum is a sum of some thousand products,
     round-off 1e-16 each; of the angular momentum that is lost which is set back by c_0 dt with what rests
-    (rigid.lifting); contacts give way by a share 1 - HARD of what they take."""
+    (rigid.impact_step); contacts give way by a share 1 - HARD of what they take."""
     one, two, anvil = before.bodies, after.bodies, len(after.bodies)
     points, given = touches.on(anvil)
     size = float(one.mass[-1]) * speed

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from cases import STRIP, changed, write_study
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 from support.ranks import TESTS
 
 THETA = '''

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import block_diag, csr_array
 
-from fracsim.stepping.trust import trusted_step
+from fracsim.solvers.nonlinear_elimination import trusted_step
 
 RANDOM = np.random.default_rng(11)
 

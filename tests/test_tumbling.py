@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.tumbling import PART, driven, orientation, rotated, tumbled
+from fracsim.rigid.bodies import PART, driven, orientation, rotated, tumbled
 
 Values = npt.NDArray[np.float64]
 TOP = np.diag([1.0, 2.0, 3.0])[None]  # kg m^2
@@ -45,7 +45,7 @@ def test_a_top_keeps_its_angular_momentum_to_round_off_and_its_energy() -> None:
 def test_what_turns_by_a_radian_a_step_keeps_its_energy_as_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of second order: as many parts as PART fits in, squared, better than in one, within a tenth."""
     in_parts, parts = kept(4, 6), math.ceil(2 * np.pi / 6 / PART)
-    monkeypatch.setattr("fracsim.rigid.tumbling.PART", np.inf)
+    monkeypatch.setattr("fracsim.rigid.bodies.PART", np.inf)
     assert in_parts * parts**2 == pytest.approx(kept(4, 6), rel=0.1)
 
 

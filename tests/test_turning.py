@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fracsim.study.check import check_study
-from fracsim.study.turning import turned
+from fracsim.study.length_checks import turned
 from support.scenes import make_study
 
 STIFF: dict[str, Any] = {

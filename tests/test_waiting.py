@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.fracture.energy.tips import CrackTips
-from fracsim.fracture.energy.waiting import Waiting
+from fracsim.fracture.energy.release_rate_bound import Waiting
+from fracsim.fracture.energy.tip_criterion import CrackTips
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
 from support.tips import criterion_of, seen

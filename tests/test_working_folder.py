@@ -77,7 +77,7 @@ SCRIPT = """
 import os
 before = os.getcwd()
 from fracsim.scene import build_scene
-from fracsim.study.file import load_study
+from fracsim.study.reader import load_study
 from mpi4py import MPI
 scene = build_scene(MPI.COMM_WORLD, load_study("strip.toml"))
 state, _ = scene.stepper.advance(scene.start())

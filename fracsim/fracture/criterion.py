@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.edges import EdgeGraph
-from ..mesh.ranks import allgather, total
+from ..mesh.edge_graph import EdgeGraph
+from ..mesh.parallel import allgather, total
 from .edge_stress import Simplices, greatest_pull
 from .strength import Strength
 

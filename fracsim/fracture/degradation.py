@@ -4,7 +4,7 @@ docs/theory.md#edge-projected-strain).
 chi     psi_frac = chi psi, chi the share of the edges' stress that intact ones carry (M22 eq. 28), never rising
 edge    psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22 eqs. 21-22, forms.damage)
 
-Where cracks close (`unilateral`) the springs of broken edges are added to either (forms.closing).
+Where cracks close (`unilateral`) the springs of broken edges are added to either (forms.crack_closure).
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms.kinematics import deformation_gradient
-from ..mechanics.kernels import CellExpression
+from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
-from ..mesh.edges import EdgeGraph
+from ..mesh.edge_graph import EdgeGraph
 from .edge_stress import Simplices
 
 Values = npt.NDArray[np.float64]
@@ -145,7 +145,7 @@ class Projection:
 
 
 class ClosingChi(Chi):
-    """chi beside the springs of broken edges (forms.closing)."""
+    """chi beside the springs of broken edges (forms.crack_closure)."""
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         super().__init__(stress, graph)

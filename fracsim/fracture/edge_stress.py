@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.compiled import Float64, Int32, Uint8, address, at, library
+from ..mesh.c_library import Float64, Int32, Uint8, address, at, library
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
@@ -71,7 +71,7 @@ class _Damage(Structure):
 
 
 class Damage(Protocol):
-    """Edges of cells and their damage (mesh.edges)."""
+    """Edges of cells and their damage (mesh.edge_graph)."""
 
     @property
     def cell_edges(self) -> npt.NDArray[np.int32]: ...

@@ -22,10 +22,10 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.compiled import Float64, Int32, address, at, library
+from ..mesh.c_library import Float64, Int32, address, at, library
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
-from ..mesh.ranks import largest
+from ..mesh.parallel import largest
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

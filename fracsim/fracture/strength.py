@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mechanics.material import PerCell
-from ..mesh.edges import EdgeGraph
+from ..mechanics.material_fields import PerCell
+from ..mesh.edge_graph import EdgeGraph
 
 Values = npt.NDArray[np.float64]
 

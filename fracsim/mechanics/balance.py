@@ -1,7 +1,7 @@
 """The balance of forces of a body: a sum of terms, its residual, and what belongs to it at a state.
 
 r(u) = sum of the terms' virtual works  +  M (sum of their accelerations)  +  sum of their nodal forces
-K(u) = d r / d u (mechanics.stiffness)
+K(u) = d r / d u (mechanics.tangent)
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
-from ..mesh.dolfinx_calls import apply_lifting
+from ..mesh.dolfinx_compat import apply_lifting
 from ..mesh.domain import Domain
-from ..mesh.ranks import total
-from .blow import Blow, given
+from ..mesh.parallel import total
+from .contact_time_weights import Blow, given
 from .inertia import Mass
-from .kernels import CellForm, cells_measure
+from .jit import CellForm, cells_measure
+from .matrix_assembly import Assembler
 from .prescribed_motion import PrescribedMotion
-from .stiffness import Stiffness
 from .stress import Stress
+from .tangent import Stiffness
 from .term import Cuts, Form, Level, Term, sum_of_forms
-from .vectors import Assembler
 
 Values = npt.NDArray[np.float64]
 

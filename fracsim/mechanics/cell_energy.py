@@ -12,7 +12,7 @@ import numpy.typing as npt
 import ufl
 
 from ..forms.kinematics import deformation_gradient
-from .kernels import point_expression
+from .jit import point_expression
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]

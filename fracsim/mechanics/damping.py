@@ -13,10 +13,10 @@ from ufl.core.expr import Expr
 
 from ..forms.balance import viscous_work
 from .inertia import Mass
-from .kernels import CellForm, cells_measure
+from .jit import CellForm, cells_measure
+from .matrix_assembly import Assembler
 from .stress import Stress
 from .term import Level, Term
-from .vectors import Assembler
 
 Values = npt.NDArray[np.float64]
 

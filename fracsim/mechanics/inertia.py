@@ -20,14 +20,14 @@ from dolfinx import fem, la
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from ..mesh.dolfinx_calls import assemble_matrix
+from ..mesh.dolfinx_compat import assemble_matrix
 from ..mesh.domain import Domain
-from .kernels import compile_form
+from .jit import compile_form
+from .matrix_assembly import Assembler
 from .term import Level, Term
-from .vectors import Assembler
 
 if TYPE_CHECKING:
-    from .tangent import Assembly
+    from .matrix_assembly import Assembly
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

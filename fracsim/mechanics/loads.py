@@ -12,13 +12,13 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..forms.balance import pressure_work, traction_work
-from ..mesh.dolfinx_calls import exterior_facets
+from ..mesh.dolfinx_compat import exterior_facets
 from ..mesh.domain import Domain, Ints
-from ..mesh.ranks import total
-from .kernels import compile_form
+from ..mesh.parallel import total
+from .jit import compile_form
+from .matrix_assembly import Assembler
 from .term import Level, Term
 from .time_functions import TimeFunction
-from .vectors import Assembler
 
 Values = npt.NDArray[np.float64]
 OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and what acts on them

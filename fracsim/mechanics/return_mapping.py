@@ -25,10 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms.plasticity import Trial
-from .kernels import point_expression
+from .jit import point_expression
 from .plasticity import Plasticity
-from .spectrum import deviatoric_power, eigenvalues, times
 from .stress import Stress
+from .tensor_functions import deviatoric_power, eigenvalues, times
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
@@ -40,7 +40,7 @@ BLOCK = 4096  # cells at a time: their arrays stay in the cache
 
 
 class ReturnMapping:
-    """The flow of a step, once its displacement is known: a part of stepping.after_step.
+    """The flow of a step, once its displacement is known: a part of timestepping.protocols.
 
     Attributes:
         stored: this rank's share of int psi dX after it, J; without damage.

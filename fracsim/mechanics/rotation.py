@@ -7,7 +7,7 @@ from ufl.core.expr import Expr
 
 from ..mesh.domain import Domain
 from ..mesh.small_matrices import polar_rotation
-from .kernels import point_expression, point_field
+from .jit import point_expression, point_field
 
 
 class RotationField:

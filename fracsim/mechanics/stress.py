@@ -2,7 +2,7 @@
 
 energy                    undamaged; times chi in the approach "chi"
 forms.damage              approach "edge"
-forms.closing             either, where cracks close
+forms.crack_closure             either, where cracks close
 forms.plasticity          the elastic part of F, and what flow within a step takes off its stress
 """
 
@@ -24,16 +24,16 @@ from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.simplices import local_edges
-from .few_cells import FewCells
-from .kernels import CellForm, OfLarge, cells_measure, compile_form
-from .material import MaterialFields
+from .cell_subset_assembly import FewCells
+from .jit import CellForm, OfLarge, cells_measure, compile_form
+from .material_fields import MaterialFields
+from .matrix_assembly import Assembler
 from .rotation import RotationField
 from .term import Form, Level, Term
-from .vectors import Assembler
 
 if TYPE_CHECKING:
     from ..forms.plasticity import ImplicitFlow
-    from .lanes import ScalarLanes
+    from .simd_kernels import ScalarLanes
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -111,7 +111,7 @@ class Stress(Term):
             whole = EdgeProjected(cast(Strained, whole), self.integrity, edges, self._floor)
         if not weakening.closes:
             return whole
-        from ..forms.closing import Closing, bends_of
+        from ..forms.crack_closure import Closing, bends_of
 
         share = 1.0 if self.chi is None else 1 - self.chi
         bends = bends_of(self.u, self._place_in_cell(), edges) if self.domain.order == 2 else None
@@ -284,6 +284,6 @@ class Stress(Term):
 
 
 def _sums_in_lanes(form: fem.Form) -> ScalarLanes | None:
-    from .lanes import ScalarLanes
+    from .simd_kernels import ScalarLanes
 
     return ScalarLanes.of(form)

@@ -1,167 +1,288 @@
-"""Assembling the tangent: element matrices are summed in DOLFINx's own sparse matrix and handed to PETSc row by row.
+"""The tangent of a balance of forces, K(u) = d r / d u: when it is assembled, and what is kept beside its matrix.
 
-PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell, takes twice as long as the kernels and
-DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values. Larger
-bodies have several cells assembled at a time (lanes).
-
-It can be summed in blocks of the d dofs of a node instead. Products are made with those where they are (products);
-PETSc's matrix of single entries, which multigrid is set up from, follows where it is asked for.
-
-Where a body falls apart, the entries of its dead cells are zeros that every product with the matrix still reads. They
-are given up from time to time: the matrix shrinks, the unknowns stay.
+What terms give as forms is assembled cell by cell (mechanics.matrix_assembly). What couples nodes of different cells is
+added to that, or kept beside it as products of few vectors or as springs, where it would fill the matrix.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mesh.dolfinx_calls import block_csr, create_matrix, expanded_csr, pattern_of
-from ..mesh.ranks import total
-from .kernels import CellForm, OfLarge
+from ..mesh.parallel import total
+from .inertia import Mass
+from .jit import CellForm, cells_measure
+from .low_rank_springs import Stiff
+from .matrix_assembly import Assembly
+from .prescribed_motion import PrescribedMotion
+from .stress import Stress
+from .term import Term, sum_of_forms
 
 if TYPE_CHECKING:
-    from ctypes import CDLL
+    from scipy.sparse import csr_matrix
 
-    from .inertia import InBlocks
-    from .lanes import MatrixLanes
-    from .products import Products
+    from .bcsr_matvec import Products
+    from .psd_projection import Positive
 
-Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# of an edge: moves within an attempt that leave the body's share of the tangent as it is while pieces touch
+STILL = 0.01
+# of a correction: where contact leaves less of it, the next one, which is the rest of it, is found with the same share
+CUT_SHORT = 0.5
 
 
-class Assembly:
-    """A bilinear form and the matrix that it is assembled into.
+class Stiffness:
+    """K of a balance, rows and columns of prescribed dofs replaced by the identity's.
 
     Attributes:
-        form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
-        blocks: products with what is assembled into blocks, where it is; kept as long.
-        on_diagonal: (owned nodes,) those blocks of owned rows that are on the diagonal, where there are blocks.
-        is_behind: whether the blocks have been assembled since the matrix.
+        form: of what K is the assembly of.    c_v: rate of the scheme that it is assembled with, 1/s.
+        pattern: how often the matrix has become another one, or has got entries at more places, since the start. PETSc
+            does not notice new entries: whatever was made for an earlier pattern has to be made anew by its owner.
+        low_rank: U (owned dofs, k) and C (k, k) of what K lacks yet, - U C U^T, since it was assembled.
+        springs: the rest of what it lacks.
+        couples: whether terms coupled dofs of different cells in the last tangent otherwise than by constants.
     """
 
-    matrix: PETSc.Mat
+    def __init__(
+        self, u: fem.Function, terms: Sequence[Term], stress: Stress, motion: PrescribedMotion, mass: Mass
+    ) -> None:
+        """Compiles what the forms of the terms add up to (collective)."""
+        self.domain, self.c_v = stress.domain, 0.0
+        self._u, self._terms, self._stress, self._motion, self._mass = u, terms, stress, motion, mass
+        self._owned = u.x.index_map.size_local * u.x.block_size
+        self.pattern, self.couples = 0, False
+        self.low_rank: list[tuple[Values, Values]] = []
+        self.springs: list[Stiff] = []
+        self._coupled = False  # whether a coupling has ever been added
+        self._mixed = False  # whether what is no constant has ever been added to the tangent's own entries
+        self._touches = True  # whether the tangent has contact in it
+        self._positive: Positive | None = None
+        self._body_at: tuple[float | None, Values] | None = None  # where K was assembled in this attempt
+        self._went = 1.0  # share of the last correction
+        self._last: tuple[object, list[Values]] | None = None  # what a linear tangent was last assembled with
+        v, w, dx = ufl.TrialFunction(self.domain.space), ufl.TestFunction(self.domain.space), cells_measure(self.domain)
+        self.form = CellForm(sum_of_forms([term.tangent(v, w, dx) for term in terms]))
+        self._assembly = Assembly(self.form)
 
-    def __init__(self, form: CellForm) -> None:
-        self.form = form
-        self.blocks: Products | None = None
-        self.is_behind = False
-        self._dead: Flags | None = None
-        self._make()
-
-    def use_blocks(self, *, dead_too: bool = False) -> Products | None:
-        """Assemble into blocks from here on; products with them, None where there is no compiler. `dead_too`: with room
-        for cells that the form has left out (collective)."""
-        if self.blocks is None:
-            from .products import compiled
-
-            size = self.matrix.getBlockSize()
-            if (code := compiled(self.form.mesh.comm, size)) is None:
-                return None
-            self.matrix.destroy()
-            self._make(code, dead_too)
-        return self.blocks
-
-    def _make(self, by_blocks: CDLL | None = None, dead_too: bool = False) -> None:
-        """Matrices with the pattern of the cells that the form is integrated over (`dead_too`: and of those left out),
-        and a full diagonal; `by_blocks`: what makes products with blocks."""
-        pattern = pattern_of(self.form.whole if dead_too else self.form._cpp_object)
-        owned = self.form.function_spaces[0].dofmap.index_map.size_local
-        pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
-        pattern.finalize()
-        self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._lanes = OfLarge(self._in_lanes)
-        self._sum = expanded_csr(pattern) if by_blocks is None else block_csr(pattern)
-        rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
-        starts = self._sum.indptr[: rows.size_local + 1]
-        self._own = slice(int(starts[-1]))  # entries or blocks of owned rows; those of ghosts come after
-        names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
-        self._starts = starts.astype(PETSc.IntType)
-        self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
-        self._by_blocks = by_blocks
-        if by_blocks is not None:
-            from .products import Products
-
-            self.blocks = Products(self._sum, by_blocks)
-            rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-            self.on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
-
-    def fit(self, dead: Flags, share: float) -> bool:
-        """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
-        room for are alive, and make room for cells that are back; whether the matrix is a new one (collective).
-
-        `dead`: (owned cells,) flags of what is left out now.
-        """
-        had = np.zeros_like(dead) if self._dead is None else self._dead
-        alive, room, back = total(self.form.mesh.comm, np.array([np.sum(~dead), np.sum(~had), np.sum(had & ~dead)]))
-        if not back and (alive == room or alive > share * room):
-            return False
-        self._dead = dead.copy()
-        self.destroy()
-        self._make(self._by_blocks)
-        return True
-
-    def __call__(self, bcs: list[fem.DirichletBC], more: fem.Form | None = None, mass: InBlocks | None = None) -> None:
-        """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's.
-        `mass` is added to blocks, which `bring` makes the matrix of (collective)."""
-        self._sum.data[:] = 0.0
-        for form in (self.form, more) if more is not None else (self.form,):
-            self._add(form, bcs)
-        self._sum.scatter_reverse()
-        if self.blocks is None:
-            self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
-            self.matrix.assemble()
-            return
-        if mass is not None:
-            self._diagonals[mass.blocks] += mass.values
-        self.is_behind = True
-
-    def diagonals_of(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
-        """(blocks of owned rows, d) what a form of the same pattern adds to the diagonal of each; nothing in rows and
-        columns of prescribed dofs. It is summed in the tangent's place, which has to be assembled after it
-        (collective)."""
-        self._sum.data[:] = 0.0
-        fem.assemble_matrix(self._sum, form, bcs, 0.0)  # type: ignore[arg-type]
-        self._sum.scatter_reverse()
-        return self._diagonals.copy()
+    # --- what K is kept in ---
 
     @property
-    def _diagonals(self) -> Values:
-        """The same of the sum, as part of it."""
-        d = self.matrix.getBlockSize()
-        return np.einsum("bii->bi", self._sum.data[: d * d * self._own.stop].reshape(-1, d, d))
+    def matrix(self) -> PETSc.Mat:
+        """That of K, until `shrink` makes another."""
+        return self._assembly.matrix
 
-    def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
-        """Add a form to the sum (collective the first time)."""
-        if (lanes := self._lanes(form)) is None:
-            fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
+    def in_blocks(self) -> Products | None:
+        """Products with the same in blocks of a node's dofs, which are assembled first from here on; None where terms
+        add to single entries, or nothing can be compiled (collective)."""
+        if any(map(adds_entries, self._terms)):
+            return None
+        return self._assembly.use_blocks(dead_too=not self._mass.diagonal)
+
+    def bring_entries(self) -> None:
+        """Bring `matrix` to where its blocks are, with what is beside them (collective)."""
+        if self._coupled and self._assembly.is_behind:
+            self.matrix.zeroEntries()  # those beyond the blocks
+        if self._assembly.bring() and self._touches:
+            for coupling in [term.coupling() for term in self._terms]:
+                if coupling is not None:
+                    self._couple(coupling, constant=True)
+
+    def rows(self, nodes: Ints) -> csr_matrix:
+        """(d n, dofs of all ranks) those of owned nodes (n,), of blocks where there are any (collective)."""
+        if (blocks := self._assembly.blocks) is not None:
+            return blocks.rows(nodes)
+        from scipy.sparse import csr_matrix
+
+        d = self.domain.dim
+        first = d * self.domain.space.dofmap.index_map.local_range[0]
+        at = (first + d * nodes[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
+        which = PETSc.IS().createGeneral(at, comm=self.domain.comm)
+        part = self.matrix.createSubMatrix(which)
+        starts, columns, values = part.getValuesCSR()
+        result = csr_matrix((values, columns, starts), shape=(len(at), self.matrix.getSize()[1]))
+        which.destroy()
+        part.destroy()
+        return result
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether K may lack `low_rank` or `springs`."""
+        return any(term.beside for term in self._terms)
+
+    def damage_changed(self) -> None:
+        """Cells lost stiffness: those without any stress are not integrated from here on (not collective)."""
+        self._leave_out_dead(self.form)
+        if self._positive is not None:
+            self._leave_out_dead(self._positive.form)
+
+    def _leave_out_dead(self, form: CellForm) -> None:
+        if (dead := self._stress.stressless) is not None:
+            form.leave_out(dead)
+
+    def shrink(self, share: float) -> bool:
+        """Give up the tangent's entries of dead cells where at most that share of its cells are alive; whether it is a
+        new matrix (collective)."""
+        dead = self._stress.stressless
+        changed = dead is not None and self._mass.diagonal and self._assembly.fit(dead, share)
+        self.pattern += changed
+        return changed
+
+    # --- a solve ---
+
+    def set_out(self) -> None:
+        """Newton's method sets out on the step, once more where it has failed before."""
+        self._body_at, self._went = None, 1.0
+
+    def went(self, share: float) -> None:
+        """u went that share of a correction."""
+        self._went = share
+
+    @contextmanager
+    def untouched(self) -> Iterator[None]:
+        """That of a body that touches nothing."""
+        self._touches = False
+        try:
+            yield
+        finally:
+            self._touches = True
+
+    def assemble(self, *, small: float | None = None, blocks_alone: bool = False) -> None:
+        """K at the current u; `small`: with moduli made positive to within that share of them; `blocks_alone`: where it
+        has blocks, single entries are left for `bring_entries` (collective).
+
+        A linear one is kept while damage and rates are what they were.
+        """
+        if not (self._linear and self._is_assembled(small)):
+            self._assemble_all(small)
+        if not blocks_alone:
+            self.bring_entries()
+
+    def _assemble_all(self, small: float | None) -> None:
+        served = self._serves(small)
+        if not served:
+            self._assemble_body(small)
+        self.springs, self.couples = [], False
+        if (blocks := self._assembly.blocks) is not None:
+            tied = [term.tied(self._motion.free) for term in self._terms] if self._touches else []
+            blocks.beside = [each for each in tied if each is not None]
+            return
+        for term in self._terms:
+            term.add_stiffness(self.matrix)
+            if self._touches and (coupling := term.coupling()) is not None and not (served and term.linear):
+                self._couple(coupling, constant=term.linear)
+        self.low_rank = [part for term in self._terms for part in term.low_rank()] if self._touches else []
+        for U, _ in self.low_rank:
+            U[self._motion.owned] = 0.0
+
+    # --- the body's share ---
+
+    def _assemble_body(self, small: float | None) -> None:
+        """What K has without terms that add to it."""
+        if self._coupled:
+            self.matrix.zeroEntries()  # those beyond the pattern of the cells, which the next line does not reach
+        more = None if small is None else self._positive_moduli(small)
+        factor = sum(term.mass_factor for term in self._terms)
+        if self._assembly.blocks is not None:
+            mass = self._mass.in_blocks(self._assembly, factor) if factor else None
+            self._assembly(self._motion.bcs, more, mass)
         else:
-            lanes.add(self._sum, bcs)
+            self._assembly(self._motion.bcs, more)
+            if factor:
+                self._mass.add_to(self.matrix, factor, more_entries=self._coupled)
+        self._body_at = (small, self._displacement.copy()) if self._alone else None
 
-    def _in_lanes(self, form: fem.Form) -> MatrixLanes | None:
-        from .lanes import MatrixLanes
+    @property
+    def _displacement(self) -> Values:
+        return np.asarray(self._u.x.array[: self._owned])
 
-        return MatrixLanes.of(form, self._sum)
+    def _serves(self, small: float | None) -> bool:
+        """Whether the last K of this attempt is the body's own, and it has hardly moved since (collective).
 
-    def bring(self) -> bool:
-        """Bring the matrix to where the blocks are, if there are any that it is behind of; whether there were
-        (collective)."""
-        if was_behind := self.is_behind:
-            d = self.matrix.getBlockSize()
-            values = self._sum.data[: d * d * self._own.stop]
-            self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
-            self.matrix.assemble()
-            self.is_behind = False
-        return was_behind
+        While pieces touch most corrections are of a share of the barrier's distance: what bends is the barrier. And
+        while they come into touch, one after another, a correction is found again and again.
+        """
+        if self._body_at is None or self._mixed or not self.couples or self._body_at[0] != small:
+            return False
+        if self._went < CUT_SHORT:
+            return True
+        moved = float(np.abs(self._displacement - self._body_at[1]).max(initial=0.0))
+        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= STILL * self.domain.mean_edge)
+
+    @cached_property
+    def _alone(self) -> bool:
+        """Whether all that terms add to K is beside it, or a coupling, and the body's share follows from u alone."""
+        within = any(type(term).add_stiffness is not Term.add_stiffness for term in self._terms)
+        limited = any(term.limits_steps for term in self._terms)
+        return limited and all([term.potential() is not None for term in self._terms]) and not within
+
+    def _positive_moduli(self, small: float) -> fem.Form:
+        """What makes the moduli positive at the current u."""
+        if self._positive is None:
+            from .psd_projection import Positive
+
+            self._positive = Positive(self._stress)
+            self._leave_out_dead(self._positive.form)
+        self._positive.update(small)
+        return self._positive.form
+
+    @cached_property
+    def _linear(self) -> bool:
+        return all(term.linear for term in self._terms)
+
+    def _is_assembled(self, small: float | None) -> bool:
+        """Whether K is what would be assembled, if it is linear; it is assembled next where not (collective)."""
+        fields = [field.x.array for field in self._stress.fields]
+        rates = self.matrix.handle, small, sum(term.mass_factor for term in self._terms), self.c_v, self._touches
+        was = self._last
+        same = was is not None and was[0] == rates and all(map(np.array_equal, was[1], fields))
+        if not same:
+            self._last = rates, [field.copy() for field in fields]
+        return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
+
+    # --- what couples nodes of different cells ---
+
+    def _couple(self, coupling: PETSc.Mat | Stiff, *, constant: bool) -> None:
+        """K += a matrix of another pattern, but for prescribed dofs; what is Stiff is kept beside it. What is
+        `constant` stays in K while the body's share does (collective)."""
+        self.couples |= not constant
+        if isinstance(coupling, Stiff):
+            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            coupling.directions[self._motion.owned] = 0.0
+            self.springs.append(coupling)
+            return
+        K = self.matrix
+        before = K.getInfo()["nz_used"]
+        part = coupling.copy()
+        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        part.destroy()
+        self._coupled, self._mixed = True, self._mixed or not constant
+        self.pattern += bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+
+    @cached_property
+    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
+        """Global numbers of the prescribed dofs of this rank."""
+        first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
+        return np.asarray(self._motion.owned + first * d, PETSc.IntType)
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's matrices back."""
-        self.matrix.destroy()
-        if self.blocks is not None:
-            self.blocks.destroy()
-            self.blocks, self.is_behind = None, False
+        """Give the memory of PETSc's objects back."""
+        self._assembly.destroy()
+
+
+def adds_entries(term: Term) -> bool:
+    """Whether a term adds to a tangent in blocks what is neither a form nor tied."""
+    kind = type(term)
+    coupling = (Term.coupling,) if kind.tied is Term.tied else ()
+    return any(getattr(kind, each.__name__) is not each for each in (Term.add_stiffness, Term.low_rank, *coupling))

@@ -19,13 +19,13 @@ import ufl
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from .blow import NONE, Blow
-from .drawn import Drawn
-from .stiff import Stiff
+from .contact_time_weights import NONE, Blow
+from .low_rank_springs import Stiff
+from .surface_data import Drawn
 
 if TYPE_CHECKING:
-    from ..mesh.split.places import Places
-    from .tied import Tied
+    from ..mesh.split_surface.surface_map import Places
+    from .tie_matrix import Tied
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -108,7 +108,8 @@ class Term:
     def struck(self) -> Values | None:
         """(owned dofs,) forces of contact at the end of the step that belongs to the current u, N (collective).
 
-        r has them with the weight of a blow, and the acceleration that a scheme carries on is without them (blow).
+        r has them with the weight of a blow, and the acceleration that a scheme carries on is without them
+        (contact_time_weights).
         """
         return None
 

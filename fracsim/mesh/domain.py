@@ -14,16 +14,15 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..meshes.data import MeshData
+from ..meshes.text import format_point
 from ..meshes.topology import distinct_rows, signed_measures
-from ..meshes.words import format_point
-from .dolfinx_calls import KeptCell, coordinate_element, create_mesh, facets_of_nodes
-from .names import check_group
-from .places import Group, InBox, OnPlane, Place
-from .ranks import Gather, GatherSome, bcast, total
+from .dolfinx_compat import KeptCell, coordinate_element, create_mesh, facets_of_nodes
+from .parallel import Gather, GatherSome, bcast, total
+from .selectors import Group, InBox, OnPlane, Place, check_group
 from .simplices import local_edges
 
 if TYPE_CHECKING:
-    from .middles import Middles
+    from .midside_nodes import Middles
 
 Ints = npt.NDArray[np.int32]
 Values = npt.NDArray[np.float64]
@@ -174,7 +173,7 @@ class Domain:
         """`source`, in cells of 6 or 10 nodes where displacement is quadratic (rank 0; None elsewhere)."""
         if self.middles is None or self.source is None:
             return self.source
-        from .middles import with_middles
+        from .midside_nodes import with_middles
 
         return with_middles(self.source, self.middles, written=True)
 
@@ -334,7 +333,7 @@ def _drawn(data: MeshData | None, middles: Middles | None, dim: int) -> tuple[np
     """Cells, points and the coordinate element: of straight cells where none are bent."""
     element, nodes = coordinate_element(dim), dim + 1
     if middles is not None and middles.bent:
-        from .middles import with_middles
+        from .midside_nodes import with_middles
 
         element, nodes = coordinate_element(dim, 2), (dim + 1) * (dim + 2) // 2
         data = data and with_middles(data, middles, written=False)
@@ -344,7 +343,7 @@ def _drawn(data: MeshData | None, middles: Middles | None, dim: int) -> tuple[np
 
 
 def _middles(comm: MPI.Comm, data: MeshData | None) -> Middles:
-    from .middles import middles_of
+    from .midside_nodes import middles_of
 
     return middles_of(comm, data)
 

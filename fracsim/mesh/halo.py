@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .ranks import allgather, exchanged
+from .parallel import allgather, exchanged
 
 Values = npt.NDArray[np.float64]
 

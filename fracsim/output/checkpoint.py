@@ -19,8 +19,9 @@ from mpi4py import MPI
 from ..errors import InputError, NotConverged
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from ..mesh.ranks import Gather, bcast, on_root, total
-from ..stepping.state import State
+from ..mesh.parallel import Gather, bcast, on_root, total
+from ..timestepping.state import State
+from .atomic_write import written
 from .checkpoint_file import (
     LARGEST,
     Notes,
@@ -32,11 +33,10 @@ from .checkpoint_file import (
     require,
     write_arrays,
 )
-from .writing import written
 
 if TYPE_CHECKING:
-    from ..fracture.brittle.surfaces import BrittleSurfaces
-    from ..fracture.record import EdgeRecord
+    from ..fracture.brittle.surface_criterion import BrittleSurfaces
+    from ..fracture.edge_history import EdgeRecord
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")

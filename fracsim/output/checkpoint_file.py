@@ -23,8 +23,8 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import replacing
-from .own_files import CHECKPOINT
-from .writing import ROOM, hdf5_file, hdf5_there
+from .atomic_write import ROOM, hdf5_file, hdf5_there
+from .file_ownership import CHECKPOINT
 
 Arrays = dict[str, npt.NDArray[Any]]
 

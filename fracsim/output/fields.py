@@ -12,14 +12,14 @@ from ufl.core.expr import Expr
 
 from ..forms.energies import Energy, full_cauchy_stress, von_mises
 from ..forms.kinematics import deformation_gradient, embed, green_strain
-from ..mechanics.kernels import CellExpression
+from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
-from ..stepping.state import State
+from ..timestepping.state import State
 from .fields_file import TENSOR, Field
 
 if TYPE_CHECKING:
-    from ..fracture.breaking import Breaking
-    from ..mesh.pieces import Pieces
+    from ..fracture.fracture_pass import Breaking
+    from ..mesh.fragments import Pieces
 
 Values = npt.NDArray[np.generic]
 _ENTRIES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENSOR]

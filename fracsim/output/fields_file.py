@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import data_elsewhere, replacing
-from .writing import ROOM, append, hdf5_file, hdf5_there, replace_text
+from .atomic_write import ROOM, append, hdf5_file, hdf5_there, replace_text
 
 Values = npt.NDArray[np.float64]
 TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # of a symmetric tensor in VTK's order, as ParaView names it

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..mechanics.balance import Balance
-from ..stepping.state import State
-from .breaks import Breaks
+from ..timestepping.state import State
+from .atomic_write import written
 from .fields import Frames
 from .fields_file import Field, FieldsFile
-from .writing import written
+from .fracture_log import Breaks
 
 if TYPE_CHECKING:
-    from ..fracture.breaking import Breaking
-    from .passing import Passing
-    from .surface.output import SurfaceOutput
+    from ..fracture.fracture_pass import Breaking
+    from .interpenetration_check import Passing
+    from .surface.surface_output import SurfaceOutput
 
 
 class FrameFiles:
@@ -84,7 +84,7 @@ def _surface(
     smooth: bool,
 ) -> SurfaceOutput:
     """The split surface: imported, built and kept only where it is wanted."""
-    from .surface.output import SurfaceOutput
+    from .surface.surface_output import SurfaceOutput
 
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(

@@ -19,11 +19,11 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
-from ..mesh.ranks import total
-from ..meshes.words import AXES
-from ..stepping.state import State
-from ..stepping.stepper import StepReport
-from .writing import open_to_append, replace_text, write_all, written
+from ..mesh.parallel import total
+from ..meshes.text import AXES
+from ..timestepping.state import State
+from ..timestepping.stepper import StepReport
+from .atomic_write import open_to_append, replace_text, write_all, written
 
 COLUMNS = (
     "step", "time", "dt", "kinetic", "elastic", "dissipated", "external_work", "broken_edges", "split_cells", "pieces",

@@ -129,7 +129,7 @@ def end_with(launcher: int, *, parent: int) -> None:
 @cache
 def _code() -> CDLL | None:
     """What signals do at once; None where there is no compiler: then a second signal waits for Python, too."""
-    from ..mesh.compiled import library
+    from ..mesh.c_library import library
 
     try:
         return library(_SOURCE)

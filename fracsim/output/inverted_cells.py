@@ -9,10 +9,10 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mechanics.stress import Stress
-from ..mesh.ranks import total
+from ..mesh.parallel import total
 
 if TYPE_CHECKING:
-    from ..fracture.breaking import Breaking
+    from ..fracture.fracture_pass import Breaking
 
 FLAT = 1e-6  # a cell with no more than this share of its volume left is none
 

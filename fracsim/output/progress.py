@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass
 
 from ..errors import STOP_SIGNALS
-from ..mesh.ranks import starts_ranks
+from ..mesh.parallel import starts_ranks
 
 VARIABLE = "FRACSIM_PROGRESS"
 FIRST, PERIOD = 5.0, 60.0  # s until the first line of a log, and from one line to the next

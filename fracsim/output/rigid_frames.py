@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..mechanics.contact.drawing import Drawings
-from ..mechanics.contact.obstacle import Obstacle
-from ..mechanics.contact.placed import Placed
+from ..contact.drawing import Drawings
+from ..contact.obstacle import Obstacle
+from ..contact.pose import Placed
 from ..meshes.data import MeshData
 from ..rigid.bodies import Bodies
-from ..rigid.placing import Poses
-from .surface.copies import SurfaceOfCopies
-from .surface.files import SurfaceFiles
-from .surface.fragments import Fragments
+from ..rigid.instance_placement import Poses
+from .surface.fragment_table import Fragments
+from .surface.instance_surface import SurfaceOfCopies
+from .surface.vtk_files import SurfaceFiles
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

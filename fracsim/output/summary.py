@@ -12,9 +12,9 @@ from typing import Any
 from mpi4py import MPI
 
 from ..errors import one_line
-from ..mesh.ranks import total
-from ..stepping.stepper import Stepper
-from .writing import replace_text, written
+from ..mesh.parallel import total
+from ..timestepping.stepper import Stepper
+from .atomic_write import replace_text, written
 
 
 class Meter:

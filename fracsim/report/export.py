@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.plain_files import replacing_all
-from .pictures.body import is_crack, without_dust
-from .pictures.colouring import rgb
-from .pictures.shots import CLOSE, Shot, film_interval, find_frames, load, study_of
-from .pictures.skins import Skin, skin_of
+from .pictures.colour_maps import rgb
+from .pictures.frame_geometry import is_crack, without_dust
+from .pictures.frames import CLOSE, Shot, film_interval, find_frames, load, study_of
+from .pictures.material_looks import Skin, skin_of
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

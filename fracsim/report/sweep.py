@@ -19,10 +19,10 @@ from typing import Any
 
 from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import create, replacing_all
+from ..output.file_ownership import check_owner, resumable
 from ..output.lock import FolderLock, holder
-from ..output.own_files import check_owner, resumable
 from ..study.check import check_study
-from ..study.file import load_study, study_text
+from ..study.reader import load_study, study_text
 from .exit_status import OUTCOMES, SPEAKER, last_words
 
 LONGEST_NAME = 100

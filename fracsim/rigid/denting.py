@@ -43,7 +43,7 @@ from ..mesh.small_matrices import barycentric_gradients, polar_rotation
 from ..meshes.topology import signed_measures
 
 if TYPE_CHECKING:
-    from .free_body import FreeBody, Stiffness
+    from .free_body_analysis import FreeBody, Stiffness
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

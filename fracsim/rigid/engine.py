@@ -1,10 +1,11 @@
 """The rigid-body engine: MuJoCo finds contacts and their forces, with friction; bodies fly and turn by their momentum.
 
-    v' = v + dt g + J / m,   x' = x + s dt (v + s dt g / 2) + (1 - s) dt v',   l' = l + r x J,   turns: rigid.tumbling
+    v' = v + dt g + J / m,   x' = x + s dt (v + s dt g / 2) + (1 - s) dt v',   l' = l + r x J,   turns: rigid.bodies
 
-with impulses J (rigid.pushing) for the law of rigid.meeting, where bodies are after the share s of the step that they
-fly for before they are struck (rigid.striking); some steps are taken apart (rigid.events). MuJoCo's own contacts are
-springs and dashpots that let things in, and its own way of turning bodies loses angular momentum: neither is used.
+with impulses J (rigid.contact_solver) for the law of rigid.contact_law, where bodies are after the share s of the step
+that they fly for before they are struck (rigid.impact_step); some steps are taken apart (rigid.impact_sequence).
+MuJoCo's own contacts are springs and dashpots that let things in, and its own way of turning bodies loses angular
+momentum: neither is used.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from .bodies import Bodies
-from .cores import Cores
-from .course import course_of, still
-from .events import Event, Kin
-from .finding import Finder
-from .model import Part, Rules, Stand, model_of
-from .motion import flown
-from .pushing import Pushing
-from .siblings import Overlaps, Parting
-from .striking import Striking
-from .touches import Touches
-from .waiting import Helper
+from .collision_detection import Finder
+from .contact_records import Touches
+from .contact_solver import Pushing
+from .core_contact import Cores
+from .fragment_overlap import Overlaps, Parting
+from .free_flight import flown
+from .impact_sequence import Event, Kin
+from .impact_step import Striking
+from .mujoco_model import Part, Rules, Stand, model_of
+from .swept_bounds import course_of, still
+from .worker_ranks import Helper
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -69,8 +70,8 @@ class Engine:
 
     def advance(self, bodies: Bodies, ways: Values | None = None, kin: Kin | None = None) -> tuple[Bodies, Touches]:
         """The bodies a step later, and what touched; `ways`: (stands, 3) where the reference points of what stands are
-        at the end of the step, m (None: where they were); `kin`: of what may break, see rigid.events (None: nothing
-        does).
+        at the end of the step, m (None: where they were); `kin`: of what may break, see rigid.impact_sequence (None:
+        nothing does).
 
         What is struck goes farther than it would have, and what it meets there is looked for in rounds."""
         model, rules = self._model, self._rules

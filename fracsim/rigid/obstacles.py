@@ -13,16 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..mechanics.contact.obstacle import Obstacle
-from ..mechanics.contact.placed import Placed
-from ..mechanics.contact.pose import Pose
+from ..contact.obstacle import Obstacle
+from ..contact.pose import Placed, Pose
 from .bodies import Bodies
-from .hulls import outermost
-from .model import Part, Stand
-from .primitives import Primitive, primitives
+from .convex_decomposition import outermost
+from .mujoco_model import Part, Stand
+from .obstacle_shapes import Primitive, primitives
 
 if TYPE_CHECKING:
-    from ..mechanics.contact.free_obstacle import FreeObstacle
+    from ..contact.obstacle import FreeObstacle
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -97,7 +96,7 @@ class Others:
         """Names of the readings."""
         if not self.free:
             return []
-        from ..mechanics.contact.flights import columns
+        from ..contact.rigid_obstacle_state import columns
 
         return [name for number in self.free for name in columns(cast("FreeObstacle", self.every[number]))]
 

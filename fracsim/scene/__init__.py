@@ -2,10 +2,10 @@
 
 Here alone a study becomes physics: what lies below this room takes numbers, arrays and functions.
 
-material    the energy, its moduli and the yield law
-terms       what adds to the balance of forces, and the balance
-contact     obstacles, and how they act
-breaking    what flows and what breaks after a step
+material_model     the energy, its moduli and the yield law
+terms              what adds to the balance of forces, and the balance
+contact_terms      obstacles, and how they act
+inelastic_updates  what flows and what breaks after a step
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from mpi4py import MPI  # noqa: E402
 
 from ..forms.schemes import Scheme  # noqa: E402
 from ..mechanics.balance import Balance  # noqa: E402
-from ..mechanics.material import MaterialFields  # noqa: E402
-from ..mechanics.supports import check_supports  # noqa: E402
+from ..mechanics.material_fields import MaterialFields  # noqa: E402
+from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
-from ..mesh.ranks import on_root  # noqa: E402
+from ..mesh.parallel import on_root  # noqa: E402
 from ..output.history import Probe, Probes  # noqa: E402
-from ..stepping.after_step import Breaking, Flow, Unbreakable  # noqa: E402
-from ..stepping.initial import initial_velocity  # noqa: E402
-from ..stepping.solver import Solver  # noqa: E402
-from ..stepping.state import State  # noqa: E402
-from ..stepping.stepper import Stepper, StepSizes  # noqa: E402
-from ..stepping.weakly import free_dropped  # noqa: E402
+from ..solvers.nonlinear_solver import Solver  # noqa: E402
+from ..solvers.weak_callbacks import free_dropped  # noqa: E402
 from ..study import Study, Time  # noqa: E402
 from ..study.check import checked_mesh  # noqa: E402
 from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course  # noqa: E402
-from .breaking import breaking_of, flow_of  # noqa: E402
-from .material import material_of  # noqa: E402
+from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
+from ..timestepping.protocols import Breaking, Flow, Unbreakable  # noqa: E402
+from ..timestepping.state import State  # noqa: E402
+from ..timestepping.stepper import Stepper, StepSizes  # noqa: E402
+from .inelastic_updates import breaking_of, flow_of  # noqa: E402
+from .material_model import material_of  # noqa: E402
 from .terms import TERMS, Parts, balance_of  # noqa: E402
 
 if TYPE_CHECKING:
-    from ..fracture.breaking import Breaking as EdgeBreaking
+    from ..fracture.fracture_pass import Breaking as EdgeBreaking
 
 __all__ = ["TERMS", "Parts", "Scene", "build_scene", "make_scheme", "make_stepper", "material_of", "scene_on"]
 
@@ -131,14 +131,14 @@ def make_stepper(
         timing.longest, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course, frames
     )  # fmt: skip
     if solver is None:
-        from ..stepping.explicit import ExplicitStepper
+        from ..timestepping.explicit import ExplicitStepper
 
         return ExplicitStepper(balance, sizes, flow, breaking)
     if balance.scheme.inertia:
-        from ..stepping.implicit import ImplicitStepper
+        from ..timestepping.implicit import ImplicitStepper
 
         return ImplicitStepper(balance, sizes, flow, breaking, solver)
-    from ..stepping.quasi_static import QuasiStaticStepper
+    from ..timestepping.quasi_static import QuasiStaticStepper
 
     return QuasiStaticStepper(balance, sizes, flow, breaking, solver)
 

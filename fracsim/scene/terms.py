@@ -14,12 +14,12 @@ from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
 from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
 from ..mechanics.loads import DeadLoads, OnFacets, Pressure, area
-from ..mechanics.material import MaterialFields, coefficient
+from ..mechanics.material_fields import MaterialFields, coefficient
+from ..mechanics.matrix_assembly import Assembler
 from ..mechanics.prescribed_motion import PrescribedMotion
 from ..mechanics.stress import RESIDUAL_STIFFNESS, Stress, Weakening
 from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
-from ..mechanics.vectors import Assembler
 from ..mesh.domain import Domain
 from ..study import Study
 from ..study.conditions import Condition, conditions, volume_loads
@@ -90,7 +90,7 @@ def _shared(force: TimeFunction, area: float) -> TimeFunction:
 def _obstacles(parts: Parts) -> Term | None:
     if all(each.shape == "mesh" for each in parts.study.obstacle):
         return None
-    from .contact import explicit_obstacles_of, obstacles_of
+    from .contact_terms import explicit_obstacles_of, obstacles_of
 
     if not parts.scheme.implicit:
         return explicit_obstacles_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
@@ -100,7 +100,7 @@ def _obstacles(parts: Parts) -> Term | None:
 def _solids(parts: Parts) -> Term | None:
     if not any(each.shape == "mesh" for each in parts.study.obstacle):
         return None
-    from .contact import solids_of
+    from .contact_terms import solids_of
 
     return solids_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
@@ -108,7 +108,7 @@ def _solids(parts: Parts) -> Term | None:
 def _contact(parts: Parts) -> Term | None:
     if parts.study.contact is None or not parts.study.contact.itself:
         return None
-    from .contact import explicit_self_contact_of, self_contact_of
+    from .contact_terms import explicit_self_contact_of, self_contact_of
 
     if not parts.scheme.implicit:
         return explicit_self_contact_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
@@ -119,7 +119,7 @@ def _tethers(parts: Parts) -> Term | None:
     fracture = parts.study.fracture
     if fracture is None or fracture.crumbs or fracture.approach != "chi" or parts.domain.order > 1:
         return None
-    from ..mechanics.tethers import Tethers
+    from ..mechanics.node_ties import Tethers
 
     domain = parts.domain
     young = domain.comm.allreduce(float(np.max(parts.stress.material.young, initial=0.0)), op=MPI.MAX)

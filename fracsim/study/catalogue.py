@@ -8,7 +8,7 @@ from ..forms.schemes import SCHEMES
 from ..meshes import BUILDERS
 from ..studies import folder
 from . import Time
-from .materials import MATERIALS
+from .material_library import MATERIALS
 
 ENERGIES = {
     "linear": "Hooke's law; small strains and rotations; plane stress in 2D",

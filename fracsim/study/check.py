@@ -16,23 +16,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.bodies import bodies_of, not_held
-from ..mesh.names import check_group, check_regions
-from ..mesh.places import Group, Place
+from ..mesh.connected_bodies import bodies_of, not_held
+from ..mesh.selectors import Group, Place, check_group, check_regions
 from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import MOST_CELLS as CELLS
+from ..meshes.text import AXES, format_point
 from ..meshes.topology import boundary_facets, edges_of, signed_measures
-from ..meshes.words import AXES, format_point
 from . import Brittle, Contact, Fracture, Obstacle, Study
 from .conditions import conditions, cracks, fibre_direction, initial_motion, obstacles, of_size, place_of, volume_loads
-from .lengths import fits, large_strains
+from .energy_checks import refuse_forks, tearing
+from .length_checks import MUCH, fits, large_strains, turned
+from .load_resultants import MOST_CELLS, loaded, resultants
 from .mesh_source import build_mesh, cells_inside, find_builder, open_solid, open_surface
-from .order import bent, has_round_sides
-from .resultants import MOST_CELLS, loaded, resultants
-from .steps import steps_of
-from .tearing import refuse_forks, tearing
-from .turning import MUCH, turned
-from .units import questions
+from .quadratic_checks import bent, has_round_sides
+from .step_checks import steps_of
+from .unit_checks import questions
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
@@ -87,13 +85,13 @@ def _near(study: Study, anatomy: Anatomy) -> list[str]:
     """Names of obstacles that may overlap the body. InputError where one is no shape, or overlaps another one."""
     if not study.obstacle:
         return []
-    from .at_start import near_obstacles
+    from .overlap_checks import near_obstacles
 
     return near_obstacles(study, np.array(anatomy.lower), np.array(anatomy.upper))
 
 
 def _check_room(study: Study, mesh: MeshData) -> None:
-    from .at_start import check_room
+    from .overlap_checks import check_room
 
     check_room(study, mesh)
 

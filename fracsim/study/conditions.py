@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
-from ..mesh.cracks import Crack, plane, polygon, segment
-from ..mesh.places import Group, InBox, OnPlane, Place
-from ..meshes.words import AXES
+from ..mesh.crack_planes import Crack, plane, polygon, segment
+from ..mesh.selectors import Group, InBox, OnPlane, Place
+from ..meshes.text import AXES
 from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, Time, TimeTable
-from .breaking import Crack as CrackTable
+from .fracture import Crack as CrackTable
 from .mesh_source import check_file
 
 Flags = npt.NDArray[np.bool_]

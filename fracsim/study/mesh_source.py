@@ -19,10 +19,10 @@ from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import SHORTEST, check_extent, is_number
 from ..meshes.plain_files import MISSING, wrong_with
 from . import Mesh
-from .explain import explain, unknown_key
+from .error_messages import explain, unknown_key
 
 if TYPE_CHECKING:
-    from ..meshes.scattered.drawn import Drawn
+    from ..meshes.random_points.outline_file import Drawn
     from ..meshes.surfaces.closed import ClosedSurface
 
 
@@ -134,7 +134,7 @@ def open_outline(mesh: Mesh) -> Drawn | None:
     """The outline of a [mesh] table in metres, not filled; None where it names none. InputError."""
     if mesh.outline is None:
         return None
-    from ..meshes.scattered.drawn import read_outline
+    from ..meshes.random_points.outline_file import read_outline
 
     _check_source(mesh)
     with _told():
@@ -172,7 +172,7 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
         elif surface is not None:
             data = _filled(mesh, surface)
         elif (drawn := open_outline(mesh)) is not None:
-            from ..meshes.scattered.drawn import fill_outline
+            from ..meshes.random_points.outline_file import fill_outline
 
             data = fill_outline(drawn, float(mesh.parameters["h"]), int(mesh.parameters.get("seed", 1)))
         elif mesh.shell is not None:

@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from ..curved_boundaries import Round
 from ..data import MeshData
 from ..gmsh_session import meshed
 from ..parameters import affordable, one_of, positive, require
-from ..rounds import Round
 from ..sizing import Sizing, cells_for
 from ..topology import boundary_facets, facets_except, plane_groups
 from .profile import Profile

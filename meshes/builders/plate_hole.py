@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
 
+from ..curved_boundaries import Round
 from ..parameters import affordable, not_negative, positive, require
-from ..rounds import Round
 from ..sizing import Sizing
 from .profile import CutRectangle, Profile
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..components import components
-from ..contents import Block
 from ..data import Indices, MeshError, Points
+from ..mesh_conversion import Block
 from ..parameters import LONGEST, SHORTEST
+from ..text import middle_of
 from ..topology import Floats, Mask, distinct_rows
-from ..words import middle_of
 from .enclosed import enclosed_volumes, windings
 from .mending import areas, directed_edges, flat_triangles, mended, mended_sheet
 from .polygons import triangles_of_faces

@@ -14,7 +14,7 @@ from ..data import Indices, MeshData, MeshError, Points
 from ..gmsh_session import TRIANGLE, cells_in, fill_volumes, session
 from ..parameters import affordable, positive, require
 from ..sizing import Sizing, cells_for_body
-from ..timed import within
+from ..time_limit import within
 from ..topology import Floats, boundary_facets, distinct_rows, facets_of, signed_measures
 from .closed import ClosedSurface
 from .enclosed import enclosed_volumes

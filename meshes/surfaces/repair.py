@@ -15,9 +15,9 @@ import numpy as np
 
 from ..components import components
 from ..data import Indices, MeshError, Points
-from ..timed import Died, within
+from ..text import middle_of
+from ..time_limit import Died, within
 from ..topology import Mask, distinct_rows
-from ..words import middle_of
 from .closed import (
     ClosedSurface,
     Repairable,

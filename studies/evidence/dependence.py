@@ -108,7 +108,7 @@ def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
 
 def crack_corners(run: Path, time: float | None = None) -> npt.NDArray[np.float64]:
     """(n, 2 or 3, 3) ends or corners of those faces at rest, m; of the last frame, or of that nearest to a time, s."""
-    from fracsim.mesh.split.skeleton import CRACK
+    from fracsim.mesh.split_surface.entity_numbering import CRACK
     from fracsim.output.surface.collection import read_collection
 
     frames = read_collection(run / "surface.pvd")

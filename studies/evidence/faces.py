@@ -70,7 +70,7 @@ def measured(kind: str, n: int) -> dict[str, Any]:
     from ...meshes.write import write_mesh
     from ...run import Run
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
 
     with tempfile.TemporaryDirectory() as folder:
         write_mesh(bodies(kind, n, 0.033 / n), Path(folder, "mesh.msh"))

@@ -118,10 +118,10 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
     """Figures of one case on the ranks of this process (collective); the baseline is for one rank."""
     from mpi4py import MPI
 
-    from ...mesh.ranks import total
+    from ...mesh.parallel import total
     from ...run import Run
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
 
     comm = MPI.COMM_WORLD
     study = validate(scene_study(case), case)
@@ -172,7 +172,7 @@ class VirtualNodes:
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
         from ...scene import make_stepper, material_of, scene_on
-        from ...stepping.after_step import NoFlow, Unbreakable
+        from ...timestepping.protocols import NoFlow, Unbreakable
         from .virtual_nodes import duplicate
 
         began = time.perf_counter()
@@ -227,7 +227,7 @@ def _facet_nodes(domain: Any, facets: Any) -> Any:
 
 def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
     """Seconds per step of the loops, one step of each in turn."""
-    from ...mesh.ranks import total
+    from ...mesh.parallel import total
     from ..bench import timed
 
     loops = {"whole": whole.scene.stepper, "cut": cut.scene.stepper}

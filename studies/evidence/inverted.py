@@ -40,10 +40,10 @@ def main() -> None:
 
 def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
-    from ...mesh.ranks import total
+    from ...mesh.parallel import total
     from ...output.inverted_cells import InvertedCells
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
 
     study = extremes.bare("inside out", extremes.BAR, {"energy": energy}, steps)
     study["damping"] = {"mass": 5.0}

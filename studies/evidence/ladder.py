@@ -38,19 +38,19 @@ DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never str
 EXACT: dict[str, Any] = {"solver": {"snes_type": "newtonls", "ksp_rtol": 1e-5}}
 FLOW: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
 FRACTURE_MODULES = (
-    "fracture.breaking", "fracture.degradation", "fracture.strength", "fracture.edge_stress", "fracture.record",
-    "mesh.edges", "mesh.incidence", "mesh.parting", "mesh.pieces",
+    "fracture.fracture_pass", "fracture.degradation", "fracture.strength", "fracture.edge_stress",
+    "fracture.edge_history", "mesh.edge_graph", "mesh.incidence", "mesh.incremental_fragments", "mesh.fragments",
 )  # fmt: skip
 PLASTIC_MODULES = (
-    "mechanics.plasticity", "mechanics.flow_prediction", "mechanics.return_mapping", "mechanics.spectrum",
+    "mechanics.plasticity", "mechanics.plasticity", "mechanics.return_mapping", "mechanics.tensor_functions",
     "forms.plasticity",
 )  # fmt: skip
-AVERAGE, SURFACE, BRITTLE = "fracture.nonlocal_average", ("mesh.split", "output.surface"), "fracture.brittle"
-CONTACT_MODULES = ("mechanics.contact", "scene.contact", "stepping.condensed", *SURFACE)
+AVERAGE, SURFACE, BRITTLE = "fracture.nonlocal_average", ("mesh.split_surface", "output.surface"), "fracture.brittle"
+CONTACT_MODULES = ("contact", "scene.contact_terms", "solvers.low_rank", *SURFACE)
 BALL: dict[str, Any] = {"name": "ball", "shape": "sphere", "radius": 0.5, "at": [5.0, 0.5, 2.0]}  # far from the bar
 OPTIONAL = (
-    *FRACTURE_MODULES, *CONTACT_MODULES, *PLASTIC_MODULES, AVERAGE, BRITTLE, "forms.damage", "forms.closing",
-    "stepping.edge_frequencies", "report",
+    *FRACTURE_MODULES, *CONTACT_MODULES, *PLASTIC_MODULES, AVERAGE, BRITTLE, "forms.damage", "forms.crack_closure",
+    "timestepping.stable_time_step_damaged", "report",
 )  # fmt: skip
 NEAR_NOTHING = 1.03  # what an obstacle that touches nothing may cost, at 192k tetrahedra
 PARTS = {"faces": faces, "solvers": solvers, "steps": steps}  # by their case: what touches flat, solvers, hard steps
@@ -170,7 +170,7 @@ def started(name: str, n: int, folder: Path) -> Any:
 
     from ...run import Run
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
 
     run = Run(build_scene(MPI.COMM_WORLD, validate(rung_study(name, n), name)), folder)
     if rungs(n)[name].cut:

@@ -100,7 +100,7 @@ def _run(name: str, way: str) -> dict[str, Any]:
 
     from ...run import Run
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
     from .results import history
 
     with tempfile.TemporaryDirectory() as folder:

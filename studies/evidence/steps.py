@@ -140,7 +140,7 @@ def _run(study: Data, name: str, folder: Path) -> Any:
 
     from ...run import Run
     from ...scene import build_scene
-    from ...study.file import validate
+    from ...study.reader import validate
 
     return Run(build_scene(MPI.COMM_WORLD, validate(study, name)), folder)
 

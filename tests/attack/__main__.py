@@ -79,7 +79,7 @@ def _import_all() -> None:
 
     import fracsim.rigid_run
     import fracsim.run
-    import fracsim.scene.rigid
+    import fracsim.scene.rigid_scene
     import fracsim.study.check  # noqa: F401
 
 

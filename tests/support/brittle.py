@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 import pyvista
 
-from fracsim.fracture.brittle.body import Body
-from fracsim.fracture.brittle.level_set import DirectionField
-from fracsim.fracture.brittle.pattern import Load, Opened, Pattern
-from fracsim.fracture.brittle.rules import SurfaceRules
-from fracsim.mesh.split.build import Split, split
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.fracture.brittle.crack_level_set import DirectionField
+from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.surface_cut import Body
+from fracsim.fracture.brittle.surface_pass import Load, Opened, Pattern
+from fracsim.mesh.split_surface.closed_surface import Split, split
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
 from fracsim.meshes.data import MeshData
-from fracsim.output.surface.fragments import volumes
+from fracsim.output.surface.fragment_table import volumes
 from fracsim.scene import Scene
 
 Values = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from fracsim.run import run_study
-from fracsim.study.file import load_study
+from fracsim.study.reader import load_study
 
 README = Path(__file__).parents[2] / "README.md"
 COARSE = ["mesh.h=0.025", "time.step=0.01", "fracture.radius=0.025", "output.interval=0.15", "output.picture=false"]

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from fracsim.output.inverted_cells import InvertedCells
 from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence import extremes
-from fracsim.study.file import validate
+from fracsim.study.reader import validate
 
 from .scenes import Walk
 from .torn import Found

@@ -13,7 +13,8 @@ from petsc4py import PETSc
 
 from cases import BAR, STRIP, study
 from fracsim.scene import build_scene
-from fracsim.stepping import blocks, weakly
+from fracsim.solvers import weak_callbacks
+from fracsim.solvers.multigrid import block_operator
 from support.scenes import Walk
 
 IN_USE = "living objects of PETSc", "communicators", "options", "MiB"
@@ -33,7 +34,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 def build_and_drop(kind: str, count: int, steps: int) -> Iterator[None]:
     """Build a scene, take some steps and drop it, so many times; small bodies are multiplied with in blocks, too."""
-    blocks.SMALL = 0
+    block_operator.SMALL = 0
     tables = dict(KINDS[kind])
     table = study(tables.pop("base"), **tables)
     for _ in range(count):
@@ -82,5 +83,5 @@ if __name__ == "__main__":
     import sys
 
     name, *numbers, often = sys.argv[1:]
-    weakly.OFTEN = int(often) or weakly.OFTEN
+    weak_callbacks.OFTEN = int(often) or weak_callbacks.OFTEN
     print(json.dumps(most_in_use(name, *map(int, numbers))))

@@ -7,8 +7,8 @@ from mpi4py import MPI
 
 from fracsim import cli
 from fracsim.errors import InputError, NotConverged
-from fracsim.mesh import ranks
-from fracsim.stepping import stepper as stepper_module
+from fracsim.mesh import parallel
+from fracsim.timestepping import stepper as stepper_module
 
 FAILURES: dict[str, BaseException] = {
     "input": InputError("only here"),
@@ -19,7 +19,7 @@ FAILURES: dict[str, BaseException] = {
 }
 
 rank, kind, *arguments = sys.argv[1:]
-ranks.PATIENCE = 1.0  # as long as the other rank would need to fail in the same place
+parallel.PATIENCE = 1.0  # as long as the other rank would need to fail in the same place
 calls = 0
 advance = stepper_module.BalanceStepper.advance
 

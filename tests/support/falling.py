@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.fracture.brittle.rules import SurfaceRules
-from fracsim.mechanics.contact.obstacle import Obstacle
-from fracsim.mechanics.contact.shapes import Plane
+from fracsim.contact.obstacle import Obstacle
+from fracsim.contact.shapes import Plane
+from fracsim.fracture.brittle.grains import SurfaceRules
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.copies import Copies
-from fracsim.rigid.geometry import Geometry
+from fracsim.rigid.fragment_geometry import Geometry
 from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.model import Rules, Stand
-from fracsim.rigid.primitives import primitive
-from fracsim.rigid.stepper import RigidStepper
+from fracsim.rigid.instances import Copies
+from fracsim.rigid.mujoco_model import Rules, Stand
+from fracsim.rigid.obstacle_shapes import primitive
+from fracsim.rigid.rigid_stepper import RigidStepper
 from support.rigid import DENSITY, breakable
 
 Values = npt.NDArray[np.float64]

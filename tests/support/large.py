@@ -10,7 +10,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fracsim.mesh.halo import Halo
-from fracsim.mesh.ranks import Gather, GatherSome, allgather, alltoall, bcast, gather
+from fracsim.mesh.parallel import Gather, GatherSome, allgather, alltoall, bcast, gather
 
 END = 1500  # elements
 UNIT = 2**31 // 1024

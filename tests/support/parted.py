@@ -6,7 +6,7 @@ import numpy as np
 from dolfinx.mesh import create_box
 from mpi4py import MPI
 
-from fracsim.mesh.dolfinx_calls import coordinate_element, create_mesh
+from fracsim.mesh.dolfinx_compat import coordinate_element, create_mesh
 
 
 def main(path: str) -> None:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.mesh import parting
-from fracsim.mesh.edges import EdgeGraph
+from fracsim.mesh import incremental_fragments
+from fracsim.mesh.edge_graph import EdgeGraph
 
 from .scenes import make_scene
 
@@ -32,11 +32,11 @@ def broken_bit_by_bit(dim: int, h: float, order: int) -> npt.NDArray[np.int64]:
         fracture={"strength": 1.0},
     )
     graph, rows = scene.fracture.graph, []
-    follow, turn = parting.Parting(graph), _turns(graph)
+    follow, turn = incremental_fragments.Parting(graph), _turns(graph)
     for last in np.arange(0, turn[-1] + AT_ONCE, AT_ONCE):
         graph.break_edges(turn[:-1] <= last)
-        everywhere = patch.object(parting, "find_pieces", wraps=parting.find_pieces)
-        with patch.object(parting, "FAR", NEAR), everywhere as searched:
+        everywhere = patch.object(incremental_fragments, "find_pieces", wraps=incremental_fragments.find_pieces)
+        with patch.object(incremental_fragments, "FAR", NEAR), everywhere as searched:
             pieces = follow.look()
         of_node = graph.domain.gather_nodes(pieces.of_node[: graph.domain.node_count])
         keys = graph.broken_keys()

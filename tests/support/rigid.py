@@ -7,22 +7,22 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from fracsim.fracture.brittle.rules import SurfaceRules
-from fracsim.fracture.brittle.surfaces import BrittleSurfaces
+from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.surface_criterion import BrittleSurfaces
 from fracsim.fracture.neighbour_average import NeighbourAverage
 from fracsim.fracture.strength import Strength
-from fracsim.mechanics.material import material_fields
+from fracsim.mechanics.material_fields import material_fields
+from fracsim.mechanics.matrix_assembly import Assembler
 from fracsim.mechanics.stress import Stress, Weakening
-from fracsim.mechanics.vectors import Assembler
 from fracsim.mesh.domain import Domain, distribute
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.split.build import split
-from fracsim.mesh.split.moments import Moments, moments
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.polyhedron_moments import Moments, moments
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.breakable import Breakable, Operator, Within
-from fracsim.rigid.free_body import FreeBody, Stiffness
-from fracsim.rigid.shell_body import ShellStiffness
+from fracsim.rigid.breakage import Breakable, Operator, Within
+from fracsim.rigid.free_body_analysis import FreeBody, Stiffness
+from fracsim.rigid.shell_analysis import ShellStiffness
 
 Values = npt.NDArray[np.float64]
 DENSITY = 2000.0  # kg/m^3

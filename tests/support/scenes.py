@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 from fracsim.meshes.data import MeshData
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping.state import State
-from fracsim.stepping.stepper import StepReport
 from fracsim.study import Study
+from fracsim.timestepping.state import State
+from fracsim.timestepping.stepper import StepReport
 
 Values = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.mechanics.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
 
 Values = npt.NDArray[np.float64]
 

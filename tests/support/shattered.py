@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fracsim.fracture.record import EdgeRecord
+from fracsim.fracture.edge_history import EdgeRecord
 from fracsim.scene import Scene
 
 from .scenes import make_scene, march

@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from fracsim.mesh.split.build import Split, split
-from fracsim.mesh.split.skeleton import Skeleton
+from fracsim.mesh.split_surface.closed_surface import Split, split
+from fracsim.mesh.split_surface.entity_numbering import Skeleton
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import oriented, signed_measures
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import Indices, MeshData, Points
-from fracsim.meshes.scattered.outline import Outline, delaunay
+from fracsim.meshes.random_points.outline import Outline, delaunay
 from fracsim.meshes.topology import boundary_facets, oriented, plane_groups
 
 KINDS = ("structured", "alternating", "rotated", "unstructured")

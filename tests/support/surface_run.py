@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.fracture.record import EdgeRecord
-from fracsim.mesh.pieces import find_pieces
-from fracsim.output.surface.output import SurfaceOutput
+from fracsim.fracture.edge_history import EdgeRecord
+from fracsim.mesh.fragments import find_pieces
+from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene
-from fracsim.stepping.state import State
+from fracsim.timestepping.state import State
 
 
 class WrittenSurface:

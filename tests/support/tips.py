@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.fracture.energy.seen import Seen
-from fracsim.fracture.energy.tips import CrackTips
+from fracsim.fracture.energy.tip_criterion import CrackTips
+from fracsim.fracture.energy.tip_fields import Seen
 from fracsim.scene import Scene
 
 Values = npt.NDArray[np.float64]

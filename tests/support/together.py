@@ -7,8 +7,8 @@ from threading import Lock
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.mechanics.kernels import compile_together
-from fracsim.mesh.ranks import from_root, on_root
+from fracsim.mechanics.jit import compile_together
+from fracsim.mesh.parallel import from_root, on_root
 
 comm = MPI.COMM_WORLD
 

@@ -13,18 +13,18 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fracsim.fracture import nonlocal_average as average_module
-from fracsim.fracture.holding import Holding
+from fracsim.fracture.node_retention import Holding
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hashed
 from fracsim.mesh.domain import Domain
-from fracsim.mesh.edges import EdgeGraph
-from fracsim.mesh.parts import parts_of_nodes
-from fracsim.mesh.pieces import find_pieces
-from fracsim.mesh.ranks import total
+from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.facet_components import parts_of_nodes
+from fracsim.mesh.fragments import find_pieces
+from fracsim.mesh.parallel import total
 from fracsim.scene import Scene, build_scene
-from fracsim.stepping import blocks
-from fracsim.stepping.loose_parts import loose_parts
-from fracsim.stepping.state import State
+from fracsim.solvers.deflation import loose_parts
+from fracsim.solvers.multigrid import block_operator
+from fracsim.timestepping.state import State
 
 from .failing import Failing
 from .scenes import Values, break_across, each_step, make_scene, make_study
@@ -423,9 +423,9 @@ def by_rows() -> Found:
 
 def in_blocks() -> Found:
     """Edges that the block breaks where its tangent is multiplied with in blocks."""
-    small, blocks.SMALL = blocks.SMALL, 0
+    small, block_operator.SMALL = block_operator.SMALL, 0
     found = run("block") | run("joined")
-    blocks.SMALL = small
+    block_operator.SMALL = small
     return {f"{key}-in-blocks": found[key] for key in ("block-broken", "block-u", "joined-broken", "joined-u")}
 
 

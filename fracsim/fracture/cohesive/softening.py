@@ -21,14 +21,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ...mechanics.material import MaterialFields, PerCell
+from ...mechanics.material_fields import MaterialFields, PerCell
 from ...mechanics.stress import Stress
-from ...mesh.edges import EdgeGraph
+from ...mesh.edge_graph import EdgeGraph
 from ...mesh.simplices import node_groups
 from ...mesh.small_matrices import barycentric_gradients
-from ..brittle.principal import largest, tensors
+from ..brittle.principal_stress import largest, tensors
 from ..degradation import Lost
-from ..energy.front import Front
+from ..energy.crack_front import Front
 from ..strength import Strength
 
 Ints = npt.NDArray[np.int64]

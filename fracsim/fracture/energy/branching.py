@@ -3,7 +3,7 @@
     g = G a,   a = sum_k q(x_k) t_k      of tips x_k in the disc, along t_k, that take up G each
 
 A disc with several tips advances them all, so that its force is over all of them, as that in space is over the crack
-that an advance makes (front). Each of two short branches releases 0.52 of what the one crack does straight on.
+that an advance makes (crack_front). Each of two short branches releases 0.52 of what the one crack does straight on.
 
 The force of a disc in which there is another tip is neither's, and does not say which is to go. Until branches have
 left each other's discs they keep level, and each goes straight on, at the angle at which short branches open and do not
@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from .around import Pairs
-from .force import plateau
+from .configurational_force import plateau
+from .neighbour_search import Pairs
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]

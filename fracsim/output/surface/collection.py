@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...meshes.plain_files import check_readable
-from ..own_files import FRAME
+from ..file_ownership import FRAME
 
 _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
 _TAIL = "  </Collection>\n</VTKFile>\n"

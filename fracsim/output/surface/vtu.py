@@ -12,7 +12,7 @@ from ...meshes.plain_files import create, replacing
 from ..fields_file import EARLIER_TENSOR, TENSOR, from_earlier, padded
 
 if TYPE_CHECKING:
-    from .frame import Frame
+    from .body_surface import Frame
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.integer]

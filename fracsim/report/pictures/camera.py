@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .body import moved, without_dust
-from .look import Look
-from .obstacles import corners_near
-from .shots import Shot, load, planes_of, study_of
+from .frame_geometry import moved, without_dust
+from .frames import Shot, load, planes_of, study_of
+from .obstacle_meshes import corners_near
+from .picture_options import Look
 
 Values = npt.NDArray[np.float64]
 WORTH = 0.005  # of the points: the least piece that the camera looks for

@@ -1,9 +1,16 @@
-"""Pictures, sheets and animations of runs, off-screen: their split surface where there is one, else their mesh."""
+"""Pictures, sheets and animations of runs, off-screen: their split surface where there is one, else their mesh.
+
+A screen for VTK on machines that have none.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +21,39 @@ import numpy.typing as npt
 from ...errors import InputError
 from ...meshes.plain_files import check_replaceable, replacing_all
 from .camera import scope_of, union
-from .colouring import merged
-from .look import Look
-from .screen import display
-from .shots import Shot, find_frames, study_of, times_shown
-from .stage import Stage, range_of
+from .colour_maps import merged
+from .frames import Shot, find_frames, study_of, times_shown
+from .picture_options import Look
+from .renderer import Stage, range_of
 
 Pixels = npt.NDArray[np.uint8]
 FILMS = (".gif", ".mp4")
 FPS = 12
 TILE = 0.5  # of the size of a picture: one of several on a sheet
 GAP = 8  # pixels between pictures of a sheet
+
+
+@contextmanager
+def display() -> Iterator[None]:
+    """The screen there is, or a virtual one that ends with the picture."""
+    xvfb = shutil.which("Xvfb")
+    if os.environ.get("DISPLAY") or xvfb is None:
+        yield
+        return
+    read, write = os.pipe()
+    command = [xvfb, "-displayfd", str(write), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
+    quiet = subprocess.DEVNULL
+    # not in the working folder, where it looks for keyboards
+    server = subprocess.Popen(command, pass_fds=[write], stdout=quiet, stderr=quiet, cwd="/")
+    os.close(write)
+    try:
+        with os.fdopen(read) as pipe:
+            os.environ["DISPLAY"] = f":{pipe.readline().strip()}"
+        yield
+    finally:
+        os.environ.pop("DISPLAY", None)
+        server.terminate()
+        server.wait()
 
 
 def render(

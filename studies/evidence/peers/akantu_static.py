@@ -53,7 +53,7 @@ def main() -> None:
     from mpi4py import MPI
 
     from ....scene import build_scene
-    from ....study.file import validate
+    from ....study.reader import validate
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", choices=CASES, required=True)

@@ -90,7 +90,7 @@ def _started(n: int, way: str, folder: Path) -> Any:
 
     from ....run import Run
     from ....scene import build_scene
-    from ....study.file import validate
+    from ....study.reader import validate
 
     return Run(build_scene(MPI.COMM_WORLD, validate(study(n, way), way)), folder)
 

@@ -116,10 +116,10 @@ def beside(n: int, pull: str) -> dict[str, Any]:
 def _ours(n: int, pull: Pull) -> dict[str, float]:
     from mpi4py import MPI
 
-    from ....fracture.energy.tips import CrackTips
+    from ....fracture.energy.tip_criterion import CrackTips
     from ....run import Run
     from ....scene import build_scene
-    from ....study.file import validate
+    from ....study.reader import validate
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(build_scene(MPI.COMM_WORLD, validate(study(n, pull), "notched plate")), Path(folder, "ours"))

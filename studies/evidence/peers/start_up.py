@@ -74,7 +74,7 @@ def _theirs(folder: Path) -> Callable[[], None]:
     from mpi4py import MPI
 
     from ....scene import build_scene
-    from ....study.file import validate
+    from ....study.reader import validate
 
     python, files = interpreter(), [str(folder / name) for name in ("problem.npz", "result.npz")]
     assert python is not None

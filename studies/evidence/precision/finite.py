@@ -22,7 +22,7 @@ STRETCH = {"neo-hookean": 1.5, "stvk": 1.2}
 SHEAR = {"neo-hookean": 0.5, "stvk": 0.2}
 STEPS = 5
 TOLERANCES = ((1e-2, 1e-2), (1e-3, 1e-3), (1e-4, 1e-3), (1e-4, 1e-5), (1e-6, 1e-5), (1e-8, 1e-6), (1e-10, 1e-8))
-DEFAULT = (1e-6, 1e-5)  # of fracsim.stepping.linear, which a test compares
+DEFAULT = (1e-6, 1e-5)  # of fracsim.solvers.linear_solver, which a test compares
 
 
 def _table(value: list[Any]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from ....forms.energies import first_piola_kirchhoff
 from ....forms.kinematics import deformation_gradient
 from ....mechanics.term import Form, Term
 from ....scene import TERMS, Parts, Scene, build_scene
-from ....study.file import validate
+from ....study.reader import validate
 from .smooth import ENERGIES
 
 Values = npt.NDArray[np.float64]

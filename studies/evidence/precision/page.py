@@ -211,8 +211,8 @@ def cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
 
 def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
-    from ....stepping.linear import DEFAULTS
-    from ....stepping.preconditioner import MULTIGRID
+    from ....solvers.linear_solver import DEFAULTS
+    from ....solvers.preconditioner import MULTIGRID
     from ....study import Plasticity, Time
 
     ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}

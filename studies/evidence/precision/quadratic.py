@@ -28,9 +28,9 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
 
     from ....mechanics.loads import surface_measures
     from ....mesh.domain import distribute
-    from ....mesh.places import Group
+    from ....mesh.selectors import Group
     from ....study.check import checked_mesh
-    from ....study.file import validate
+    from ....study.reader import validate
 
     checked = validate(study | {"mesh": study["mesh"] | {"order": 2}}, "quadratic")
     domain = distribute(MPI.COMM_SELF, checked_mesh(checked), 2)  # for its round sides

@@ -83,8 +83,8 @@ def block_of_slivers() -> Study:
 
 
 def _shown(given: dict[str, Any]) -> dict[str, Any]:
-    """Columns of the table: the defaults of fracsim.stepping.linear where nothing is given."""
-    from ....stepping.linear import DEFAULTS
+    """Columns of the table: the defaults of fracsim.solvers.linear_solver where nothing is given."""
+    from ....solvers.linear_solver import DEFAULTS
 
     keys = ("snes_rtol", "ksp_rtol", "snes_type", "ksp_type")
     plain = {"pc_type": "gamg"} | {key: DEFAULTS[key] for key in keys}

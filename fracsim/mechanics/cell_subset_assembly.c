@@ -1,0 +1,46 @@
+/* A linear form in a few cells (mechanics.cell_subset_assembly): FFCx's kernel, with numbers looked up where fields have them. */
+
+#include <stdint.h>
+#include <string.h>
+
+typedef void (*Kernel)(double *, const double *, const double *, const double *, const int *, const uint8_t *);
+
+/* `size` numbers at each of the `nodes` of a cell: dofs (cells, nodes). */
+typedef struct {
+    int64_t nodes, size;
+    const int32_t *dofs;
+    const double *values;
+} Field;
+
+typedef struct {
+    Kernel kernel;
+    int64_t nodes, size, corners, fields, width; /* the first two of the form's own dofs; width: numbers of all fields */
+    const int32_t *dofs, *points;                /* (cells, nodes), (cells, corners) */
+    const double *x, *constants;                 /* (points, 3) */
+} Form;
+
+static inline double *taken(const Field *field, int64_t cell, double *to)
+{
+    for (int64_t node = 0; node < field->nodes; node++)
+        for (int64_t i = 0; i < field->size; i++)
+            *to++ = field->values[field->size * field->dofs[field->nodes * cell + node] + i];
+    return to;
+}
+
+/* Add what cells (count,) give to b. */
+void add(const Form *form, const Field *fields, int64_t count, const int64_t *cells, double *b)
+{
+    const int64_t rows = form->nodes * form->size;
+    double A[rows], w[form->width + 1], x[3 * form->corners];
+    for (int64_t n = 0; n < count; n++) {
+        double *to = w;
+        for (int64_t i = 0; i < form->fields; i++) to = taken(fields + i, cells[n], to);
+        for (int64_t i = 0; i < form->corners; i++)
+            memcpy(x + 3 * i, form->x + 3 * (int64_t)form->points[form->corners * cells[n] + i], 3 * sizeof(double));
+        memset(A, 0, rows * sizeof(double));
+        form->kernel(A, w, form->constants, x, 0, 0);
+        for (int64_t node = 0; node < form->nodes; node++)
+            for (int64_t i = 0; i < form->size; i++)
+                b[form->size * form->dofs[form->nodes * cells[n] + node] + i] += A[form->size * node + i];
+    }
+}

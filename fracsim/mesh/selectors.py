@@ -1,0 +1,99 @@
+"""Places of a body: a group of facets, a box or a plane, and which points belong to them. No DOLFINx here.
+
+Named groups and regions of a mesh, as a study calls them. No DOLFINx here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+SLACK = 1e-9  # of the body's size: faces that coincide are meant
+
+
+@dataclass(frozen=True)
+class Group:
+    """The nodes of a named group of facets."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f'group "{self.name}"'
+
+
+@dataclass(frozen=True)
+class InBox:
+    """The closed box between two corners (d numbers each, m)."""
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    def __str__(self) -> str:
+        return f"box {list(self.lower)} to {list(self.upper)}"
+
+    def selects(self, points: Values, size: float) -> Flags:
+        """(n,) which of the points (n, d) in m lie in it; `size`: of the body, m."""
+        slack = SLACK * size
+        return np.all((points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack), axis=1)
+
+    def meets(self, lower: Values, upper: Values) -> bool:
+        """Whether it reaches into a bounding box."""
+        slack = SLACK * float(np.linalg.norm(upper - lower))
+        return bool(np.all(self.lower <= upper + slack) and np.all(self.upper >= lower - slack))
+
+
+@dataclass(frozen=True)
+class OnPlane:
+    """A plane through a point (m), and what lies within `within` of it (m; default 1e-6 of the body's size).
+
+    Raises InputError where the normal is zero.
+    """
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+    within: float | None = None
+
+    def __post_init__(self) -> None:
+        if not np.linalg.norm(self.normal) > 0:  # squares of less than 1e-154 are nothing
+            raise InputError(f"normal = {list(self.normal)}: a normal must not be zero")
+
+    def __str__(self) -> str:
+        return f"plane through {list(self.point)} with normal {list(self.normal)}"
+
+    def selects(self, points: Values, size: float) -> Flags:
+        """(n,) which of the points (n, d) in m lie on it; `size`: of the body, m."""
+        normal = np.array(self.normal)
+        distance = np.abs((points - np.array(self.point)) @ normal) / np.linalg.norm(normal)
+        return np.asarray(distance <= (self.within or 1e-6 * size))
+
+    def meets(self, lower: Values, upper: Values) -> bool:
+        """Whether it passes through a bounding box, whose corners may be infinite."""
+        normal = np.array(self.normal)
+        ends = np.sort(normal * (np.array([lower, upper]) - np.array(self.point)), axis=0)
+        slack = (self.within or 0.0) * np.linalg.norm(normal) + SLACK * np.abs(ends[np.isfinite(ends)]).sum()
+        return bool(ends[0].sum() <= slack and ends[1].sum() >= -slack)
+
+
+type Place = Group | InBox | OnPlane
+
+
+def check_group(name: str, known: Iterable[str], key: str) -> None:
+    """InputError where the mesh has no facet group of that name; `key`: where the study has it."""
+    known = sorted(known)
+    if name not in known:
+        raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {", ".join(known) or "none"}')
+
+
+def check_regions(names: Iterable[str], known: Sequence[str]) -> None:
+    """InputError for a [material.NAME] that the mesh does not have."""
+    for name in names:
+        if name not in known:
+            regions = ", ".join(known) or "none"
+            raise InputError(f"material.{name}: the mesh has no region of that name; it has: {regions}")

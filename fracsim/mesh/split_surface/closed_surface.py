@@ -1,0 +1,256 @@
+"""From damage to a closed surface: points, elements, and the nodes that each point follows.
+
+The points of the split surface: nodes that stay, and copies of edge, facet and cell points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from ...meshes.topology import facets_of
+from ..simplices import local_edges
+from .cut_patterns import CELL, EDGE, FACET, Elements, Table, table, table_of_whole_cells
+from .entity_numbering import CRACK, Skeleton
+from .surface_motion import Follow
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+class SurfacePoints:
+    """Points of a state of damage, numbered: nodes first, then copies of edge, facet and cell points.
+
+    Attributes:
+        positions: (n, d) reference coordinates, m.
+        follow: the nodes that each point follows.
+        first: number of the first copy.
+        cell, kind, entity: (copies,) what is copied: of which cell, and of that which edge, facet or the whole.
+        group: (copies, d + 1) nodes of the cell that each follows.
+    """
+
+    def __init__(self, skeleton: Skeleton, damaged: Ints, pattern: Ints, cut: Values | None, table: Table) -> None:
+        """`pattern`: of the damaged cells; `cut`: see build.split."""
+        self._skeleton, self._copies = skeleton, table.copies
+        self._cut = cut if cut is not None and np.isfinite(cut).any() else None
+        nodes = np.arange(len(skeleton.points)) if skeleton.dim == 2 else skeleton.boundary_nodes
+        self._of_node = np.full(len(skeleton.points), -1)
+        self._of_node[nodes] = np.arange(len(nodes))
+        row, owner = self._copies.expand(pattern)
+        self._first = np.searchsorted(owner, np.arange(len(damaged)))  # first copy of each damaged cell
+        number, one = _numbered(self._keys(row, damaged[owner], owner))
+        self._of_copy = np.append(number + len(nodes), -1)  # something to index where there is no copy
+        row, cell = row[one], damaged[owner[one]]
+        self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
+        self.first, self.group = len(nodes), (group := self._copies.group[row])
+        parents = np.concatenate([nodes, skeleton.cells[cell][group]])
+        count = np.concatenate([np.ones(len(nodes), np.int64), group.sum(axis=1)])
+        self.positions: Values = np.concatenate([skeleton.points[nodes], self._places(row, cell)])
+        self.follow = Follow.of(parents, count, self.positions, skeleton.points)
+
+    def of_nodes(self, nodes: Ints) -> Ints:
+        """Points of nodes that have one: those of the boundary, in 2D all."""
+        return self._of_node[nodes]
+
+    def of_corners(self, corners: Ints, place: Ints, cell: Ints) -> Ints:
+        """Points of table.Elements.corners (n, w), each row of the damaged cell `cell` (n,), the place-th of them."""
+        copy = np.minimum(self._first[place][:, None] + np.maximum(corners, 0), len(self._of_copy) - 1)
+        node = self._skeleton.cells[cell[:, None], np.maximum(-1 - corners, 0)]
+        return np.where(corners >= 0, self._of_copy[copy], self._of_node[node])
+
+    def _keys(self, row: Ints, cell: Ints, owner: Ints) -> Ints:
+        """A number for every copy that all its cells agree on: (edge, end), (facet, group), (cell, group)."""
+        skeleton, copies, d = self._skeleton, self._copies, self._skeleton.dim
+        kind, entity, lead = copies.kind[row], copies.entity[row], copies.lead[row]
+        keys = np.empty(len(row), np.int64)
+        at = np.flatnonzero(kind == EDGE)
+        edge = skeleton.cell_edges[cell[at], entity[at]]
+        keys[at] = 2 * edge + (skeleton.cells[cell[at], lead[at]] == skeleton.edges[edge, 1])
+        at = np.flatnonzero(kind == FACET)
+        facet = skeleton.cell_facets[cell[at], entity[at]]
+        group = np.where(copies.group[row[at]], skeleton.cells[cell[at]], len(skeleton.points))
+        rank = np.count_nonzero(skeleton.facets[facet] < group.min(axis=1)[:, None], axis=1)
+        base = 2 * len(skeleton.edges)
+        keys[at] = base + d * facet + rank
+        at = np.flatnonzero(kind == CELL)
+        keys[at] = base + d * len(skeleton.facets) + (d + 1) * owner[at] + lead[at]
+        return keys
+
+    # --- where they are in the reference configuration ---
+
+    def _places(self, row: Ints, cell: Ints) -> Values:
+        skeleton, kind, entity = self._skeleton, self._copies.kind[row], self._copies.entity[row]
+        result = np.empty((len(row), skeleton.dim))
+        at = kind == EDGE
+        result[at] = self._edge_points(skeleton.cell_edges[cell[at], entity[at]])
+        at = kind == FACET
+        if at.any():
+            nodes = skeleton.facets[skeleton.cell_facets[cell[at], entity[at]]]
+            # ascending, so that all copies of a point are at the same place to the last bit
+            edges = np.sort(skeleton.cell_edges[cell[at][:, None], _facet_edges()[entity[at]]], axis=1)
+            result[at] = self._centres(nodes, edges)
+        at = kind == CELL
+        result[at] = self._centres(skeleton.cells[cell[at]], skeleton.cell_edges[cell[at]])
+        return result
+
+    def _edge_points(self, edges: Ints) -> Values:
+        ends = self._skeleton.points[self._skeleton.edges[edges]]
+        share = 0.5 if self._cut is None else np.where(np.isnan(self._cut[edges]), 0.5, self._cut[edges])[:, None]
+        cut: Values = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+        return cut
+
+    def _centres(self, nodes: Ints, edges: Ints) -> Values:
+        """Centroids, or the mean of the cuts with a place where there are two or more: a planar cut stays planar."""
+        centre: Values = self._skeleton.points[nodes].mean(axis=1)
+        if self._cut is not None:
+            placed = ~np.isnan(self._cut[edges])
+            at = np.flatnonzero(placed.sum(axis=1) >= 2)
+            weight = placed[at] / placed[at].sum(axis=1, keepdims=True)
+            cuts = self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, self._skeleton.dim)
+            centre[at] = np.einsum("ne,nei->ni", weight, cuts)
+        return centre
+
+
+@cache
+def _facet_edges() -> Ints:
+    """(4, 3) local edges of each facet of a tetrahedron."""
+    return np.array([np.flatnonzero(np.all(local_edges(3) != facet, axis=1)) for facet in range(4)])
+
+
+def _numbered(keys: Ints) -> tuple[Ints, Ints]:
+    """Number of each key among the distinct ones, ascending; and the first place where each distinct key stands.
+
+    Counting in place of sorting: the keys are dense.
+    """
+    used = np.zeros(int(keys.max(initial=-1)) + 1, bool)
+    used[keys] = True
+    number = np.cumsum(used)[keys] - 1
+    one = np.empty(np.count_nonzero(used), np.int64)
+    one[number[::-1]] = np.arange(len(keys))[::-1]
+    return number, one
+
+
+@dataclass(frozen=True)
+class Split:
+    """The surface of a state of damage, in the reference configuration.
+
+    Attributes:
+        points: (n, d) reference coordinates, m: nodes of the mesh first (3D: of its boundary), then the copies.
+        follow: the nodes that each point follows.
+        elements: (m, d) triangles with normals outwards (3D) or segments with the body to their left (2D): closed.
+        cell: (m,) of the mesh. edge: (m,) whose breaking opened it, -1 on the boundary. origin: (m,) see Skeleton.
+        fill: (k, 3) triangles that cover the body in 2D, none in 3D; fill_cell: (k,).
+        broken: (E,) edges.
+        pieces, piece_of_node: how many, and (N,), numbered by their lowest node.
+    """
+
+    points: Values
+    follow: Follow
+    elements: Ints
+    cell: Ints
+    edge: Ints
+    origin: Ints
+    fill: Ints
+    fill_cell: Ints
+    broken: npt.NDArray[np.bool_]
+    pieces: int
+    piece_of_node: Ints
+
+    @property
+    def piece_of_point(self) -> Ints:
+        """(n,) the parents of a point are all of one piece."""
+        return self.piece_of_node[self.follow.first_parent]
+
+
+def split(
+    skeleton: Skeleton,
+    pattern: npt.NDArray[np.integer],
+    cut: Values | None = None,
+    table: Callable[[int], Table] = table,
+) -> Split:
+    """The surface of damage patterns (C,), as in EdgeGraph.pattern.
+
+    `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle. `table`: what the
+    patterns mean, by dimension.
+    """
+    rows = table if pattern.any() else table_of_whole_cells
+    return _Builder(skeleton, pattern, cut, rows(skeleton.dim))()
+
+
+def points_of(
+    skeleton: Skeleton, pattern: npt.NDArray[np.integer], table: Callable[[int], Table] = table
+) -> SurfacePoints:
+    """The points of the same, cut in the middle."""
+    damaged = np.flatnonzero(pattern)
+    return SurfacePoints(skeleton, damaged, pattern[damaged].astype(np.int64), None, table(skeleton.dim))
+
+
+class _Builder:
+    """Works on the damaged cells only; the boundary facets of all others stay as they are."""
+
+    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], cut: Values | None, table: Table) -> None:
+        self.skeleton, self.table = skeleton, table
+        self.damaged = np.flatnonzero(pattern)
+        self.pattern = pattern[self.damaged].astype(np.int64)
+        self.place = np.full(len(pattern), -1)  # of a cell among the damaged ones
+        self.place[self.damaged] = np.arange(len(self.damaged))
+        self.broken = skeleton.broken_edges(pattern)
+        self.points = SurfacePoints(skeleton, self.damaged, self.pattern, cut, table)
+
+    def __call__(self) -> Split:
+        parts = self._whole_facets(), self._torn_facets(), self._walls()
+        elements, cell, edge, origin = (np.concatenate(each) for each in zip(*parts, strict=True))
+        count, piece = self.skeleton.pieces(self.broken)
+        points = self.points
+        return Split(
+            points.positions, points.follow, elements, cell, edge, origin, *self._fill(), self.broken, count, piece
+        )
+
+    def _whole_facets(self) -> tuple[Ints, ...]:
+        """(corners, cell, edge, origin) of boundary facets of undamaged cells."""
+        boundary = self.skeleton.boundary
+        at = np.flatnonzero(self.place[boundary[:, 0]] < 0)
+        cell = boundary[at, 0]
+        corners = self.points.of_nodes(boundary_corners(self.skeleton, at))
+        return corners, cell, np.full(len(at), -1), self.skeleton.origin[at]
+
+    def _torn_facets(self) -> tuple[Ints, ...]:
+        """The same of boundary facets of damaged cells."""
+        cell, facet = self.skeleton.boundary.T
+        at = np.flatnonzero(self.place[cell] >= 0)
+        place = self.place[cell[at]]
+        key = (self.skeleton.dim + 1) * self.pattern[place] + facet[at]
+        corners, owner, edge = self._expand(self.table.facets, key, place)
+        return corners, cell[at[owner]], edge, self.skeleton.origin[at[owner]]
+
+    def _walls(self) -> tuple[Ints, ...]:
+        """The same of both sides of the cracks."""
+        corners, owner, edge = self._expand(self.table.walls, self.pattern, np.arange(len(self.damaged)))
+        cell = self.damaged[owner]
+        return corners, cell, self.skeleton.cell_edges[cell, edge], np.full(len(cell), CRACK)
+
+    def _fill(self) -> tuple[Ints, Ints]:
+        """Triangles that cover the body in 2D, and the cell of each."""
+        if self.skeleton.dim == 3:
+            return np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        whole = np.flatnonzero(self.place < 0)
+        corners, owner, _ = self._expand(self.table.fill, self.pattern, np.arange(len(self.damaged)))
+        triangles = np.concatenate([self.skeleton.cells[whole], corners])
+        return triangles, np.concatenate([whole, self.damaged[owner]])
+
+    def _expand(self, elements: Elements, key: Ints, place: Ints) -> tuple[Ints, Ints, Ints]:
+        """(corners, owner, local edge) of the elements of each key; `place` of its damaged cell."""
+        row, owner = elements.expand(key)
+        of = place[owner]
+        return self.points.of_corners(elements.corners[row], of, self.damaged[of]), owner, elements.edge[row]
+
+
+def boundary_corners(skeleton: Skeleton, which: Ints) -> Ints:
+    """(n, d) nodes of boundary facets, their normals outwards."""
+    outward = facets_of(np.arange(skeleton.dim + 1)[None])[0]
+    cell, facet = skeleton.boundary[which].T
+    return skeleton.cells[cell[:, None], outward[facet]]

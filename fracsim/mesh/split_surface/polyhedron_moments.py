@@ -1,0 +1,65 @@
+"""Volume, centre and second moments of what closed surfaces enclose: exact for the polyhedra that pieces are.
+
+With the cones of all elements (corners x_1 ... x_d, apex at the origin), signed by the side that they face, and
+s = sum x_i,
+
+    V = sum det(x_1 .. x_d) / d!,   int x dV = sum V_e s / (d + 1),
+    int x x^T dV = sum V_e (sum_i x_i x_i^T + s s^T) / ((d + 1) (d + 2)).
+"""
+
+from __future__ import annotations
+
+from ctypes import c_int64
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..c_library import at, library
+
+SOURCE = Path(__file__).with_suffix(".c")
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Of n bodies.
+
+    Attributes:
+        volume: (n,) m^3 (2D: m^2).    centre: (n, d) of volume, m; that of the points where there is no volume.
+        second: (n, d, d) int (x - centre) (x - centre)^T dV, m^5 (2D: m^4).
+    """
+
+    volume: Values
+    centre: Values
+    second: Values
+
+    @property
+    def inertia(self) -> Values:
+        """(n, 3, 3) tensor of inertia about the centre per density, tr S 1 - S; 2D: (n, 1, 1), tr S."""
+        trace = np.einsum("nii->n", self.second)[:, None, None]
+        return trace if self.second.shape[1] == 2 else trace * np.eye(3) - self.second
+
+
+def cones(x: Values) -> Values:
+    """(m,) signed volumes of the cones from the origin over elements with corners (m, d, d)."""
+    if x.shape[2] == 2:
+        return np.asarray(x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2
+    return np.asarray(np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2]))) / 6
+
+
+def moments(points: Values, elements: Ints, body: Ints, count: int) -> Moments:
+    """Moments of `count` bodies from the points (n, d) of their closed surfaces and the elements (m, d), each of the
+    body that `body` (m,) says."""
+    d = points.shape[1]
+    given = [np.ascontiguousarray(points), *(np.ascontiguousarray(each, np.int64) for each in (elements, body))]
+    many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
+    near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # each about a point of its own
+    sums = library(SOURCE).sums
+    sums(*map(c_int64, (len(elements), d, count)), *map(at, (*given, many, near, volume, first, second)))
+    arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
+    across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]
+    about = second.reshape(-1, d, d) / ((d + 1) * (d + 2)) - across
+    return Moments(volume[:, 0], near + arm, about)

@@ -1,0 +1,120 @@
+"""Where points of a split surface are: linear in the nodes, and drawn in towards them as far as there is no room.
+
+    x = mean over p of (x_p + s F_p (X - X_p)) = X_s + sum over nodes a of w_a u_a
+
+F_p as in `local`. With s = 1 the point is where the material is; with s < 1 it is nearer to the nodes that it follows,
+which is where a wall is put that comes to light inside something: nodes lie deeper in the body than its walls. Affine
+motions of the place X_s are reproduced, and sum w_a = 1, at any s.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix, diags
+
+from ..simplices import is_split
+from .closed_surface import Split, SurfacePoints
+from .entity_numbering import Skeleton
+from .surface_motion import Follow
+
+Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
+
+
+class Places:
+    """Where n points are, at shares of their arms; never changed.
+
+    Attributes:
+        share: (n,) s.    rest: (n, d) X_s, m.
+    """
+
+    def __init__(
+        self, mean: csr_matrix, middle: Values, arms: csr_matrix, out: Values, share: Values | None = None
+    ) -> None:
+        """`mean` (n, nodes) over the parents, `middle` (n, d) theirs, m; `arms` (n, nodes) times gradients, `out`
+        (n, d) mean arm, m; `share` 1 where it is not given."""
+        self._mean, self._middle, self._arms, self._out = mean, middle, arms, out
+        self.share = np.ones(len(middle)) if share is None else share
+        self.rest: Values = middle + self.share[:, None] * out
+
+    @cached_property
+    def copies(self) -> Ints:
+        """(k,) points that have arms: also those in the middle of their nodes, whose arms cancel each other until the
+        body is deformed."""
+        armed = np.asarray(abs(self._arms).sum(axis=1)).ravel() > 0
+        return np.flatnonzero(np.any(self._out != 0, axis=1) | armed)
+
+    @cached_property
+    def weights(self) -> csr_matrix:
+        """(n, nodes) w."""
+        return (self._mean + diags(self.share) @ self._arms).tocsr()
+
+    def drawn_in(self, share: Values) -> Places:
+        """The points with `share` (n,) of their arms."""
+        return Places(self._mean, self._middle, self._arms, self._out, share)
+
+    def laid_on(self, points: Ints, mean: csr_matrix, other: Places) -> Places:
+        """With `points` (k,) at means, rows (k, m), of the points of `other` once their arms are whole."""
+        n = len(self.share)
+        to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
+        keep, out = diags(1.0 - np.bincount(points, minlength=n)), self._out.copy()
+        out[points] = mean @ other.rest - self._middle[points]
+        arms = keep @ self._arms + to @ (mean @ other.weights - self._mean[points])
+        return Places(self._mean, self._middle, arms.tocsr(), out, self.share)
+
+    def __call__(self, u: Values) -> Values:
+        """(n, d) x of nodal displacements (nodes, d), m."""
+        return np.asarray(self.rest + self.weights @ u)
+
+    def some(self, u: Values, points: Ints, share: Values) -> Values:
+        """(k, d) x of some points at other shares (k,); u (nodes, d), m."""
+        middle = self._middle[points] + self._mean[points] @ u
+        return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
+
+
+def middles(points: Values, follow: Follow) -> Values:
+    """(n, d) means of the parents of reference `points` (n, d), m."""
+    start = follow.start
+    result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
+    return result
+
+
+def whole(made: Split | SurfacePoints, skeleton: Skeleton, pattern: npt.NDArray[np.integer], places: Values) -> Places:
+    """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
+    that has the whole mesh."""
+    d, count, follow = skeleton.dim, len(places), made.follow
+    parents = np.diff(follow.start)
+    rows = np.repeat(np.arange(count), parents)
+    share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
+    mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
+    armed = np.zeros(follow.nodes, bool)
+    armed[follow.parents[np.any(arm != 0, axis=1)]] = True
+    corners = skeleton.cells[~is_split(d)[pattern] & armed[skeleton.cells].any(axis=1)]
+    X = skeleton.points[corners]
+    volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
+    around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
+    at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
+    gradients = csr_matrix((values, (at, of)), shape=(d * follow.nodes, follow.nodes))
+    of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
+    arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
+                      shape=(count, d * follow.nodes))  # fmt: skip
+    middle = np.asarray(mean @ skeleton.points)
+    return Places(mean, middle, (arms @ gradients).tocsr(), places - middle)
+
+
+def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:
+    """Entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
+
+    `X` (cells, d + 1, d) corners, `number` (cells, d + 1) of their nodes, `share` (cells, d + 1) of each cell in the
+    average around each of its nodes.
+    """
+    d = X.shape[2]
+    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
+    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
+    entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
+    at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
+    of = np.broadcast_to(number[:, None, None, :], entries.shape)
+    return at.reshape(-1), of.reshape(-1), entries.reshape(-1)

@@ -1,0 +1,171 @@
+"""All that a run watches from step to step: what makes its result doubtful, what ends it early, what it has used.
+
+Each is there only where it can tell anything. They go on with a restart, have their part of summary.json, and say their
+sentences at the end.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from .output.energy_check import EnergyGain, worth_telling
+from .output.inverted_cells import InvertedCells
+from .output.run_folder import versions
+from .output.summary import Meter, trouble_in_words
+
+if TYPE_CHECKING:
+    from .output.contact_checks import Meetings, Met
+    from .output.history import History
+    from .output.interpenetration_check import Passing
+    from .output.load_drop import LoadDrop
+    from .output.obstacle_overlap_check import Overlapping
+    from .scene import Scene
+    from .study import Study
+    from .timestepping.state import State
+    from .timestepping.stepper import StepReport
+
+
+class Monitor(Protocol):
+    """Something that is watched in some runs only."""
+
+    def monitors(self) -> dict[str, Any]:
+        """What a restart goes on from, for `restore` (collective)."""
+
+    def restore(self, monitors: dict[str, Any]) -> None:
+        """Go on from `monitors`."""
+
+    def summary(self) -> dict[str, Any]:
+        """Its part of summary.json (rank 0)."""
+
+
+# What every checkpoint of a deformable body says of the run so far.
+WATCHED = {
+    *("smallest_J", "inverted_cells", "inverted_since", "energy_rise", "energy_scale", "energy_least"),
+    *("peak_reactions", "trouble", "wall", "cpu", "memory", "seconds"),
+}
+
+
+class Watched:
+    """What is watched.
+
+    Attributes:
+        history: with the peaks of its columns.    meter: what the run has used.
+        inverted: cells crushed or turned inside out.    gained: energy from nowhere.
+        meetings: of obstacles with the body.    overlapping: of obstacles with one another.
+        passing: of pieces through each other.    drop: of the load; each of these four None where there is none.
+    """
+
+    def __init__(self, scene: Scene, history: History, meter: Meter) -> None:
+        """(collective)"""
+        study, stress = scene.study, scene.balance.stress
+        self._study, self.history, self.meter = study, history, meter
+        self.inverted = InvertedCells(stress, scene.fracture)
+        floor = worth_telling(stress)
+        self.gained = EnergyGain(at_rest=study.at_rest, floor=floor, thickness=study.thickness)
+        self.meetings, self.overlapping = _of_obstacles(scene)
+        self.passing, self.drop = _passing(study), _load_drop(study)
+        those = (self.meetings, self.overlapping, self.passing, self.drop)
+        self._others: list[Monitor] = [each for each in those if each is not None]
+
+    @property
+    def dropped(self) -> bool:
+        """Whether the load has fallen as far as ends the run."""
+        return self.drop is not None and self.drop.reached
+
+    def look(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
+        """Note a step; `figures`: what was probed in it; `broken`: edges so far (collective)."""
+        if self.meetings is not None:
+            self.meetings.look(state, report.dt, figures)
+        if self.drop is not None:
+            self.drop.look(state.t, figures, broken)
+        self.gained.look(report, state)
+
+    def look_at_frame(self, t: float) -> None:
+        """Note what is looked at in frames alone (collective)."""
+        self.inverted.look(t)
+        if self.overlapping is not None:
+            self.overlapping.look(t)
+
+    def saved(self) -> dict[str, Any]:
+        """For a checkpoint (collective)."""
+        watched: dict[str, Any] = self.inverted.monitors() | self.gained.monitors()
+        watched |= {"peak_reactions": self.history.peaks, "worked": self.history.worked}
+        for monitor in self._others:
+            watched |= monitor.monitors()
+        return watched | self.meter.read()
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go on from those of a checkpoint."""
+        watched: list[Any] = [self.inverted, self.gained, self.meter, *self._others]
+        for each in watched:
+            each.restore(saved)
+        self.history.peaks |= saved["peak_reactions"]
+        self.history.worked |= saved.get("worked", {})
+
+    def summary(self) -> dict[str, Any]:
+        """Their part of summary.json (collective)."""
+        used = self.meter.read()
+        return {
+            **used["trouble"], "smallest_J": self.inverted.least,
+            "inverted_cells": self.inverted.count, "peak_reactions": self.history.peaks,
+            "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
+            "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
+            **{name: found for each in self._others for name, found in each.summary().items()},
+            "ranks": self.history.comm.size, "versions": versions(self.history.comm),
+        }  # fmt: skip
+
+    def notes(self, *, done: bool) -> list[str]:
+        """Sentences on what makes the result doubtful; `done`: the run came to its end (collective)."""
+        energy, time = self._study.material.energy, self._study.time
+        trouble = trouble_in_words(self.meter.read()["trouble"])
+        notes = [note for note in (trouble, self.inverted.note(energy), self.gained.note(time.scheme)) if note]
+        if self.meetings is not None:
+            notes += self.meetings.notes(done=done)
+        if self.overlapping is not None:
+            notes += self.overlapping.notes()
+        if self.passing is not None:
+            notes += self.passing.notes(implicit=time.kind.implicit)
+        return notes
+
+
+def wants_surface(study: Study) -> bool:
+    """Whether the split surface is written: as the study says, or where something breaks or stands in the way."""
+    if study.output.surface is None:
+        return study.fracture is not None or bool(study.obstacle)
+    return study.output.surface
+
+
+def _of_obstacles(scene: Scene) -> tuple[Meetings | None, Overlapping | None]:
+    """Where there are any; that they lie in one another, where one of several moves freely."""
+    obstacles = scene.study.obstacle
+    if not obstacles:
+        return None, None
+    from .contact.obstacle_term import Obstacles
+    from .output.contact_checks import Meetings
+
+    terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
+    meetings = Meetings(cast("list[Met]", terms))
+    watched = [term for term in terms if isinstance(term, Obstacles)]
+    if not watched or len(obstacles) == 1 or not any(each.free for each in obstacles):
+        return meetings, None
+    from .output.obstacle_overlap_check import Overlapping
+
+    return meetings, Overlapping(watched[0])
+
+
+def _passing(study: Study) -> Passing | None:
+    """Where nothing keeps pieces apart, and their surface is made anyway."""
+    if not wants_surface(study) or (study.contact is not None and study.contact.itself):
+        return None
+    from .output.interpenetration_check import Passing
+
+    return Passing()
+
+
+def _load_drop(study: Study) -> LoadDrop | None:
+    """What ends the run early."""
+    if (until := study.time.until) is None:
+        return None
+    from .output.load_drop import LoadDrop
+
+    return LoadDrop(study.watched, until.drop, until.above, breaks=study.fracture is not None)

@@ -1,0 +1,190 @@
+"""What happens to the body of a study at the end of a step: it flows, then it breaks. Nothing is imported in vain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mechanics.balance import Balance
+from ..mechanics.stress import Stress
+from ..mesh.domain import Domain
+from ..study import Brittle, Study
+from ..study.conditions import cracks, fibre_direction
+from ..study.energy_checks import refuse_forks
+from ..timestepping.protocols import Flow, NoFlow
+from .material_model import per_cell
+
+Values = npt.NDArray[np.float64]
+
+if TYPE_CHECKING:
+    from ..fracture.brittle.grains import SurfaceRules
+    from ..fracture.brittle.surface_criterion import BrittleSurfaces
+    from ..fracture.criterion import Average, OverloadedEdges
+    from ..fracture.energy.tip_constraints import JoinedTips
+    from ..fracture.energy.tip_criterion import CrackTips
+    from ..fracture.fracture_pass import Breaking
+    from ..fracture.node_retention import Holding, Joining
+    from ..fracture.strength import Strength
+    from ..mesh.edge_graph import EdgeGraph
+
+
+def flow_of(study: Study, balance: Balance) -> Flow:
+    """What flows."""
+    if study.plasticity is None:
+        return NoFlow()
+    from ..mechanics.return_mapping import ReturnMapping
+
+    return ReturnMapping(balance.stress)
+
+
+def breaking_of(study: Study, balance: Balance) -> Breaking | None:
+    """What breaks; None without [fracture]."""
+    if study.fracture is None:
+        return None
+    from ..fracture.fracture_pass import Breaking
+    from ..mesh.edge_graph import EdgeGraph
+
+    graph = EdgeGraph(balance.domain)
+    passes = study.fracture.passes
+    if passes is None and balance.scheme.inertia:
+        passes = 1
+    opened = _opened(study, balance, graph)
+    if study.fracture.energy is not None:
+        breaking = _tearing(study, balance, graph, passes, opened)
+    else:
+        criterion = _criterion(study, balance.stress, graph)
+        joining = _joining(study, balance, graph, criterion.strength)
+        breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
+    if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
+        balance.cut_by(lambda: graph.gather_broken(cut[:, None]))
+    if opened is not None:
+        balance.edges_broke(graph.pattern)
+        balance.damage_changed()
+    return breaking
+
+
+def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+    """What breaks where cracks take an energy."""
+    from ..fracture.energy.cell_degradation import ClosingSplitting, Splitting
+    from ..fracture.energy.front_advance import RowTips
+    from ..fracture.energy.tip_criterion import CrackTips
+    from ..fracture.fracture_pass import Breaking
+
+    assert study.fracture is not None and study.fracture.energy is not None
+    refuse_forks(study, balance.domain.dim)
+    if study.fracture.law == "cohesive":
+        return _cohesive(study, balance, graph, passes, opened)
+    stress, strength = balance.stress, strength_of(study, balance.domain, graph)
+    toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
+    given, moves = study.fracture.passes is not None, balance.scheme.inertia
+    rows = balance.domain.dim == 3 and not moves
+    criterion_type: type[CrackTips] = RowTips if rows else CrackTips
+    if study.fracture.branching:
+        from ..fracture.energy.crack_speed import RunningTips
+
+        criterion_type = RunningTips
+    tips = criterion_type(stress, graph, strength, toughness, opened)
+    pace = tips.pace() if moves and not given else None
+    kind = ClosingSplitting if stress.closes else Splitting
+    splitting = kind(stress, graph, tips.release_rate() if moves else None)
+    criterion: CrackTips | JoinedTips = tips
+    if (joining := _joining(study, balance, graph, strength)) is not None:
+        from ..fracture.energy.tip_constraints import JoinedTips
+
+        criterion = JoinedTips(tips, graph, joining)
+    return Breaking(stress, graph, criterion, passes=passes, opened=opened, degradation=splitting, pace=pace)
+
+
+def _cohesive(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+    """What breaks where cracks hold on while they open."""
+    from ..fracture.cohesive.cohesive_pass import CohesiveBreaking
+    from ..fracture.cohesive.cohesive_tips import CohesiveTips
+    from ..fracture.cohesive.softening import Softening
+    from ..mesh.edge_graph import EdgeGraph
+
+    assert study.fracture is not None
+    stress, cuts = balance.stress, EdgeGraph(balance.domain)
+    strength = strength_of(study, balance.domain, cuts)
+    toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
+    tips = CohesiveTips(stress, cuts, strength, toughness, opened)
+    softening = Softening(stress, cuts, strength, toughness, tips.cut)
+    return CohesiveBreaking(stress, graph, cuts, tips, softening, passes=passes, opened=opened)
+
+
+def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
+    """[[crack]]: break its edges; where they are cut, None without any."""
+    if not study.crack:
+        return None
+    from ..fracture.initial_cracks import open_cracks
+
+    return open_cracks(graph, cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
+
+
+def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | Holding | BrittleSurfaces:
+    """Which edges fail."""
+    from ..fracture.criterion import OverloadedEdges
+
+    assert study.fracture is not None
+    strength, average = strength_of(study, stress.domain, graph), average_of(study, stress.domain)
+    if study.brittle is None:
+        failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+        if study.fracture.crumbs:
+            return failing
+        from ..fracture.node_retention import Holding
+
+        return Holding(failing, stress, graph)
+    from ..fracture.brittle.surface_criterion import BrittleSurfaces
+
+    return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
+
+
+def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining | None:
+    """What nodes without a whole cell stay joined by."""
+    table = study.fracture
+    assert table is not None
+    if not table.joins(study.material.energy):
+        return None
+    from ..fracture.node_retention import Joining
+
+    return Joining(balance.stress, graph, strength, balance.motion.held, cracks=table.energy is not None)
+
+
+def average_of(study: Study, domain: Domain) -> Average | None:
+    """The average that a study takes of its stress; None: it takes the stress as it is."""
+    table = study.fracture
+    if table is None:
+        return None
+    if table.kernel == "neighbours":
+        from ..fracture.neighbour_average import NeighbourAverage
+
+        return NeighbourAverage(domain)
+    if not table.radius:
+        return None
+    from ..fracture.nonlocal_average import NonlocalAverage
+
+    return NonlocalAverage(domain, table.radius, table.kernel)
+
+
+def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> Strength:
+    """Strength of edges by region, with scatter, another one in each `copy` of a mesh, and a fibre."""
+    from ..fracture.strength import Fibre, Scatter, Strength
+
+    table = study.fracture
+    assert table is not None
+    scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed + copy)
+    direction = fibre_direction(study, domain.dim)
+    fibre = Fibre(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
+    of_cell = per_cell(study, domain, table, "strength")
+    return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
+
+
+def surface_rules(table: Brittle, copy: int = 0) -> SurfaceRules:
+    """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
+    from ..fracture.brittle.grains import GrainRules, SurfaceRules
+
+    given = table.grains
+    grains = None if given is None else GrainRules(given.count, given.seed + copy, given.spread, given.mode)
+    curved = table.shape == "curved"
+    return SurfaceRules(table.surfaces, table.spacing, curved, table.seed + copy, table.per_pass, grains)

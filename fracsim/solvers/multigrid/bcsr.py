@@ -1,0 +1,150 @@
+"""Rows of square blocks in single precision, and vectors for products with them.
+
+What carries from a level of multigrid's cycle (vcycle) to the next finer one and, transposed, back.
+
+In single precision. Blocks come row by row, so that products with them and with their transpose both take a row of a
+block at once: one copy serves both, and what the cycle reads stays near the processor.
+"""
+
+from __future__ import annotations
+
+from ctypes import CDLL, c_float, c_int64
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import la
+from dolfinx.common import IndexMap
+from mpi4py import MPI
+
+from ...mesh.c_library import FASTER, at, built_together, prepared
+from .hierarchy import Blocks
+
+Single = npt.NDArray[np.float32]
+Values = npt.NDArray[np.float64]
+SOURCE = Path(__file__).with_suffix(".c")
+BEHIND = 8  # numbers behind the last block, which are read and made nothing of
+PROLONGATION_SOURCE = Path(__file__).with_name("prolongation.c")
+
+
+class Vector:
+    """Numbers of this rank, those of ghosts behind them.
+
+    Attributes:
+        array: all of them.    place: where they begin.
+    """
+
+    def __init__(self, nodes: IndexMap, size: int, kind: type = np.float32) -> None:
+        """`size`: numbers of a node; `kind`: of number."""
+        self._vector = la.vector(nodes, size, kind)
+        self.array: npt.NDArray[Any] = self._vector.array
+        self.place = at(self.array)
+        self._alone = nodes.comm.size == 1
+
+    def fetch(self) -> None:
+        """Those of ghosts become their owners' (collective)."""
+        if not self._alone:
+            self._vector.scatter_forward()
+
+    def give_back(self) -> None:
+        """Those of ghosts are added to their owners' (collective)."""
+        if not self._alone:
+            self._vector.scatter_reverse(la.InsertMode.add)
+
+
+class Rows:
+    """Rows of this rank. Vectors to be multiplied with have their ghosts.
+
+    Attributes:
+        blocks: (blocks, numbers of one) column by column.
+    """
+
+    def __init__(self, made: CDLL, size: int, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
+        """`made`: `code` for blocks of size x size; `starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
+        self._code, numbers = made, np.zeros(int(starts[-1]) * size**2 + BEHIND, np.float32)
+        self.blocks: Single = numbers[:-BEHIND].reshape(-1, size**2)
+        self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
+        self._all = *self._pattern, at(numbers)
+        self._residual, self._smooth, self._add = (
+            prepared(made, name, *self._all) for name in ("residual", "smooth", "add")
+        )  # fmt: skip
+
+    def take(self, blocks: Values, left: Values, right: Values) -> None:
+        """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
+        self._code.scale(*self._pattern, at(blocks), at(left), at(right), self._all[-1])
+
+    def lose(self, blocks: Values, left: Values, right: Values, lost: Single) -> None:
+        """What rounding has taken from each row of A's blocks, where left and right are undone (C tells)."""
+        self._code.lose(*self._all, at(blocks), at(left), at(right), at(lost))
+
+    def multiply(self, lost: Single, left: Values, z: Vector, x: Values, y: Values) -> None:
+        """y = diag(left) A z + lost x in double precision, z of ghosts as well."""
+        self._code.multiply(*self._all, at(lost), at(left), z.place, at(x), at(y))
+
+    def residual(self, b: Vector, x: Vector, left: Vector) -> None:
+        """left = b - A x."""
+        self._residual(*self._all, b.place, x.place, left.place)
+
+    def smooth(self, by: Diagonal, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
+        """d = keep d + take B (b - A x), to = x + d."""
+        self._smooth(
+            *self._all, by.place, c_float(keep), c_float(take), b.place, x.place, d.place, to.place
+        )  # fmt: skip
+
+    def add(self, x: Vector, y: Vector) -> None:
+        """y += A x."""
+        self._add(*self._all, x.place, y.place)
+
+
+class Diagonal:
+    """Blocks of this rank's rows on the diagonal, B, symmetric.
+
+    Attributes:
+        blocks: (rows, size, size).    place: where they begin.
+    """
+
+    def __init__(self, made: CDLL, size: int, rows: int) -> None:
+        """`made`: `code` for blocks of size x size."""
+        numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
+        self._code, self._rows, self.place = made, c_int64(rows), at(numbers)
+        self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
+
+    def invert(self, D: Single) -> None:
+        """B = D^-1 of blocks as these; where D is not positive, of the size of its diagonal."""
+        self._code.invert(self._rows, at(D), self.place)
+
+    def begin(self, take: float, b: Vector, d: Vector, x: Vector) -> None:
+        """d = x = take B b."""
+        self._code.begin(self._rows, self.place, c_float(take), b.place, d.place, x.place)
+
+
+def code(comm: MPI.Comm, size: int) -> CDLL | None:
+    """For blocks of size x size; None without a compiler (collective)."""
+    lanes = next(n for n in (2, 4, 8) if n >= size)
+    return built_together(comm, "rows", SOURCE.read_text(), [*FASTER, f"-DR={size}", f"-DLANES={lanes}"])
+
+
+class Between:
+    """diag(left) P diag(right), of P's blocks in the rows of this rank."""
+
+    def __init__(self, made: CDLL, P: Blocks, left: Values, right: Values) -> None:
+        """`made`: `code` for blocks of that size."""
+        numbers = np.empty(P.values.size, np.float32)
+        pattern = c_int64(len(P.starts) - 1), at(P.starts), at(P.columns)
+        made.scale(*pattern, at(P.values), at(left), at(right), at(numbers))
+        self._all = *pattern, at(numbers)
+        self._add, self._add_transposed = (prepared(made, name, *self._all) for name in ("add", "add_transposed"))
+
+    def add(self, x: Vector, y: Vector) -> None:
+        """y += P x, of x with its ghosts."""
+        self._add(*self._all, x.place, y.place)
+
+    def add_transposed(self, x: Vector, y: Vector) -> None:
+        """y += P^T x, ghosts of y included."""
+        self._add_transposed(*self._all, x.place, y.place)
+
+
+def prolongation_code(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:
+    """For blocks of that size; None without a compiler (collective)."""
+    return built_together(comm, "between", PROLONGATION_SOURCE.read_text(), [*FASTER, f"-DR={rows}", f"-DC={columns}"])

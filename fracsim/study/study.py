@@ -1,0 +1,304 @@
+"""A whole study, and what its tables ask of one another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from .body import Damping, Material, Mesh
+from .boundary_conditions import Boundary, Initial, Load
+from .contact import Contact, Obstacle
+from .fracture import Brittle, Crack, Fracture, Plasticity
+from .material_library import filled
+from .quadratic_checks import check_order
+from .rigid_bodies import MOST_TURN, Body, check_rigid, of_rigid
+from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
+from .time_and_output import FRACTURE_FIELDS, Output, Probe, Time, frame_interval, frame_notes
+from .values import Later, Table
+
+
+def _moduli(material: Material) -> list[tuple[float, float]]:
+    """(Young, Poisson) of the material and of every region."""
+    regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
+    regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
+    return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
+
+
+class Study(Table):
+    """A whole study. A table that is absent costs nothing."""
+
+    title: str
+    mesh: Mesh
+    material: Material
+    time: Time
+    fracture: Later[Fracture] | None = None
+    plasticity: Later[Plasticity] | None = None
+    brittle: Later[Brittle] | None = None
+    crack: list[Later[Crack]] = Field(default_factory=list)
+    damping: Later[Damping] | None = None
+    boundary: list[Boundary] = Field(default_factory=list)
+    load: Later[Load] | None = None
+    initial: Later[Initial] | None = None
+    solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
+    obstacle: list[Later[Obstacle]] = Field(default_factory=list)
+    body: list[Later[Body]] = Field(default_factory=list)
+    contact: Later[Contact] | None = None
+    probe: list[Later[Probe]] = Field(default_factory=list)
+    output: Output = Output()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_is_not_said(cls, data: Any) -> Any:
+        return of_rigid(filled(data)) if isinstance(data, dict) else data
+
+    @field_validator("probe", "obstacle")
+    @classmethod
+    def _told_apart[Entry: (Probe, Obstacle)](cls, entries: list[Entry], info: ValidationInfo) -> list[Entry]:
+        names = [each.name for each in entries]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two {info.field_name}s have the name {twice[0]}")
+        return entries
+
+    @field_validator("solver")
+    @classmethod
+    def _printing_is_a_bare_option(cls, options: Options) -> Options:
+        return spoken(options)
+
+    @model_validator(mode="after")
+    def _options_are_data(self) -> Study:
+        refuse_what_is_no_data(self.solver)
+        return self
+
+    @model_validator(mode="after")
+    def _fields_exist(self) -> Study:
+        wanted = [name for name in self.output.fields or [] if name in FRACTURE_FIELDS]
+        if wanted and self.fracture is None:
+            raise ValueError(f'output.fields has "{wanted[0]}", which needs a [fracture] table')
+        return self
+
+    @model_validator(mode="after")
+    def _strength_needs_fracture(self) -> Study:
+        special = [name for name, region in self.material.regions.items() if region.strength is not None]
+        if special and self.fracture is None:
+            raise ValueError(f"material.{special[0]}.strength needs a [fracture] table")
+        special = [name for name, region in self.material.regions.items() if region.fracture_energy is not None]
+        if special and (self.fracture is None or self.fracture.energy is None):
+            raise ValueError(f"material.{special[0]}.fracture_energy needs fracture.energy, that of the other regions")
+        return self
+
+    @model_validator(mode="after")
+    def _flow_needs_plasticity(self) -> Study:
+        if self.plasticity is None:
+            special = [name for name, region in self.material.regions.items() if region.yield_stress is not None]
+            if special:
+                raise ValueError(f"material.{special[0]}.yield_stress needs a [plasticity] table")
+            if "plastic_strain" in (self.output.fields or []):
+                raise ValueError('output.fields has "plastic_strain", which needs a [plasticity] table')
+        return self
+
+    @model_validator(mode="after")
+    def _plasticity_fits(self) -> Study:
+        table, material = self.plasticity, self.material
+        if table is None:
+            return self
+        if self.time.scheme == "rigid":  # see check_rigid
+            return self
+        if material.energy == "linear":
+            raise ValueError(
+                "[plasticity] splits the deformation gradient, which the energy linear does not tell from small "
+                'strain; choose energy = "corotated", the same law at small strain'
+            )
+        if material.plane == "stress":
+            raise ValueError('[plasticity] is for 3D and plane strain; choose plane = "strain"')
+        if self.fracture is not None and self.fracture.approach == "edge":
+            raise ValueError(
+                'fracture.approach = "edge" projects strain on the edges at rest, which plastic flow leaves behind; '
+                'choose approach = "chi" with [plasticity]'
+            )
+        for young, poisson in _moduli(material):
+            if table.hardening <= (limit := -1.5 * young / (1 + poisson)):
+                raise ValueError(
+                    f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
+                    "that softens faster than it unloads has no equilibrium"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _surfaces_need_strength(self) -> Study:
+        if self.brittle is None:
+            return self
+        if self.fracture is None:
+            raise ValueError("[brittle] needs a [fracture] table: its strength decides where surfaces start")
+        if self.fracture.cap is not None:
+            raise ValueError(
+                "fracture.cap is a share of edges, [brittle] breaks surfaces: set brittle.per_pass instead"
+            )
+        if self.output.cut == "forces":
+            raise ValueError(
+                'output.cut = "forces" is for single edges; surfaces of [brittle] say where they cut: remove'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _energy_stands_alone(self) -> Study:
+        table = self.fracture
+        if table is not None and table.branching:
+            if table.energy is None:
+                raise ValueError("fracture.branching needs fracture.energy: tips branch where that of two cracks flows")
+            if self.time.scheme == "quasi-static":
+                raise ValueError(
+                    "fracture.branching needs inertia: a slow crack is given no more than it takes; remove it, or "
+                    'choose time.scheme = "explicit" or "newmark"'
+                )
+        if table is not None and table.law == "cohesive":
+            self._cohesive_stands_alone(table)
+        if table is None or table.energy is None:
+            return self
+        others = {
+            "fracture.approach": (table.approach != "chi", 'cells that a crack cuts fade: choose approach = "chi"'),
+            "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
+            "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
+            "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
+            'output.cut = "forces"': (self.output.cut == "forces", "cracks say where they cut: remove it"),
+            "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
+            "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
+        }
+        for key, (given, why) in others.items():
+            if given:
+                raise ValueError(f"fracture.energy does not go with {key}: {why}")
+        return self
+
+    def _cohesive_stands_alone(self, table: Fracture) -> None:
+        if table.energy is None:
+            raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
+        others = {
+            f'time.scheme = "{self.time.scheme}"': (
+                self.time.scheme != "quasi-static", 'cohesive cracks are slow ones: choose "quasi-static"'
+            ),
+            "fracture.unilateral": (
+                table.unilateral, "cells that are cut and pressed keep what stiffness they have left: remove it"
+            ),
+            "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
+        }  # fmt: skip
+        for key, (given, why) in others.items():
+            if given:
+                raise ValueError(f'fracture.law = "cohesive" does not go with {key}: {why}')
+
+    @model_validator(mode="after")
+    def _cracks_need_fracture(self) -> Study:
+        if self.crack and self.fracture is None:
+            raise ValueError("[[crack]] needs a [fracture] table: without it no edge can be broken (strength = inf)")
+        return self
+
+    @model_validator(mode="after")
+    def _projection_is_of_small_strains(self) -> Study:
+        if self.fracture is None or self.fracture.approach != "edge":
+            return self
+        if self.material.energy not in ("linear", "corotated"):
+            raise ValueError(
+                f'fracture.approach = "edge" is for the energies linear and corotated, not {self.material.energy}: '
+                'with a nonlinear strain split cells blow up; choose approach = "chi" or energy = "corotated"'
+            )
+        if "chi" in (self.output.fields or []):
+            raise ValueError('output.fields has "chi", which fracture.approach = "edge" does not have; remove it')
+        return self
+
+    @model_validator(mode="after")
+    def _explicit_steps_once(self) -> Study:
+        if not self.time.kind.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
+            raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
+        return self
+
+    @model_validator(mode="after")
+    def _contact_fits_the_scheme(self) -> Study:
+        scheme = f'time.scheme = "{self.time.scheme}"'
+        if self.contact is not None and not self.time.kind.implicit and self.contact.creep is not None:
+            raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
+        solids = [number for number, each in enumerate(self.obstacle) if each.shape == "mesh"]
+        if solids and not self.time.kind.implicit:
+            raise ValueError(
+                f"obstacle.{solids[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
+                '"backward-euler", or another shape'
+            )
+        if self.contact is not None and not self.contact.itself and not self.obstacle:
+            raise ValueError("[contact] has itself = false and there is no [[obstacle]]: nothing can touch; remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _free_obstacles_have_inertia(self) -> Study:
+        loose = [number for number, each in enumerate(self.obstacle) if each.free]
+        if loose and not self.time.kind.inertia:
+            raise ValueError(
+                f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
+                'choose time.scheme = "backward-euler", or drive it by displacement'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _spins_are_followed(self) -> Study:
+        spins = [(f"body.{number}", each.spin) for number, each in enumerate(self.body)]
+        spins += [(f"obstacle.{number}", each.spin) for number, each in enumerate(self.obstacle) if each.spin]
+        for key, spin in spins:
+            if (turned := max(map(abs, spin)) * self.time.longest) > MOST_TURN:
+                raise ValueError(
+                    f"{key}.spin turns it by {turned:.3g} rad in a step of {self.time.longest:g} s; at most "
+                    f"{MOST_TURN:g} rad are followed: give a slower spin or a shorter time.step"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _order_fits(self) -> Study:
+        check_order(self)
+        return self
+
+    @model_validator(mode="after")
+    def _rigid_or_not(self) -> Study:
+        check_rigid(self)
+        return self
+
+    @model_validator(mode="after")
+    def _a_load_ends_the_run(self) -> Study:
+        if self.time.until is None:
+            return self
+        named = [each.name for each in self.probe if each.quantity == "reaction"]
+        named += [each.name for each in self.obstacle]
+        of = self.time.until.of
+        if (len(named) == 1 and of is None) or of in named:
+            return self
+        which = f"of = {of!r} is none of them" if of is not None else "say which, of = NAME"
+        there = ", ".join(named) or "none: add a [[probe]] with on = the group that is driven"
+        raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
+
+    @property
+    def watched(self) -> str:
+        """Name of the probe or obstacle whose load ends the run (time.until)."""
+        names = [each.name for each in self.probe if each.quantity == "reaction"] + [e.name for e in self.obstacle]
+        assert self.time.until is not None
+        return self.time.until.of or names[0]
+
+    @property
+    def thickness(self) -> float:
+        """m, of a 2D body out of its plane: what forces and energies per metre are multiplied with."""
+        return self.material.thickness or 1.0
+
+    @property
+    def frame_interval(self) -> float:
+        """Simulated time between two frames, s; 0 where they are counted in steps."""
+        return frame_interval(self.time, self.output)
+
+    @property
+    def frame_notes(self) -> list[str]:
+        """What is to be said where frames are not as far apart as the study asks."""
+        return frame_notes(self.time, self.output)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves at the start."""
+        return self.initial is None and not any(each.free and (each.velocity or each.spin) for each in self.obstacle)
+
+    @model_validator(mode="after")
+    def _rest_has_no_velocity(self) -> Study:
+        if not self.time.kind.inertia and self.initial is not None:
+            raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
+        return self

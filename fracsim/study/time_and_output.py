@@ -1,0 +1,232 @@
+"""[time], [[probe]] and [output]: how a study is run, and what is kept of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import MISSING, fields
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
+
+from ..forms.schemes import SCHEMES, Scheme
+from .boundary_conditions import Where
+from .values import Finite, Flag, InTime, Name, NonNegative, Positive, Seconds, Table, TimeTable, Vector
+
+
+class Until(Table):
+    """[time] until: the run ends before `end` once a load has fallen from its peak."""
+
+    drop: Annotated[Finite, Field(gt=0, lt=1)]  # share of the peak that is lost
+    of: str | None = None  # name of a probe that records a reaction, or of an obstacle; default: the only one
+    above: NonNegative = 0.0  # N: peaks below do not count
+
+
+class Timing(Table):
+    """[time]: scheme and steps, without the parameters of the schemes."""
+
+    scheme: str = "generalized-alpha"
+    step: InTime[Seconds]  # s; a table: of the time at which a step begins
+    end: Seconds  # s
+    adapt: Flag = True  # halve a step that fails, grow back after easy ones
+    smallest: Seconds | None = None  # s; default step / 1024
+    breaking_step: Seconds | None = None  # s: a longer step in which edges break is taken again, half as long
+    until: Until | None = None
+    mass: Literal["lumped", "consistent"] = "lumped"
+
+    @property
+    def kind(self) -> type[Scheme]:
+        """The class of the scheme."""
+        return SCHEMES[self.scheme]
+
+    @property
+    def longest(self) -> float:
+        """The longest step, s."""
+        return max(self.step.value) if isinstance(self.step, TimeTable) else self.step
+
+    @property
+    def shortest(self) -> float:
+        """The shortest step that a study asks for, s."""
+        return min(self.step.value) if isinstance(self.step, TimeTable) else self.step
+
+    @property
+    def constant(self) -> bool:
+        """Whether all steps are equal, but for those that fail or break edges; explicit ones are as the body allows."""
+        return not isinstance(self.step, TimeTable) and (self.kind.implicit or self.scheme == "rigid")
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What the scheme takes: the table has the parameters of all schemes, whichever it is."""
+        return {each.name: getattr(self, each.name) for each in fields(self.kind)}
+
+    @model_validator(mode="after")
+    def _order(self) -> Timing:
+        if self.longest > self.end:
+            raise ValueError(f"step = {self.longest:g} s is longer than the run: end = {self.end:g} s")
+        if self.smallest is not None and self.smallest > self.shortest:
+            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.shortest:g} s")
+        if self.scheme == "rigid" and isinstance(self.step, TimeTable):
+            raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
+        if self.breaking_step is not None:
+            self._check_breaking_step(self.breaking_step)
+        self.kind(**self.parameters).check()
+        if not self.kind.implicit and self.mass == "consistent":
+            raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
+        return self
+
+    def _check_breaking_step(self, step: float) -> None:
+        if not self.kind.implicit:
+            raise ValueError(f'breaking_step is for implicit and quasi-static steps, not scheme = "{self.scheme}"')
+        smallest = self.smallest or self.shortest / 1024
+        if not smallest <= step <= self.longest:
+            raise ValueError(
+                f"breaking_step = {step:g} s must lie between smallest = {smallest:g} s and step = {self.longest:g} s"
+            )
+
+
+def _keys_of_schemes() -> dict[str, Any]:
+    """Key -> (type with its limits, default) of the parameters of all schemes. TypeError where two disagree."""
+    keys: dict[str, Any] = {}
+    limits: dict[str, Any] = dict.fromkeys(Timing.model_fields)
+    for kind in SCHEMES.values():
+        for each in fields(kind):
+            own = each.default, each.metadata
+            if each.default is MISSING:
+                raise TypeError(f"{kind.__name__}.{each.name} needs a default: [time] has it whichever the scheme is")
+            if limits.setdefault(each.name, own) != own:
+                raise TypeError(f"{kind.__name__}.{each.name}: [time] has this key already, with other limits")
+            keys[each.name] = Annotated[Finite, Field(**each.metadata)], each.default
+    return keys
+
+
+if TYPE_CHECKING:
+    Time = Timing
+else:
+    Time = create_model(
+        "Time", __base__=Timing, __module__=__name__, __doc__="[time]: scheme and steps.",
+        scheme=(Literal[tuple(SCHEMES)], Timing.model_fields["scheme"].default), **_keys_of_schemes(),
+    )  # fmt: skip
+
+
+class Probe(Table):
+    """[[probe]]: what history.csv records at a point (nearest node) or over a group."""
+
+    name: Name
+    point: Vector | None = None  # m, reference configuration
+    on: Where | None = None
+    record: Literal["displacement", "reaction"] | None = None  # default: reaction over a group, displacement at a point
+
+    @model_validator(mode="after")
+    def _place(self) -> Probe:
+        if (self.point is None) == (self.on is None):
+            raise ValueError("give either point or on")
+        if self.point is not None and self.record == "reaction":
+            raise ValueError("a reaction is summed over a group or selection: give on instead of point")
+        return self
+
+    @property
+    def quantity(self) -> Literal["displacement", "reaction"]:
+        """What is recorded."""
+        return self.record or ("displacement" if self.point is not None else "reaction")
+
+
+FRAMES = 50  # of a run whose study says neither every nor interval
+FEWEST_FRAMES, MOST_FRAMES = 34, 75  # where steps are constant, so that the last one comes in time if it can
+
+
+def frame_interval(timing: Timing, output: Output) -> float:
+    """Simulated time between two frames, s; 0 where they are counted in steps (output.every).
+
+    A whole number of steps where these are constant: frames are evenly spaced, and a film of them does not stutter. An
+    interval shorter than a step is left as it is, for steps that are shortened.
+    """
+    if output.every is not None:
+        return 0.0
+    wanted = output.interval or timing.end / FRAMES
+    step = timing.longest
+    if not timing.constant:
+        return wanted
+    if output.interval is None:
+        return _steps_between(math.ceil(timing.end / step * (1 - 1e-9))) * step
+    return round(wanted / step) * step if wanted > step else wanted
+
+
+def frame_notes(timing: Timing, output: Output) -> list[str]:
+    """What is to be said where frames are not as far apart as the study asks."""
+    interval = frame_interval(timing, output)
+    if output.interval is None or abs(interval - output.interval) <= 1e-6 * interval:
+        return []
+    steps = round(interval / timing.longest)
+    return [
+        f"output.interval = {output.interval:g} s is no multiple of time.step = {timing.longest:g} s: "
+        f"there is a frame every {interval:g} s, {steps} step{'s'[: steps != 1]}, so that they are evenly spaced"
+    ]
+
+
+def _steps_between(steps: int) -> int:
+    """Steps between two of about FRAMES frames of so many steps; a divisor of them, if there is one."""
+    if steps > 100 * FRAMES:  # what the last frame is early by cannot be seen
+        return round(steps / FRAMES)
+    candidates = range(math.ceil(steps / MOST_FRAMES), max(1, steps // FEWEST_FRAMES) + 1)
+    return min(candidates, key=lambda count: (steps % count > 0, abs(math.log(steps / count / FRAMES))))
+
+
+FIELDS = (
+    "velocity",
+    "damage",
+    "chi",
+    "piece",
+    "stress",
+    "von_mises",
+    "energy_density",
+    "strain",
+    "region",
+    "plastic_strain",
+)
+FRACTURE_FIELDS = ("damage", "chi", "piece")
+
+
+LOOKS = ("plain", "bread", "porcelain", "jade", "granite", "steel", "wood")
+Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
+
+
+class Colours(Table):
+    """[output] look: own colours."""
+
+    skin: Colour  # of what was the boundary
+    inside: Colour  # of what cracks lay open
+
+
+def _look(value: Any) -> str:
+    """Tag of a look."""
+    return "<colours>" if isinstance(value, dict | Colours) else "<name>"
+
+
+class Output(Table):
+    """[output]: what is written, and how often."""
+
+    every: Annotated[int, Field(ge=1, strict=True)] | None = None  # steps
+    interval: Positive | None = None  # s
+    fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
+    surface: Flag | None = None  # the split surface and pieces.csv; default: with [fracture] or an [[obstacle]]
+    # where broken edges are cut: in proportion to the nodal forces, or so that cracks are smooth; default: smooth where
+    # there is a look and nothing touches, else in the middle
+    cut: Literal["middle", "forces", "smooth"] | None = None
+    picture: Flag = True  # a PNG of the last frame
+    look: Annotated[  # type: ignore[valid-type]
+        Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[Colours, Tag("<colours>")],
+        Discriminator(_look),
+    ] = "plain"  # of pictures
+    checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
+
+    @field_validator("fields")
+    @classmethod
+    def _each_once(cls, fields: list[str] | None) -> list[str] | None:
+        if twice := [name for name in fields or [] if (fields or []).count(name) > 1]:
+            raise ValueError(f'"{twice[0]}" is given twice; name each field once')
+        return fields
+
+    @model_validator(mode="after")
+    def _one_clock(self) -> Output:
+        if self.every is not None and self.interval is not None:
+            raise ValueError("give every (in steps) or interval (in s), not both")
+        return self

@@ -1,0 +1,107 @@
+"""Implicit steps: a nonlinear solve, then the passes of fracture, each of which may solve the step again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mechanics.balance import Balance
+from ..mesh.parallel import total
+from ..solvers.nonlinear_solver import Solver
+from .energy_balance import released_state
+from .protocols import Breaking, Flow, PassResult
+from .state import State
+from .stepper import BalanceStepper, SolveResult, StepSizes
+
+Values = npt.NDArray[np.float64]
+
+
+class ImplicitStepper(BalanceStepper):
+    """Steps of a scheme with inertia that solves for the displacement."""
+
+    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking, solver: Solver) -> None:
+        super().__init__(balance, sizes, flow, breaking)
+        self.solver = solver
+
+    def heed(self, abandons: Callable[[], bool]) -> None:
+        """Ask `abandons` (collective) between Newton iterations whether the step is to be abandoned."""
+        self.solver.heed(abandons)
+
+    def troubles(self) -> dict[str, int]:
+        """Counts by name of what failed on the way, over all ranks (collective)."""
+        return super().troubles() | {"linear_failures": self.solver.linear_failures}
+
+    def _recalled(self) -> None:
+        super()._recalled()
+        self._tell_solver()
+
+    def _tell_solver(self) -> None:
+        """Tell the solver of the damage that there is, whenever that came about."""
+        pattern = self.breaking.pattern
+        torn = pattern is not None and total(self.comm, np.count_nonzero(pattern))[0] > 0
+        self.solver.damage_changed(None if torn else 0)
+
+    def forget(self) -> None:
+        """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
+        self.balance.forget()
+        self.solver.renew()
+        self._tell_solver()
+
+    def _attempt(self, state: State, dt: float) -> SolveResult:
+        return self._solve(state, dt, self._guess(state, dt))
+
+    def _solve(self, state: State, dt: float, guess: Values) -> SolveResult:
+        began = time.perf_counter()
+        self._begin(state, dt)
+        result = self.solver.solve(guess)
+        self.phases["solve"] += time.perf_counter() - began
+        return result
+
+    def _guess(self, state: State, dt: float) -> Values:
+        """Where the body would go by itself."""
+        return np.asarray(state.u + (1 - self.balance.scheme.alpha_f) * dt * state.v)
+
+    def _passes(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
+        """Break, solve the step again from its start, until nothing new breaks or the passes are used up.
+
+        Where the weakened body has no solution the last one stands, and the next step takes up what is out of balance.
+        """
+        broken, released = 0, 0.0
+        for _ in range((self.breaking.passes or UNLIMITED) - 1):
+            solved = self.balance.u.x.array[: self.balance.owned].copy()
+            _, v, a = self._arrive(state, dt)
+            self._let_flow()
+            self.breaking.moving(v, a)
+            result = self._broken_in(dt)
+            if not result.broken:
+                self._return_to(solved, state, dt)
+                break
+            broken, released = broken + result.broken, released + result.released
+            self._damage_changed(result)
+            again = self._attempt(state, dt)
+            solve = SolveResult(True, solve.newton + again.newton, solve.krylov + again.krylov, "")
+            if not again.converged:
+                self.trouble.unbalanced_steps += 1
+                self._return_to(solved, state, dt)
+                break
+        return solve, broken, released
+
+    def _return_to(self, solved: Values, state: State, dt: float) -> None:
+        """The solution of the step once more."""
+        self._begin(state, dt)
+        self.balance.displace(solved)
+        self.balance.update_reactions()
+
+    def _released(self, end: State, solved: Values, result: PassResult) -> State:
+        return released_state(self.balance, end, solved, result.before, self.solver.linear_response)
+
+    def _damage_changed(self, result: PassResult) -> None:
+        super()._damage_changed(result)
+        if result.broken:
+            self.solver.damage_changed(result.broken)
+
+
+UNLIMITED = 10_000  # passes: there is no body with more left to break in one step
