@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from fracsim.meshes.builders.box import Box
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.read import read_mesh
+from support.ranks import run_on_ranks
 from support.scenes import displacement, make_scene, march
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
@@ -71,3 +72,11 @@ def test_four_plates_of_gmsh_lie_still() -> None:
     """In 0.5 s. Before, 306 um."""
     file = Path(__file__).parent / "meshes" / "stack.msh"
     lies_still(str(file), bodies_of(read_mesh(file)), 3, 0.5)
+
+
+@pytest.mark.ranks
+def test_it_lands_on_three_ranks(tmp_path: Path) -> None:
+    """Before, PETSc coarsened a graph of strong links without end in the second step."""
+    energies = run_on_ranks("support.stacked", 3, tmp_path, 60)["energies"]
+    assert energies.shape == (2, 2)
+    assert np.isfinite(energies).all()

@@ -69,6 +69,8 @@ LEVELS: Options = {"pc_type": "gamg"}
 # on the finest level: one step, with blocks of a node's dofs, within bounds of their own spectrum
 BY_NODES: Options = {"pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"}
 STRONG_LINKS: Options = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
+# on several ranks PETSc (3.22) coarsens the square of a graph of strong links, since it does not end without (MISk)
+STRONG_LINKS_ON_RANKS: Options = STRONG_LINKS | {"pc_gamg_aggressive_square_graph": True}
 ALL_LINKS: Options = {"pc_gamg_threshold": 0.0, "pc_gamg_aggressive_square_graph": True}
 SLOW = 25  # iterations of a whole body from which on aggregates of strong links are tried
 WORTH_IT = 0.9  # of these iterations, which they may take at most
@@ -315,7 +317,8 @@ class Preconditioner:
         self._all_links_its = its if worse and not all_links else (None if all_links else 0)
         if worse:
             self._by_nodes = self._large
-            self._become(ALL_LINKS if all_links else STRONG_LINKS)
+            strong = STRONG_LINKS if self._ksp.comm.size == 1 else STRONG_LINKS_ON_RANKS
+            self._become(ALL_LINKS if all_links else strong)
             self._fresh_its = 0
         return worse
 
