@@ -243,12 +243,12 @@ def list_(
     """Show the studies, builders, energies and schemes that exist, or a table of materials."""
     if not is_first_rank():
         return
-    from .study.catalogue import catalogue, table_of_materials
+    from .study.catalogue import catalogue, material_table
 
     if what is not None:
         if what != "materials":
             raise InputError(f'list {what}: there is "fracsim list" and "fracsim list materials"')
-        print("\n".join(table_of_materials()))
+        print("\n".join(material_table()))
         return
     for heading, entries in catalogue().items():
         print(heading)

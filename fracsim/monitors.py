@@ -61,7 +61,7 @@ class Watched:
         self._study, self.history, self.meter = study, history, meter
         self.inverted = InvertedCells(stress, scene.fracture)
         floor = worth_telling(stress)
-        self.gained = EnergyGain(at_rest=study.at_rest, floor=floor, thickness=study.thickness)
+        self.gained = EnergyGain(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
         self.meetings, self.overlapping = _of_obstacles(scene)
         self.passing, self.drop = _passing(study), _load_drop(study)
         those = (self.meetings, self.overlapping, self.passing, self.drop)
@@ -124,7 +124,7 @@ class Watched:
         if self.overlapping is not None:
             notes += self.overlapping.notes()
         if self.passing is not None:
-            notes += self.passing.notes(implicit=time.kind.implicit)
+            notes += self.passing.notes(implicit=time.scheme_class.implicit)
         return notes
 
 
@@ -146,7 +146,7 @@ def _of_obstacles(scene: Scene) -> tuple[Meetings | None, Overlapping | None]:
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
     meetings = Meetings(cast("list[Met]", terms))
     watched = [term for term in terms if isinstance(term, Obstacles)]
-    if not watched or len(obstacles) == 1 or not any(each.free for each in obstacles):
+    if not watched or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
         return meetings, None
     from .output.obstacle_overlap_check import Overlapping
 
@@ -168,4 +168,4 @@ def _load_drop(study: Study) -> LoadDrop | None:
         return None
     from .output.load_drop import LoadDrop
 
-    return LoadDrop(study.watched, until.drop, until.above, breaks=study.fracture is not None)
+    return LoadDrop(study.monitored_load, until.drop, until.above, breaks=study.fracture is not None)

@@ -125,7 +125,7 @@ class RigidRun:
         state, split = self.state, stepper.copies.split_cells
         lost = self._start + state.work - report.kinetic
         self.history.append_row([
-            state.step, state.t, self.scene.study.time.longest, report.kinetic, 0.0, lost, state.work, self.broken,
+            state.step, state.t, self.scene.study.time.max_step, report.kinetic, 0.0, lost, state.work, self.broken,
             split, stepper.count, report.blows + report.loads, report.krylov, report.seconds,
             *map(float, report.pushed.flat), *map(float, report.worked),
             *map(float, stepper.others.readings(state.bodies)),
@@ -217,7 +217,7 @@ class RigidRun:
                 raise self._stopped()
 
     def _tell(self, report: RigidReport) -> None:
-        state, pieces, dt = self.state, self.scene.stepper.count, self.scene.study.time.longest
+        state, pieces, dt = self.state, self.scene.stepper.count, self.scene.study.time.max_step
         more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
         self._progress.update(Done(state.t, dt, state.step, self.broken, pieces, more))
 

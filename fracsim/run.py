@@ -30,8 +30,8 @@ from .output.summary import Meter, say, write_summary
 from .process import import_outside
 from .scene import Scene, build_scene
 from .study import Study
-from .study.conditions import cracks
-from .study.reader import completed, study_text
+from .study.conditions import initial_cracks
+from .study.reader import add_missing_defaults, study_text
 from .timestepping.stepper import Abandoned, StepReport
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class Run:
         self.state = scene.stepper.resume(state)
         asked = scene.study.model_dump(mode="json")["time"]["step"]
         if notes.values()["time"]["step"] != asked:  # else the size of the last step goes on
-            self.state = replace(self.state, dt=scene.study.time.longest)
+            self.state = replace(self.state, dt=scene.study.time.max_step)
         return notes
 
     def _prepare(self, notes: Notes | None, check: Callable[[], None]) -> None:
@@ -143,7 +143,7 @@ class Run:
         from .output.crack_length import CrackFront
 
         assert self.breaks.record is not None
-        return CrackFront(self.breaks.record, cracks(study, self.scene.domain.dim))
+        return CrackFront(self.breaks.record, initial_cracks(study, self.scene.domain.dim))
 
     @property
     def ended(self) -> bool:
@@ -424,7 +424,7 @@ def _check(
         study.mesh.shell,
         *(each.file for each in study.obstacle),
     )
-    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=completed)
+    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults)
 
 
 def _draw(folder: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings
 
 from fracsim.meshes.data import MeshData
-from fracsim.study import Mesh, check
+from fracsim.study import MeshSettings, check
 from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
@@ -41,7 +41,7 @@ def meshes_built_once() -> Iterator[None]:
     is tested by themselves."""
     build, built = check.build_mesh, {}
 
-    def build_once(mesh: Mesh, *surface: Any) -> MeshData:
+    def build_once(mesh: MeshSettings, *surface: Any) -> MeshData:
         if mesh.builder is None:
             return build(mesh, *surface)
         key = repr(mesh)
@@ -59,7 +59,7 @@ def meshes_built_once() -> Iterator[None]:
 @pytest.fixture
 def little_built(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check` measures the loads of small meshes alone: it builds those of up to 60,000 cells."""
-    monkeypatch.setattr(check, "MOST_CELLS", 3000)
+    monkeypatch.setattr(check, "MAX_CHECK_CELLS", 3000)
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

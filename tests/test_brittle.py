@@ -21,7 +21,7 @@ from fracsim.fracture.brittle.surface_pass import Starts
 from fracsim.meshes.data import MeshData
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
-from fracsim.study import Mesh
+from fracsim.study import MeshSettings
 from fracsim.study.mesh_source import build_mesh
 from support.brittle import cut_points, enclosed, open_at, scene_surface, volume_above
 from support.laws import rotation
@@ -34,7 +34,7 @@ ROUND_OFF = 1e3 * EPS  # of sums over some thousand triangles
 
 def box(dim: int, h: float = 0.1) -> MeshData:
     size = [1.0, 0.8, 0.5][:dim]
-    return build_mesh(Mesh.model_validate({"builder": "box", "size": size, "h": h, "pattern": "unstructured"}))
+    return build_mesh(MeshSettings.model_validate({"builder": "box", "size": size, "h": h, "pattern": "unstructured"}))
 
 
 def stretched(dim: int, n: list[float], stretch: float = 0.06) -> Any:
@@ -138,7 +138,7 @@ def test_split_cells_carry_nothing_and_idle_edges_break() -> None:
 
 def test_nodes_on_the_surface_are_decided_by_the_mesh() -> None:
     """A plane through a layer of nodes of a regular lattice: the same edges whatever the round-off of the direction."""
-    mesh = build_mesh(Mesh.model_validate({"builder": "box", "size": [1.0, 1.0], "h": 0.125}))
+    mesh = build_mesh(MeshSettings.model_validate({"builder": "box", "size": [1.0, 1.0], "h": 0.125}))
     found = []
     for tilt in (-1e-10, 0.0, 1e-10):
         for sense in (1, -1):  # through the diagonals of the lattice
@@ -188,7 +188,7 @@ def test_a_gap_is_not_jumped() -> None:
 
 def test_a_shell_of_one_cell_is_cut_through() -> None:
     """A plate as thick as a cell: two pieces."""
-    mesh = build_mesh(Mesh.model_validate({"builder": "box", "size": [1.0, 1.0, 0.1], "h": 0.1}))
+    mesh = build_mesh(MeshSettings.model_validate({"builder": "box", "size": [1.0, 1.0, 0.1], "h": 0.1}))
     made = open_at(mesh, [[0.52, 0.47, 0.05]], [[1.0, 0.2, 0.1]], settle=True)
     assert made.surface.pieces == 2 and made.volumes.min() > 0.3 * 0.1
 
@@ -481,7 +481,9 @@ def test_check_tells_and_a_typing_error_is_named(tmp_path: Path) -> None:
 
 def test_no_node_of_a_thin_plate_is_left_without_a_whole_cell() -> None:
     """Planes at any angle through a plate about one cell thick, which as they are would leave two nodes each, or so."""
-    body = Body(build_mesh(Mesh.model_validate({"builder": "box", "size": [1.0, 0.8, 0.07], "h": 0.06} | UNSTRUCTURED)))
+    body = Body(
+        build_mesh(MeshSettings.model_validate({"builder": "box", "size": [1.0, 0.8, 0.07], "h": 0.06} | UNSTRUCTURED))
+    )
     draw, every = np.random.default_rng(0), np.ones(len(body.cells), bool)
     left = np.zeros((100, 2), int)
     for trial in left:

@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay
 
 from fracsim.fracture.edge_history import EdgeRecord
 from fracsim.output.crack_length import CrackFront
-from fracsim.study.conditions import cracks as given
+from fracsim.study.conditions import initial_cracks as given
 from support.scenes import make_scene
 
 

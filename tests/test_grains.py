@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from fracsim.fracture.brittle.grains import GrainRules, Grains, least, sow
 from fracsim.fracture.brittle.surface_cut import Body
 from fracsim.meshes.data import MeshData
-from fracsim.study import Mesh
+from fracsim.study import MeshSettings
 from fracsim.study.mesh_source import build_mesh
 from support.brittle import Broken, cut_points, open_at
 
@@ -22,7 +22,7 @@ ROUND_OFF = 1e3 * np.finfo(float).eps
 def box(dim: int, h: float = 0.0) -> MeshData:
     h = h or {2: 0.06, 3: 0.08}[dim]
     size = [1.0, 0.8, 0.5][:dim]
-    return build_mesh(Mesh.model_validate({"builder": "box", "size": size, "h": h, "pattern": "unstructured"}))
+    return build_mesh(MeshSettings.model_validate({"builder": "box", "size": size, "h": h, "pattern": "unstructured"}))
 
 
 def grains_of(dim: int, settle: bool = False, **table: Any) -> tuple[Body, Grains]:
@@ -84,7 +84,7 @@ def test_small_grains_of_a_thin_slab_leave_no_node_alone(seed: int) -> None:
     """Two cells thick, 2.5 edges to a grain: one node in ten has no cell in its grain as they are; moved all at once
     one in two hundred keeps none (three of these four seeds), one after the other none."""
     slab = {"builder": "box", "size": [0.2, 0.2, 0.02], "h": 0.012, "pattern": "unstructured"}
-    body = Body(build_mesh(Mesh.model_validate(slab)))
+    body = Body(build_mesh(MeshSettings.model_validate(slab)))
     rules = GrainRules(75, seed, 0.2, "bias")
     plain, settled = (Grains(body, rules, settle) for settle in (False, True))
     assert lost(body, plain).sum() > 50 and not lost(body, settled).any()

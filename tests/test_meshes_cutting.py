@@ -206,7 +206,7 @@ def test_plane_quadrilaterals(tmp_path: Path) -> None:
 
 def test_join_of_a_study_makes_parts_one_body(tmp_path: Path) -> None:
     """Two boxes with a common face, in millimetres, of hexahedra and of tetrahedra."""
-    from fracsim.study import Mesh
+    from fracsim.study import MeshSettings
     from fracsim.study.mesh_source import build_mesh
 
     box = np.array([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
@@ -214,8 +214,8 @@ def test_join_of_a_study_makes_parts_one_body(tmp_path: Path) -> None:
     path = tmp_path / "two.vtu"
     points, cells = np.concatenate([box, box + np.eye(3)[0]]), np.concatenate([first, first + 8])
     meshio.Mesh(points, [("hexahedron", cells)]).write(path)
-    apart = build_mesh(Mesh.model_validate({"file": path, "scale": 1e-3}))
+    apart = build_mesh(MeshSettings.model_validate({"file": path, "scale": 1e-3}))
     assert any("8 nodes coincide with nodes of another body" in note for note in apart.notes)
-    joined = build_mesh(Mesh.model_validate({"file": path, "scale": 1e-3, "join": True}))
+    joined = build_mesh(MeshSettings.model_validate({"file": path, "scale": 1e-3, "join": True}))
     assert (len(apart.points), len(joined.points)) == (16, 12)
     assert joined.notes[-1] == "4 nodes were joined with coincident nodes of another body: 2 bodies are 1 now."

@@ -20,7 +20,7 @@ from fracsim.meshes.surfaces.fill import fill_surface
 from fracsim.meshes.surfaces.repair import read_body, repaired
 from fracsim.meshes.surfaces.self_intersection import crossing_triangles
 from fracsim.meshes.topology import signed_measures
-from fracsim.study import Mesh
+from fracsim.study import MeshSettings
 from fracsim.study.mesh_source import build_mesh, open_surface
 
 trimesh = pytest.importorskip("trimesh")
@@ -311,8 +311,8 @@ def test_what_cuts_itself_after_the_repair_is_refused(tmp_path: Path, monkeypatc
             read_body(saved(tmp_path, damaged), repair=True)
 
 
-def table(path: Path, **keys: object) -> Mesh:
-    return Mesh.model_validate({"surface": path, "h": 0.5} | keys)
+def table(path: Path, **keys: object) -> MeshSettings:
+    return MeshSettings.model_validate({"surface": path, "h": 0.5} | keys)
 
 
 def test_the_study_names_the_key(tmp_path: Path) -> None:

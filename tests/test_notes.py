@@ -15,13 +15,13 @@ from mpi4py import MPI
 from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError
 from fracsim.scene import build_scene
-from fracsim.study.check import check_study, checked_mesh
+from fracsim.study.check import build_checked_mesh, check_study
 from fracsim.study.material_library import MATERIALS
 from fracsim.study.mesh_source import build_mesh
-from fracsim.study.overlap_checks import least_coordinates
+from fracsim.study.overlap_checks import containment_depth
 from fracsim.study.reader import load_study, validate
-from fracsim.study.step_checks import QUADRATIC, explicit_step
-from fracsim.study.unit_checks import questions
+from fracsim.study.step_checks import QUADRATIC, estimated_explicit_step
+from fracsim.study.unit_checks import unit_questions
 
 HELD = [{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}]
 
@@ -125,7 +125,7 @@ SLIPS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def asked(data: dict[str, Any], side: float = 0.1) -> list[str]:
-    return [line for line in questions(validate(data, "test.toml"), side) if line.startswith("question")]
+    return [line for line in unit_questions(validate(data, "test.toml"), side) if line.startswith("question")]
 
 
 @pytest.mark.parametrize("slip", SLIPS)
@@ -134,7 +134,7 @@ def test_a_figure_of_another_unit_is_asked_about(slip: str) -> None:
     tables, question = SLIPS[slip]
     data = changed(SI, **tables)
     side = max(data["mesh"]["size"])
-    assert question in "\n".join(questions(validate(data, "test.toml"), side)) and len(asked(data, side)) == 1
+    assert question in "\n".join(unit_questions(validate(data, "test.toml"), side)) and len(asked(data, side)) == 1
 
 
 def test_questions_are_part_of_check() -> None:
@@ -149,7 +149,7 @@ def test_questions_are_part_of_check() -> None:
 def test_all_that_is_in_mm_tonnes_and_megapascals_is_asked_about() -> None:
     """A study of Abaqus' habits: side, density and Young's modulus."""
     habits = changed(SI, material={"young": 2.1e5, "density": 7.85e-9}, fracture={"strength": 600.0, "energy": 20.0})
-    found = "\n".join(questions(validate(habits, "test.toml"), 100.0))
+    found = "\n".join(unit_questions(validate(habits, "test.toml"), 100.0))
     for part in ("is the mesh in mm?", "is it in t/mm^3?", "is it in MPa? Then it is 2.1e+11 Pa"):
         assert part in found
 
@@ -164,7 +164,7 @@ def test_no_material_that_there_is_is_asked_about(name: str) -> None:
 
 def test_no_packaged_study_is_asked_about() -> None:
     for path in (Path(__file__).parent.parent / "studies").glob("*.toml"):
-        assert list(questions(load_study(path), 1.0)) == [], path.name
+        assert list(unit_questions(load_study(path), 1.0)) == [], path.name
 
 
 def test_large_strains_of_glass_are_not_worth_their_price() -> None:
@@ -198,9 +198,9 @@ def test_the_step_that_check_tells_is_the_one_that_is_taken(base: dict[str, Any]
     scene = build_scene(MPI.COMM_SELF, of)
     _, report = scene.stepper.advance(scene.start())
     mesh = build_mesh(of.mesh)
-    told = explicit_step(of, mesh.dim, 0.06, mesh)
+    told = estimated_explicit_step(of, mesh.dim, 0.06, mesh)
     assert report.dt == pytest.approx(told, rel=1e-3)
-    assert explicit_step(of, mesh.dim, 0.06, None) == pytest.approx(told, rel=0.35)
+    assert estimated_explicit_step(of, mesh.dim, 0.06, None) == pytest.approx(told, rel=0.35)
 
 
 def test_quadratic_cells_have_the_bound_of_the_stepper() -> None:
@@ -264,7 +264,7 @@ def test_what_overlaps_at_the_start_is_refused_by_check_and_by_the_run(name: str
     data = changed(base, obstacle=entries, time=time)
     if time and "fracture" in data:
         data["time"]["end"] = 0.01
-    for work in (check_study, checked_mesh):
+    for work in (check_study, build_checked_mesh):
         with pytest.raises(InputError, match=re.escape(message)):
             work(validate(data, "test.toml"))
 
@@ -316,8 +316,8 @@ def test_points_of_a_mesh_lie_in_it() -> None:
         mesh = build_mesh(study(base, mesh={"pattern": "unstructured", "h": 0.1}).mesh)
         weights = random.dirichlet(np.ones(mesh.dim + 1), 300)
         x = np.einsum("nk,nkd->nd", weights, mesh.points[mesh.cells[random.integers(len(mesh.cells), size=300)]])
-        np.testing.assert_allclose(least_coordinates(x, mesh), weights.min(axis=1), atol=1e-9)
-        assert (least_coordinates(x + 2.0, mesh) == -1.0).all()
+        np.testing.assert_allclose(containment_depth(x, mesh), weights.min(axis=1), atol=1e-9)
+        assert (containment_depth(x + 2.0, mesh) == -1.0).all()
 
 
 @pytest.mark.parametrize("copies", [[1000, 1000, 100], [100, 100, 20]])

@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import edges_of
-from fracsim.study import Mesh
+from fracsim.study import MeshSettings
 from fracsim.study.mesh_source import build_mesh
 from support.ranks import Arrays, OnRanks, run_on_ranks
 from support.reference import gradients, lumped_mass
@@ -39,7 +39,7 @@ def results(on_ranks: OnRanks) -> Results:
 @cache
 def mesh_named(name: str) -> MeshData:
     """An input mesh, built here."""
-    return build_mesh(Mesh.model_validate(MESHES[name]))
+    return build_mesh(MeshSettings.model_validate(MESHES[name]))
 
 
 # --- non-local average ---

@@ -13,11 +13,11 @@ from pydantic import BaseModel
 from cases import STRIP, changed
 from fracsim.errors import InputError
 from fracsim.meshes import BUILDERS
-from fracsim.study import Study, Table
-from fracsim.study.body import Mesh
+from fracsim.study import Study, StudyTable
+from fracsim.study.body import MeshSettings
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate
-from fracsim.study.rigid_bodies import Body
+from fracsim.study.rigid_bodies import BodySettings
 from fracsim.study.values import TimeTable
 
 Data = dict[str, Any]
@@ -92,11 +92,11 @@ def name_of(path: Path) -> str:
 def test_the_study_has_every_table() -> None:
     """So that a new table comes into the test below."""
     there = {type(table) for _, table in FOUND}
-    timed = {kind for kind in kinds(Table) if issubclass(kind, TimeTable)}
+    timed = {kind for kind in kinds(StudyTable) if issubclass(kind, TimeTable)}
     assert there & timed
-    bases = {kind for kind in kinds(Table) if kind.__subclasses__()}  # of tables
-    rigid = {Body}  # of studies that have no boundary
-    assert {*kinds(Table), Mesh} - bases - timed - there == rigid
+    bases = {kind for kind in kinds(StudyTable) if kind.__subclasses__()}  # of tables
+    rigid = {BodySettings}  # of studies that have no boundary
+    assert {*kinds(StudyTable), MeshSettings} - bases - timed - there == rigid
     assert not any(field.is_required() for kind in rigid for field in kind.model_fields.values())
     assert {name_of(path) for path in REQUIRED} >= {"time.step", "time.end", "title", "boundary.1.pressure.time"}
     assert Study in there

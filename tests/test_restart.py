@@ -30,7 +30,7 @@ from fracsim.output.run_folder import differences
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh, save_mesh
-from fracsim.study.reader import completed, study_text
+from fracsim.study.reader import add_missing_defaults, study_text
 
 Data = dict[str, Any]
 Values = npt.NDArray[Any]
@@ -294,10 +294,10 @@ def test_keys_that_an_earlier_version_did_not_know_have_their_defaults() -> None
     now = tomllib.loads(study_text(study(TEARING)))
     then = copy.deepcopy(now)
     assert then["fracture"].pop("crumbs") is True and then["mesh"].pop("order") == 1
-    assert completed(then) == now
+    assert add_missing_defaults(then) == now
     then["fracture"]["strength"] *= 2
-    assert [each.split()[0] for each in differences(completed(then), now)] == ["fracture.strength"]
-    assert completed({"mesh": {"forgotten": 1}}) == {"mesh": {"forgotten": 1}}
+    assert [each.split()[0] for each in differences(add_missing_defaults(then), now)] == ["fracture.strength"]
+    assert add_missing_defaults({"mesh": {"forgotten": 1}}) == {"mesh": {"forgotten": 1}}
 
 
 @pytest.mark.parametrize("ranks", [0, 2])

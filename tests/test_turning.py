@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fracsim.study.check import check_study
-from fracsim.study.length_checks import turned
+from fracsim.study.length_checks import estimated_rotation
 from support.scenes import make_study
 
 STIFF: dict[str, Any] = {
@@ -20,7 +20,7 @@ SPEED = 5e6 / math.sqrt(1e10 * 2500.0)  # m/s, at which it breaks
 
 
 def angle(**tables: Any) -> float:
-    return turned(make_study(**STIFF | tables), 2, 0.1)
+    return estimated_rotation(make_study(**STIFF | tables), 2, 0.1)
 
 
 def test_what_is_fastest_counts() -> None:

@@ -32,9 +32,9 @@ from ..mesh.parallel import on_root  # noqa: E402
 from ..output.history import Probe, Probes  # noqa: E402
 from ..solvers.nonlinear_solver import Solver  # noqa: E402
 from ..solvers.weak_callbacks import free_dropped  # noqa: E402
-from ..study import Study, Time  # noqa: E402
-from ..study.check import checked_mesh  # noqa: E402
-from ..study.conditions import initial_motion, obstacles, of_size, place_of, step_course  # noqa: E402
+from ..study import Study, TimeSettings  # noqa: E402
+from ..study.check import build_checked_mesh  # noqa: E402
+from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
 from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
 from ..timestepping.protocols import Breaking, Flow, Unbreakable  # noqa: E402
 from ..timestepping.state import State  # noqa: E402
@@ -87,7 +87,7 @@ def build_scene(comm: MPI.Comm, study: Study, stage: Callable[[str], None] = lam
     `stage`: is told what is done from now on (collective).
     """
     stage("building the mesh" if study.mesh.builder else "reading the mesh")
-    mesh = on_root(comm, lambda: checked_mesh(study))
+    mesh = on_root(comm, lambda: build_checked_mesh(study))
     stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
     return scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
 
@@ -112,23 +112,25 @@ def scene_on(
     solver = Solver(balance, study.solver) if scheme.implicit else None
     breaks, frames = breaking or Unbreakable(balance, flow), study.frame_interval
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
-    ways = {each.name: each.moved for each in obstacles(study, domain.dim) if each.moved is not None}
+    ways = {
+        each.name: each.displacement for each in obstacle_placements(study, domain.dim) if each.displacement is not None
+    }
     probes = Probes(balance, _probes(study, domain), ways=ways, thickness=study.thickness)
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
 
 
-def make_scheme(timing: Time) -> Scheme:
+def make_scheme(timing: TimeSettings) -> Scheme:
     """The time scheme of a study."""
-    return timing.kind(**timing.parameters)
+    return timing.scheme_class(**timing.scheme_parameters)
 
 
 def make_stepper(
-    balance: Balance, timing: Time, flow: Flow, breaking: Breaking, solver: Solver | None, frames: float = 0.0
+    balance: Balance, timing: TimeSettings, flow: Flow, breaking: Breaking, solver: Solver | None, frames: float = 0.0
 ) -> Stepper:
     """What steps a balance of this scheme; `frames`: s between times at which steps end, 0: they need not."""
-    smallest, course = timing.smallest or timing.shortest / 1024, step_course(timing)
+    smallest, course = timing.smallest or timing.min_step / 1024, step_size_function(timing)
     sizes = StepSizes(
-        timing.longest, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course, frames
+        timing.max_step, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course, frames
     )  # fmt: skip
     if solver is None:
         from ..timestepping.explicit import ExplicitStepper
@@ -149,10 +151,10 @@ def _probes(study: Study, domain: Domain) -> list[Probe]:
     for i, entry in enumerate(study.probe):
         if entry.point is not None:
             key = f"probe.{i}.point"
-            nodes = domain.nearest_node(of_size(entry.point, domain.dim, key), key)
+            nodes = domain.nearest_node(check_size(entry.point, domain.dim, key), key)
         else:
             assert entry.on is not None
             key = f"probe.{i}.on"
-            nodes = domain.nodes_of(place_of(entry.on, domain.dim, key), key)
+            nodes = domain.nodes_of(find_selector(entry.on, domain.dim, key), key)
         probes.append(Probe(entry.name, entry.quantity, nodes))
     return probes

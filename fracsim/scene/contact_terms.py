@@ -26,10 +26,10 @@ from ..mechanics.stress import Stress
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root
-from ..study import Contact, Study
-from ..study.conditions import Loose, Placing, obstacles
-from ..study.mesh_source import open_solid
-from ..study.overlap_checks import shape_of
+from ..study import ContactSettings, Study
+from ..study.conditions import FreeObstacleMotion, ObstaclePlacement, obstacle_placements
+from ..study.mesh_source import read_obstacle_surface
+from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.penalty_law import Penalty
@@ -82,7 +82,7 @@ def explicit_obstacles_of(
     return set_down(domain, entries, law, partial(kind, domain, u, mass=mass, most=most), mutual=False)
 
 
-def _most_added(contact: Contact, domain: Domain, stress: Stress) -> float:
+def _most_added(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
     """What a penalty may add to the square of the highest frequency, 1/s^2 (collective)."""
     from ..timestepping.stable_time_step import cell_frequencies
 
@@ -101,7 +101,7 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
         raise InputError(
             'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
         ) from None
-    every = enumerate(obstacles(study, domain.dim))
+    every = enumerate(obstacle_placements(study, domain.dim))
     entries = {number: _solid(domain.comm, each, number) for number, each in every if each.shape == "mesh"}
     contact = _contact(study)
     law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
@@ -112,8 +112,8 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     from ..contact.mesh_rigid_term import FreeSolids
     from ..contact.supporting_obstacles import before_solids
 
-    every = enumerate(obstacles(study, domain.dim))
-    rest = {number: each for number, each in every if each.shape != "mesh" and each.loose is None}
+    every = enumerate(obstacle_placements(study, domain.dim))
+    rest = {number: each for number, each in every if each.shape != "mesh" and each.free_motion is None}
     free = [each for each in entries.values() if each.free]
     shapes = {number: _obstacle(each, number) for number, each in rest.items()}
     others = before_solids(shapes, free, law.barrier.width, domain.mean_edge)
@@ -123,28 +123,30 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     return _with_room(made, how, contact, "an obstacle from a file and the body")
 
 
-def _solid(comm: MPI.Intracomm, entry: Placing, number: int) -> Obstacle:
+def _solid(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> Obstacle:
     """Read on rank 0 (collective)."""
     from ..contact.triangle_mesh_shape import Solid
 
     given = entry.geometry
-    surface = from_root(comm, lambda: open_solid(given["file"], given.get("scale", 1.0), f"obstacle.{number}"))
+    surface = from_root(
+        comm, lambda: read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
+    )
     solid = Solid(surface.points, surface.triangles)
-    if entry.loose is not None:
-        return _free_solid(entry, entry.loose, solid)
-    return Obstacle(entry.name, solid, entry.at, entry.moved, entry.friction, entry.spin)
+    if entry.free_motion is not None:
+        return _free_solid(entry, entry.free_motion, solid)
+    return Obstacle(entry.name, solid, entry.reference_point, entry.displacement, entry.friction, entry.spin)
 
 
-def _free_solid(entry: Placing, loose: Loose, solid: Solid) -> Obstacle:
+def _free_solid(entry: ObstaclePlacement, loose: FreeObstacleMotion, solid: Solid) -> Obstacle:
     """One with a mass: it moves about its centre of mass, or turns about its hinge."""
     from ..contact.obstacle import FreeObstacle
 
     density, own = loose.density or (loose.mass or 0.0) / solid.volume, solid.centre
-    at = entry.at + own if loose.hinge is None else loose.hinge
-    solid = solid.shifted(entry.at - at)
+    at = entry.reference_point + own if loose.hinge is None else loose.hinge
+    solid = solid.shifted(entry.reference_point - at)
     return FreeObstacle(
         entry.name, solid, at, friction=entry.friction, mass=density * solid.volume, inertia=solid.inertia(density),
-        ways=loose.ways, centre=entry.at + own - at, gravity=loose.gravity, rate=loose.rate,
+        ways=loose.pose_basis, centre=entry.reference_point + own - at, gravity=loose.gravity, rate=loose.initial_rate,
     )  # fmt: skip
 
 
@@ -186,7 +188,7 @@ def _self_contact(
     return _with_room(made, law, contact, "parts of the body")
 
 
-def _with_room(made: Callable[[Any], Any], law: Any, contact: Contact, what: str) -> Any:
+def _with_room(made: Callable[[Any], Any], law: Any, contact: ContactSettings, what: str) -> Any:
     """The term that is `made` of a law whose barrier begins below half of the gap at rest between `what` (collective).
 
     InputError where the study gives a distance that is more than the gap.
@@ -206,41 +208,41 @@ def _with_room(made: Callable[[Any], Any], law: Any, contact: Contact, what: str
 def obstacle_entries(study: Study, dim: int) -> list[Obstacle]:
     """Obstacles that are felt by their distance: all but those from files. InputError where one does not fit the
     dimension, or is no shape."""
-    every = enumerate(obstacles(study, dim))
+    every = enumerate(obstacle_placements(study, dim))
     return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
 
 
 def every_obstacle(study: Study) -> list[Obstacle]:
     """Of a body in space on one rank, in the order of the study, those from files too."""
-    every = enumerate(obstacles(study, 3))
+    every = enumerate(obstacle_placements(study, 3))
     return [_solid(MPI.COMM_SELF, each, k) if each.shape == "mesh" else _obstacle(each, k) for k, each in every]
 
 
-def _obstacle(entry: Placing, number: int) -> Obstacle:
-    shape = shape_of(entry, number)
-    if entry.loose is not None:
-        return _free_obstacle(entry, entry.loose, shape)
-    return Obstacle(entry.name, shape, entry.at, entry.moved, entry.friction)
+def _obstacle(entry: ObstaclePlacement, number: int) -> Obstacle:
+    shape = build_shape(entry, number)
+    if entry.free_motion is not None:
+        return _free_obstacle(entry, entry.free_motion, shape)
+    return Obstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
 
 
-def _free_obstacle(entry: Placing, loose: Loose, shape: Shape) -> Obstacle:
+def _free_obstacle(entry: ObstaclePlacement, loose: FreeObstacleMotion, shape: Shape) -> Obstacle:
     """One with a mass; on a hinge it is placed, and turns, about that."""
     from ..contact.obstacle import FreeObstacle
     from ..contact.offset_shape import Shifted
 
     density = loose.density or (loose.mass or 0.0) / shape.volume
-    at, centre = entry.at, 0 * entry.at
+    at, centre = entry.reference_point, 0 * entry.reference_point
     if loose.hinge is not None:
-        at, centre = loose.hinge, entry.at - loose.hinge
+        at, centre = loose.hinge, entry.reference_point - loose.hinge
         shape = Shifted(shape, centre)
     return FreeObstacle(
         entry.name, shape, at, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
-        ways=loose.ways, centre=centre, gravity=loose.gravity, rate=loose.rate,
+        ways=loose.pose_basis, centre=centre, gravity=loose.gravity, rate=loose.initial_rate,
     )  # fmt: skip
 
 
-def _contact(study: Study) -> Contact:
-    return study.contact or Contact()
+def _contact(study: Study) -> ContactSettings:
+    return study.contact or ContactSettings()
 
 
 def _straight(study: Study) -> bool:
@@ -248,7 +250,9 @@ def _straight(study: Study) -> bool:
     return study.mesh.order == 2 and study.fracture is not None
 
 
-def _law(contact: Contact, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier) -> Law:
+def _law(
+    contact: ContactSettings, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
+) -> Law:
     distance = contact.distance or DISTANCE * domain.mean_edge
     return Law(
         barrier(contact.stiffness or STIFFNESS * _young(domain, material), distance),

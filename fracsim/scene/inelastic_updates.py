@@ -10,9 +10,9 @@ import numpy.typing as npt
 from ..mechanics.balance import Balance
 from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
-from ..study import Brittle, Study
-from ..study.conditions import cracks, fibre_direction
-from ..study.energy_checks import refuse_forks
+from ..study import BrittleSettings, Study
+from ..study.conditions import fibre_direction, initial_cracks
+from ..study.energy_checks import check_branching_dimension
 from ..timestepping.protocols import Flow, NoFlow
 from .material_model import per_cell
 
@@ -73,7 +73,7 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     from ..fracture.fracture_pass import Breaking
 
     assert study.fracture is not None and study.fracture.energy is not None
-    refuse_forks(study, balance.domain.dim)
+    check_branching_dimension(study, balance.domain.dim)
     if study.fracture.law == "cohesive":
         return _cohesive(study, balance, graph, passes, opened)
     stress, strength = balance.stress, strength_of(study, balance.domain, graph)
@@ -119,7 +119,7 @@ def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
         return None
     from ..fracture.initial_cracks import open_cracks
 
-    return open_cracks(graph, cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
+    return open_cracks(graph, initial_cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
 
 
 def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | Holding | BrittleSurfaces:
@@ -144,7 +144,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strengt
     """What nodes without a whole cell stay joined by."""
     table = study.fracture
     assert table is not None
-    if not table.joins(study.material.energy):
+    if not table.retains_nodes(study.material.energy):
         return None
     from ..fracture.node_retention import Joining
 
@@ -180,7 +180,7 @@ def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -
     return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def surface_rules(table: Brittle, copy: int = 0) -> SurfaceRules:
+def surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceRules:
     """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
     from ..fracture.brittle.grains import GrainRules, SurfaceRules
 

@@ -34,7 +34,7 @@ def _flowing(study: Study, domain: Domain, material: MaterialFields) -> Material
         hardening=table.hardening,
         update=table.update,
     )
-    return plastic_material(domain, law, material, implicit=study.time.kind.implicit)
+    return plastic_material(domain, law, material, implicit=study.time.scheme_class.implicit)
 
 
 def per_cell(study: Study, domain: Domain, table: Any, key: str, special_key: str | None = None) -> PerCell:

@@ -28,10 +28,10 @@ from ..rigid.instance_placement import Place, Poses, motion, placed
 from ..rigid.instances import Copies
 from ..rigid.parallel_analyses import Analyses, serve
 from ..rigid.worker_ranks import lent
-from ..study import Contact, Study
-from ..study.check import checked_mesh
+from ..study import ContactSettings, Study
+from ..study.check import build_checked_mesh
 from ..study.conditions import volume_loads
-from ..study.overlap_checks import places_of
+from ..study.overlap_checks import body_placements
 from .contact_terms import every_obstacle
 from .inelastic_updates import average_of, strength_of, surface_rules
 from .material_model import material_of, per_cell
@@ -79,14 +79,14 @@ def build_rigid_scene(
 ) -> RigidScene:
     """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit. `heed`:
     is called before an analysis, and raises Abandoned where the run is to stop."""
-    single = checked_mesh(study)
+    single = build_checked_mesh(study)
     _check_shell(study, single)
-    places = places_of(study)
+    places = body_placements(study)
     copies, poses, density = _copies(study, single, places, heed), Poses.of(places), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
-    contact, obstacles = study.contact or Contact(), every_obstacle(study)
-    rules = Rules(study.time.longest, gravity, contact.friction, contact.restitution or 0.0)
+    contact, obstacles = study.contact or ContactSettings(), every_obstacle(study)
+    rules = Rules(study.time.max_step, gravity, contact.friction, contact.restitution or 0.0)
     hertz = Hertz(study.material.young, study.material.poisson)
     analyses = Analyses(copies, comm, (study, single, places))
     geometry = Geometry(single, poses)

@@ -22,7 +22,7 @@ from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Domain
 from ..study import Study
-from ..study.conditions import Condition, conditions, volume_loads
+from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Parts:
     stress: Stress
     mass: Mass
     motion: PrescribedMotion
-    conditions: list[Condition]
+    conditions: list[BoundaryCondition]
 
     @property
     def domain(self) -> Domain:
@@ -156,8 +156,8 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
 def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
     """The balance of a body of this material (collective). InputError where a place selects nothing."""
     assembler, u = Assembler(domain), fem.Function(domain.space, name="displacement")
-    entries = conditions(study, domain.dim)
-    moved = [each for each in entries if each.moves]
+    entries = boundary_conditions(study, domain.dim)
+    moved = [each for each in entries if each.prescribes_motion]
     nodes = [domain.nodes_of(each.place, f"{each.key}.on") for each in moved]
     motion = PrescribedMotion(
         domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
@@ -171,4 +171,4 @@ def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialF
     stress = Stress(assembler, u, material, weakening, floor=floor)
     parts = Parts(study, scheme, assembler, u, density, stress, mass, motion, entries)
     others = [term for make in TERMS.values() if (term := make(parts)) is not None]
-    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.longest)
+    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.max_step)

@@ -22,18 +22,35 @@ catalogue            `fracsim list`
 material_library     materials by name, and where their values come from
 """
 
-from .body import Damping, Elastic, Material, Mesh, Region
-from .boundary_conditions import CONDITIONS, MOTIONS, Boundary, Box, Initial, Load, Plane
-from .contact import Contact, Hinge, Obstacle
-from .fracture import Brittle, Crack, Fibre, Fracture, Grains, Heterogeneity, Plasticity
-from .rigid_bodies import Body
+from .body import DampingSettings, ElasticSettings, MaterialSettings, MeshSettings, RegionSettings
+from .boundary_conditions import (
+    CONDITIONS,
+    MOTIONS,
+    BoundarySettings,
+    BoxSelector,
+    InitialSettings,
+    LoadSettings,
+    PlaneSelector,
+)
+from .contact import ContactSettings, HingeSettings, ObstacleSettings
+from .fracture import (
+    BrittleSettings,
+    CrackSettings,
+    FibreSettings,
+    FractureSettings,
+    GrainSettings,
+    HeterogeneitySettings,
+    PlasticitySettings,
+)
+from .rigid_bodies import BodySettings
 from .study import Study
-from .time_and_output import FIELDS, Output, Probe, Time
-from .values import Table, TimeTable
+from .time_and_output import FIELDS, OutputSettings, ProbeSettings, TimeSettings
+from .values import StudyTable, TimeTable
 
 __all__ = [
-    "CONDITIONS", "FIELDS", "MOTIONS", "Body", "Boundary", "Box", "Brittle", "Contact", "Crack", "Damping", "Elastic",
-    "Fibre",
-    "Fracture", "Grains", "Heterogeneity", "Hinge", "Initial", "Load", "Material", "Mesh", "Obstacle", "Output",
-    "Plane", "Plasticity", "Probe", "Region", "Study", "Table", "Time", "TimeTable",
+    "CONDITIONS", "FIELDS", "MOTIONS", "BodySettings", "BoundarySettings", "BoxSelector", "BrittleSettings",
+    "ContactSettings", "CrackSettings", "DampingSettings", "ElasticSettings", "FibreSettings", "FractureSettings",
+    "GrainSettings", "HeterogeneitySettings", "HingeSettings", "InitialSettings", "LoadSettings", "MaterialSettings",
+    "MeshSettings", "ObstacleSettings", "OutputSettings", "PlaneSelector", "PlasticitySettings", "ProbeSettings",
+    "RegionSettings", "Study", "StudyTable", "TimeSettings", "TimeTable",
 ]  # fmt: skip

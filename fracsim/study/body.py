@@ -7,12 +7,12 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from .values import LONGEST_REGION, NonNegative, Poisson, Positive, Strength, Table
+from .values import LONGEST_REGION, NonNegative, Poisson, Positive, Strength, StudyTable
 
 SOURCES = ("builder", "file", "surface", "outline", "shell")
 
 
-class Mesh(BaseModel):
+class MeshSettings(BaseModel):
     """`builder` with its own parameters, or `file` with named groups, or a closed `surface` or a plane `outline` filled
     at size `h`, or a `shell` of some thickness."""
 
@@ -26,7 +26,7 @@ class Mesh(BaseModel):
     order: Literal[1, 2] = 1  # of the displacement in a cell: linear or quadratic
 
     @model_validator(mode="after")
-    def _one_source(self) -> Mesh:
+    def _one_source(self) -> MeshSettings:
         given = [key for key in SOURCES if getattr(self, key) is not None]
         if len(given) != 1:
             found = " and ".join(given) or "none of them"
@@ -44,7 +44,7 @@ class Mesh(BaseModel):
         return dict(self.model_extra or {})
 
 
-class Elastic(Table):
+class ElasticSettings(StudyTable):
     """What may differ between the named regions of a mesh."""
 
     young: Positive  # Pa
@@ -52,7 +52,7 @@ class Elastic(Table):
     density: Positive  # kg/m^3
 
 
-class Region(Table):
+class RegionSettings(StudyTable):
     """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
 
     like: str | None = None  # name of a material that says what else differs: see materials
@@ -64,14 +64,14 @@ class Region(Table):
     yield_stress: Strength | None = None
 
 
-class Material(Elastic):
+class MaterialSettings(ElasticSettings):
     """[material]; tables inside it are regions."""
 
     like: str | None = None  # name of a material whose values those left out are: see materials
     energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
     plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
     thickness: Positive | None = None  # m, of a 2D mesh out of its plane; None: forces and energies are those of 1 m
-    regions: dict[str, Region] = Field(default_factory=dict)
+    regions: dict[str, RegionSettings] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod
@@ -84,7 +84,7 @@ class Material(Elastic):
 
     @field_validator("regions")
     @classmethod
-    def _names_are_short(cls, regions: dict[str, Region]) -> dict[str, Region]:
+    def _names_are_short(cls, regions: dict[str, RegionSettings]) -> dict[str, RegionSettings]:
         for name in regions:
             if len(name) > LONGEST_REGION or not name.isprintable():
                 raise ValueError(
@@ -94,13 +94,13 @@ class Material(Elastic):
         return regions
 
     @model_validator(mode="after")
-    def _plane_stress_needs_a_form(self) -> Material:
+    def _plane_stress_needs_a_form(self) -> MaterialSettings:
         if self.plane == "stress" and self.energy not in ("linear", "stvk"):
             raise ValueError(f'plane = "stress" is offered by the energies linear and stvk, not by {self.energy}')
         return self
 
 
-class Damping(Table):
+class DampingSettings(StudyTable):
     """Rayleigh damping a M + b K."""
 
     mass: NonNegative = 0.0  # a, 1/s

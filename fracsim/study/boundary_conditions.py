@@ -6,23 +6,23 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from .values import Finite, InTime, Motion, Positive, Table, Vector
+from .values import Finite, Motion, OverTime, Positive, StudyTable, Vector
 
 
-class Box(Table):
+class BoxSelector(StudyTable):
     """Nodes inside a box (m)."""
 
     box: Annotated[list[Vector], Field(min_length=2, max_length=2)]
 
     @model_validator(mode="after")
-    def _corners(self) -> Box:
+    def _corners(self) -> BoxSelector:
         lower, upper = self.box
         if any(a > b for a, b in zip(lower, upper, strict=False)):
             raise ValueError(f"box = {self.box}: give the lower corner first, then the upper one")
         return self
 
 
-class Plane(Table):
+class PlaneSelector(StudyTable):
     """Nodes on a plane, within `within` (m; default 1e-6 of the body's size)."""
 
     point: Vector
@@ -32,30 +32,32 @@ class Plane(Table):
 
 def _selector(value: Any) -> str:
     """Tag of a place: a group's name, a box or a plane."""
-    if isinstance(value, Box) or (isinstance(value, dict) and "box" in value):
+    if isinstance(value, BoxSelector) or (isinstance(value, dict) and "box" in value):
         return "<box>"
-    return "<plane>" if isinstance(value, dict | Plane) else "<group>"
+    return "<plane>" if isinstance(value, dict | PlaneSelector) else "<group>"
 
 
-Where = Annotated[
-    Annotated[str, Tag("<group>")] | Annotated[Box, Tag("<box>")] | Annotated[Plane, Tag("<plane>")],
+Selector = Annotated[
+    Annotated[str, Tag("<group>")] | Annotated[BoxSelector, Tag("<box>")] | Annotated[PlaneSelector, Tag("<plane>")],
     Discriminator(_selector),
 ]
 
 
-class Boundary(Table):
+class BoundarySettings(StudyTable):
     """[[boundary]]: one condition on a group of facets, a box or a plane. Give exactly one of the kinds."""
 
-    on: Where
+    on: Selector
     fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # components held at zero
-    displacement: InTime[Motion] | None = None  # m; "free" leaves a component alone
-    velocity: InTime[Motion] | None = None  # m/s
-    traction: InTime[Vector] | None = None  # Pa of the reference area
-    force: InTime[Vector] | None = None  # N in all, spread evenly over the reference area; 2D: on `material.thickness`
-    pressure: InTime[Finite] | None = None  # Pa, pushes where > 0, follows the surface
+    displacement: OverTime[Motion] | None = None  # m; "free" leaves a component alone
+    velocity: OverTime[Motion] | None = None  # m/s
+    traction: OverTime[Vector] | None = None  # Pa of the reference area
+    force: OverTime[Vector] | None = (
+        None  # N in all, spread evenly over the reference area; 2D: on `material.thickness`
+    )
+    pressure: OverTime[Finite] | None = None  # Pa, pushes where > 0, follows the surface
 
     @model_validator(mode="after")
-    def _one_condition(self) -> Boundary:
+    def _one_condition(self) -> BoundarySettings:
         if len(given := self._given()) != 1:
             kinds = ", ".join(CONDITIONS)
             raise ValueError(f"give exactly one of {kinds}; found {' and '.join(given) or 'none'}")
@@ -74,14 +76,14 @@ CONDITIONS = ("fix", "displacement", "velocity", "traction", "force", "pressure"
 MOTIONS = ("fix", "displacement", "velocity")
 
 
-class Load(Table):
+class LoadSettings(StudyTable):
     """[load]: forces on the whole body."""
 
     gravity: Vector | None = None  # m/s^2
-    body_force: InTime[Vector] | None = None  # N/m^3
+    body_force: OverTime[Vector] | None = None  # N/m^3
 
 
-class Initial(Table):
+class InitialSettings(StudyTable):
     """[initial]: velocity at the start, v = velocity + spin x (X - centre of mass)."""
 
     velocity: Vector | None = None  # m/s

@@ -7,7 +7,7 @@ import tomllib
 from ..forms.schemes import SCHEMES
 from ..meshes import BUILDERS
 from ..studies import folder
-from . import Time
+from . import TimeSettings
 from .material_library import MATERIALS
 
 ENERGIES = {
@@ -26,7 +26,7 @@ OBSTACLES = {
 }
 
 
-def table_of_materials() -> list[str]:
+def material_table() -> list[str]:
     """Lines for `fracsim list materials`."""
     head = f"{'':27}{'E, Pa':>9} {'nu':>5} {'rho':>6} {'f_t, Pa':>9} {'G_c, J/m^2':>10} {'l_ch, m':>8}  source"
     lines = ["materials: [material] like = NAME; l_ch = E' G_c / f_t^2", head]
@@ -44,6 +44,6 @@ def catalogue() -> dict[str, dict[str, str]]:
     """Heading -> name -> words."""
     studies = {path.stem: tomllib.loads(path.read_text())["title"] for path in sorted(folder().glob("*.toml"))}
     builders = {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in BUILDERS.items()}
-    chosen = Time.model_fields["scheme"].default
+    chosen = TimeSettings.model_fields["scheme"].default
     schemes = {name: kind.summary + " (default)" * (name == chosen) for name, kind in SCHEMES.items()}
     return {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes, "obstacles": OBSTACLES}

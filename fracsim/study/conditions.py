@@ -19,15 +19,25 @@ from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
 from ..mesh.crack_planes import Crack, plane, polygon, segment
 from ..mesh.selectors import Group, InBox, OnPlane, Place
 from ..meshes.text import AXES
-from . import MOTIONS, Boundary, Box, Hinge, Obstacle, Plane, Study, Time, TimeTable
-from .fracture import Crack as CrackTable
+from . import (
+    MOTIONS,
+    BoundarySettings,
+    BoxSelector,
+    HingeSettings,
+    ObstacleSettings,
+    PlaneSelector,
+    Study,
+    TimeSettings,
+    TimeTable,
+)
+from .fracture import CrackSettings
 from .mesh_source import check_file
 
 Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Condition:
+class BoundaryCondition:
     """An entry of [[boundary]].
 
     Attributes:
@@ -44,13 +54,13 @@ class Condition:
     components: Flags
 
     @property
-    def moves(self) -> bool:
+    def prescribes_motion(self) -> bool:
         """Whether it prescribes a motion."""
         return self.kind in MOTIONS
 
 
 @dataclass(frozen=True)
-class Placing:
+class ObstaclePlacement:
     """An entry of [[obstacle]].
 
     Attributes:
@@ -60,15 +70,15 @@ class Placing:
     name: str
     shape: str
     geometry: dict[str, Any]
-    at: Values
-    moved: TimeFunction | None
+    reference_point: Values
+    displacement: TimeFunction | None
     friction: float
-    loose: Loose | None = None
+    free_motion: FreeObstacleMotion | None = None
     spin: Values | None = None  # rad/s, at which a driven one turns
 
 
 @dataclass(frozen=True)
-class Loose:
+class FreeObstacleMotion:
     """What an entry of [[obstacle]] says of one that is free; d = 2 or 3, r = 1 or 3, p = d + r.
 
     Attributes:
@@ -81,29 +91,29 @@ class Loose:
     mass: float | None
     density: float | None
     hinge: Values | None
-    ways: Values
-    rate: Values
+    pose_basis: Values
+    initial_rate: Values
     gravity: Values
 
 
-def conditions(study: Study, dim: int) -> list[Condition]:
+def boundary_conditions(study: Study, dim: int) -> list[BoundaryCondition]:
     """All entries of [[boundary]]. InputError where one does not fit the dimension, or two do not agree."""
     entries = [_condition(entry, dim, f"boundary.{i}", study.thickness) for i, entry in enumerate(study.boundary)]
-    check_agreement(entries, dim)
+    check_conflicts(entries, dim)
     return entries
 
 
-def check_agreement(entries: Sequence[Condition], dim: int) -> None:
+def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
     """InputError where two entries prescribe the same component of the same place, or a load acts along one that is
     prescribed there and so does nothing."""
     for one, other in permutations(entries, 2):
-        if one.place != other.place or not one.moves:
+        if one.place != other.place or not one.prescribes_motion:
             continue
-        both = one.components & (other.components if other.moves else _acts(other, dim))
+        both = one.components & (other.components if other.prescribes_motion else _acts(other, dim))
         if not both.any():
             continue
         axis = AXES[int(np.argmax(both))]
-        if not other.moves:
+        if not other.prescribes_motion:
             raise InputError(
                 f"{other.key}.{other.kind} acts along {axis} on {other.place}, where {one.key} prescribes {axis}: it "
                 f"would do nothing; set its {axis} to 0, or leave {axis} free"
@@ -115,7 +125,7 @@ def check_agreement(entries: Sequence[Condition], dim: int) -> None:
             )
 
 
-def _acts(load: Condition, dim: int) -> Flags:
+def _acts(load: BoundaryCondition, dim: int) -> Flags:
     """(d,) components along which a traction or a force ever acts; a pressure has none of its own."""
     if load.kind == "pressure":
         return np.zeros(dim, bool)
@@ -123,21 +133,21 @@ def _acts(load: Condition, dim: int) -> Flags:
     return np.any(load.function.rows != 0, axis=0)
 
 
-def _condition(entry: Boundary, dim: int, key: str, thickness: float) -> Condition:
-    place, value = place_of(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
+def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) -> BoundaryCondition:
+    place, value = find_selector(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
     function: TimeFunction
     components: Flags = np.zeros(dim, bool)
     if entry.fix is not None:
         function, components = constant(np.zeros(dim)), _named(entry.fix, dim, key)
     else:
-        function = table = in_time(value, f"{key}.{entry.kind}", 1 if entry.kind == "pressure" else dim)
+        function = table = time_function(value, f"{key}.{entry.kind}", 1 if entry.kind == "pressure" else dim)
         if entry.kind in MOTIONS:
             components = ~np.isnan(table.rows[0])
         if entry.kind == "velocity":
             function = table.integral
         if entry.kind == "force":
             function = Tabulated(table.times, np.asarray(table.rows / thickness))
-    return Condition(key, entry.kind, place, function, components)
+    return BoundaryCondition(key, entry.kind, place, function, components)
 
 
 def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
@@ -147,11 +157,11 @@ def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
     return np.array([axis in axes for axis in AXES[:dim]])
 
 
-def place_of(where: str | Box | Plane, dim: int, key: str) -> Place:
+def find_selector(where: str | BoxSelector | PlaneSelector, dim: int, key: str) -> Place:
     """A place of the study. InputError where its vectors do not fit the dimension, or a normal is zero."""
     if isinstance(where, str):
         return Group(where)
-    if isinstance(where, Box):
+    if isinstance(where, BoxSelector):
         lower, upper = (_vector(corner, dim, f"{key}.box") for corner in where.box)
         return InBox(lower, upper)
     normal, point = (_vector(getattr(where, name), dim, f"{key}.{name}") for name in ("normal", "point"))
@@ -162,16 +172,16 @@ def place_of(where: str | Box | Plane, dim: int, key: str) -> Place:
 
 
 def _vector(values: Sequence[float], dim: int, key: str) -> tuple[float, ...]:
-    return tuple(float(value) for value in of_size(values, dim, key))
+    return tuple(float(value) for value in check_size(values, dim, key))
 
 
 def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
     """gravity (d,) in m/s^2 and body_force (d,) in N/m^3, as far as [load] has them."""
     given = {} if study.load is None else {key: getattr(study.load, key) for key in ("gravity", "body_force")}
-    return {key: in_time(value, f"load.{key}", dim) for key, value in given.items() if value is not None}
+    return {key: time_function(value, f"load.{key}", dim) for key, value in given.items() if value is not None}
 
 
-def obstacles(study: Study, dim: int) -> list[Placing]:
+def obstacle_placements(study: Study, dim: int) -> list[ObstaclePlacement]:
     """All entries of [[obstacle]]. InputError where one does not fit the dimension."""
     load = volume_loads(study, dim)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(dim)
@@ -179,7 +189,7 @@ def obstacles(study: Study, dim: int) -> list[Placing]:
     return [_placing(entry, dim, f"obstacle.{i}", gravity, study.thickness) for i, entry in entries]
 
 
-def _placing(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: float) -> Placing:
+def _placing(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> ObstaclePlacement:
     given = entry.geometry
     for name in {"normal", "axis", "size"} & set(given):
         given[name] = _vector(given[name], dim, f"{key}.{name}")
@@ -195,32 +205,32 @@ def _placing(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: fl
         _check_file(entry, dim, key)
     moved: TimeFunction | None = None
     if entry.displacement is not None:
-        moved = in_time(entry.displacement, f"{key}.displacement", dim)
-    elif entry.velocity is not None and not entry.free:
-        moved = in_time(entry.velocity, f"{key}.velocity", dim).integral
-    loose = _loose(entry, dim, key, gravity, thickness) if entry.free else None
-    at, turns = of_size(entry.at, dim, f"{key}.at"), entry.spin is not None and not entry.free
-    spin = of_size(entry.spin, 3, f"{key}.spin") if turns and entry.spin is not None else None
-    return Placing(entry.name, entry.shape, given, at, moved, entry.friction, loose, spin)
+        moved = time_function(entry.displacement, f"{key}.displacement", dim)
+    elif entry.velocity is not None and not entry.is_free:
+        moved = time_function(entry.velocity, f"{key}.velocity", dim).integral
+    loose = _loose(entry, dim, key, gravity, thickness) if entry.is_free else None
+    at, turns = check_size(entry.at, dim, f"{key}.at"), entry.spin is not None and not entry.is_free
+    spin = check_size(entry.spin, 3, f"{key}.spin") if turns and entry.spin is not None else None
+    return ObstaclePlacement(entry.name, entry.shape, given, at, moved, entry.friction, loose, spin)
 
 
-def _check_file(entry: Obstacle, dim: int, key: str) -> None:
+def _check_file(entry: ObstacleSettings, dim: int, key: str) -> None:
     if dim == 2:
         raise InputError(f'{key}.shape = "mesh": a 2D mesh has none; choose "box", "sphere", "capsule" or "plane"')
     assert entry.file is not None  # the schema sees to it
     check_file(entry.file, f"{key}.file")
 
 
-def _loose(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: float) -> Loose:
+def _loose(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> FreeObstacleMotion:
     """What is free of an entry, and how it starts."""
     turns = 1 if dim == 2 else 3
-    velocity = np.zeros(dim) if entry.velocity is None else of_size(entry.velocity, dim, f"{key}.velocity")  # type: ignore[arg-type]
+    velocity = np.zeros(dim) if entry.velocity is None else check_size(entry.velocity, dim, f"{key}.velocity")  # type: ignore[arg-type]
     ways, hinge = np.eye(dim + turns), None
     spin = [0.0] * (turns if entry.hinge is None else 1) if entry.spin is None else entry.spin
     if entry.hinge is not None:
-        hinge = of_size(entry.hinge.point, dim, f"{key}.hinge.point")
+        hinge = check_size(entry.hinge.point, dim, f"{key}.hinge.point")
         ways, turns = _about(entry.hinge, dim, f"{key}.hinge.axis"), 1
-    rate = np.concatenate([velocity, of_size(spin, turns, f"{key}.spin")])
+    rate = np.concatenate([velocity, check_size(spin, turns, f"{key}.spin")])
     if entry.hinge is not None:
         rate = rate[dim:]
     elif entry.guide is not None:
@@ -229,10 +239,10 @@ def _loose(entry: Obstacle, dim: int, key: str, gravity: Values, thickness: floa
             raise InputError(f"{key}.velocity = {velocity.tolist()}: it moves along {entry.guide} alone")
         ways, rate = ways[:, :dim][:, along], velocity[along]
     mass = None if entry.mass is None else entry.mass / thickness
-    return Loose(mass, entry.density, hinge, ways, rate, gravity)
+    return FreeObstacleMotion(mass, entry.density, hinge, ways, rate, gravity)
 
 
-def _about(hinge: Hinge, dim: int, key: str) -> Values:
+def _about(hinge: HingeSettings, dim: int, key: str) -> Values:
     """(p, 1) increment of the pose about a hinge."""
     if dim == 2:
         if hinge.axis is not None:
@@ -240,7 +250,7 @@ def _about(hinge: Hinge, dim: int, key: str) -> Values:
         return np.array([[0.0], [0.0], [1.0]])
     if hinge.axis is None:
         raise InputError(f"{key} is missing: in 3D a hinge has a point and an axis")
-    axis = of_size(hinge.axis, dim, key)
+    axis = check_size(hinge.axis, dim, key)
     length = float(np.linalg.norm(axis))
     if not length > 0:
         raise InputError(f"{key} = {hinge.axis} is no direction: give 3 numbers that are not all zero")
@@ -252,51 +262,51 @@ def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None
     initial = study.initial
     if initial is None:
         return None
-    velocity = None if initial.velocity is None else of_size(initial.velocity, dim, "initial.velocity")
-    spin = None if initial.spin is None else of_size(initial.spin, 1 if dim == 2 else 3, "initial.spin")
+    velocity = None if initial.velocity is None else check_size(initial.velocity, dim, "initial.velocity")
+    spin = None if initial.spin is None else check_size(initial.spin, 1 if dim == 2 else 3, "initial.spin")
     return velocity, spin
 
 
-def cracks(study: Study, dim: int) -> list[Crack]:
+def initial_cracks(study: Study, dim: int) -> list[Crack]:
     """[[crack]] of a body with d dimensions. InputError where they are of another, or have no extent."""
     return [_crack(entry, f"crack.{i}", dim) for i, entry in enumerate(study.crack)]
 
 
-def _crack(entry: CrackTable, key: str, dim: int) -> Crack:
+def _crack(entry: CrackSettings, key: str, dim: int) -> Crack:
     if entry.plane is not None:
-        point = of_size(entry.plane.point, dim, f"{key}.plane.point")
-        return plane(key, point, of_size(entry.plane.normal, dim, f"{key}.plane.normal"))
+        point = check_size(entry.plane.point, dim, f"{key}.plane.point")
+        return plane(key, point, check_size(entry.plane.normal, dim, f"{key}.plane.normal"))
     if entry.segment is not None:
         if dim == 3:
             raise InputError(f"{key}.segment is for 2D meshes; this one has 3 dimensions: give a polygon or a plane")
-        return segment(key, np.array([of_size(end, dim, f"{key}.segment") for end in entry.segment]))
+        return segment(key, np.array([check_size(end, dim, f"{key}.segment") for end in entry.segment]))
     assert entry.polygon is not None
     if dim == 2:
         raise InputError(f"{key}.polygon is for 3D meshes; this one has 2 dimensions: give a segment or a plane")
-    return polygon(key, np.array([of_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
+    return polygon(key, np.array([check_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
 
 
 def fibre_direction(study: Study, dim: int) -> Values | None:
     """(d,) of [fracture.fibre]; None without the table."""
     fibre = study.fracture.fibre if study.fracture is not None else None
-    return None if fibre is None else of_size(fibre.direction, dim, "fracture.fibre.direction")
+    return None if fibre is None else check_size(fibre.direction, dim, "fracture.fibre.direction")
 
 
-def step_course(timing: Time) -> Tabulated | None:
+def step_size_function(timing: TimeSettings) -> Tabulated | None:
     """The longest step, s, at a time; None where it is the same all the time."""
-    return in_time(timing.step, "time.step", 1) if isinstance(timing.step, TimeTable) else None
+    return time_function(timing.step, "time.step", 1) if isinstance(timing.step, TimeTable) else None
 
 
-def in_time(value: Any, key: str, size: int) -> Tabulated:
+def time_function(value: Any, key: str, size: int) -> Tabulated:
     """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
     table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
-    rows = np.array([of_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
+    rows = np.array([check_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
     if np.any(np.isnan(rows) != np.isnan(rows[0])):
         raise InputError(f'{key}: a component that is "free" at one time must be free at all of them')
     return Tabulated(np.asarray(table.time), rows)
 
 
-def of_size(values: Sequence[Any], size: int, key: str) -> Values:
+def check_size(values: Sequence[Any], size: int, key: str) -> Values:
     """A constant vector; InputError where it does not fit the dimension of the mesh. "free" becomes nan."""
     if len(values) != size:
         raise InputError(f"{key} = {values}: this mesh needs {size} number{'s'[: size != 1]}")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .values import Finite, Flag, InTime, Name, NonNegative, Positive, Table, TimeTable, Vector
+from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, StudyTable, TimeTable, Vector
 
 # shape -> (keys that it needs, keys that it may have)
 OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -24,14 +24,14 @@ GEOMETRY = ("normal", "radius", "length", "axis", "size", "rounding", "hollow", 
 FREE = ("spin", "hinge", "guide")  # of a free obstacle alone
 
 
-class Hinge(Table):
+class HingeSettings(StudyTable):
     """What a free obstacle turns about: a point, in 3D an axis through it."""
 
     point: Vector  # m
     axis: Vector | None = None  # 3D
 
 
-class Obstacle(Table):
+class ObstacleSettings(StudyTable):
     """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity; free where it has a mass."""
 
     name: Name
@@ -46,18 +46,18 @@ class Obstacle(Table):
     file: Path | None = None  # of a mesh: a closed surface of triangles (STL, OBJ, PLY, ...)
     scale: Positive | None = None  # of a mesh: metres for each unit of length of the file; default 1
     hollow: Flag = False  # the body is inside: a bowl, a container
-    displacement: InTime[Vector] | None = None  # m
-    velocity: InTime[Vector] | None = None  # m/s; of a free obstacle at the start
+    displacement: OverTime[Vector] | None = None  # m
+    velocity: OverTime[Vector] | None = None  # m/s; of a free obstacle at the start
     mass: Positive | None = None  # kg (2D: of material.thickness, or of 1 m): it moves freely
     density: Positive | None = None  # kg/m^3, in place of the mass
     # rad/s at the start, if free; of a mesh that is held or driven all along, about `at`
     spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None
-    hinge: Hinge | None = None  # free to turn about it
+    hinge: HingeSettings | None = None  # free to turn about it
     guide: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # free to move along these axes, without turning
     friction: NonNegative = 0.0  # Coulomb's coefficient
 
     @model_validator(mode="after")
-    def _fits_its_shape(self) -> Obstacle:
+    def _fits_its_shape(self) -> ObstacleSettings:
         needed, allowed = OF_SHAPE[self.shape]
         given = [key for key in GEOMETRY if getattr(self, key) not in (None, False)]
         if missing := [key for key in needed if key not in given]:
@@ -69,8 +69,8 @@ class Obstacle(Table):
         return self
 
     @model_validator(mode="after")
-    def _is_free_or_not(self) -> Obstacle:
-        if not self.free:
+    def _is_free_or_not(self) -> ObstacleSettings:
+        if not self.is_free:
             given = [key for key in FREE if getattr(self, key) is not None]
             if given and not (self.shape == "mesh" and given == ["spin"]):
                 raise ValueError(f"{given[0]} is for an obstacle that moves freely: give mass or density, or remove it")
@@ -88,7 +88,7 @@ class Obstacle(Table):
         return self
 
     @model_validator(mode="after")
-    def _is_held_in_one_way(self) -> Obstacle:
+    def _is_held_in_one_way(self) -> ObstacleSettings:
         if self.hinge is not None and self.guide is not None:
             raise ValueError("give hinge or guide, not both")
         if self.hinge is not None and self.velocity is not None:
@@ -98,7 +98,7 @@ class Obstacle(Table):
         return self
 
     @property
-    def free(self) -> bool:
+    def is_free(self) -> bool:
         """Whether it moves by itself."""
         return self.mass is not None or self.density is not None
 
@@ -108,7 +108,7 @@ class Obstacle(Table):
         return {key: value for key in GEOMETRY if (value := getattr(self, key)) is not None}
 
 
-class Contact(Table):
+class ContactSettings(StudyTable):
     """[contact]: of the body and its pieces with themselves; and how obstacles act."""
 
     # false: obstacles alone; "pieces": not the cracks inside a piece, nor crumbs that have lost their last whole cell

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from ..errors import InputError
 from ..forms.waves import rayleigh_speed
 from . import Study
-from .body import Region
+from .body import RegionSettings
 
 RADIUS = 5.0  # h: of the disc of a tip (fracture.energy.tip_criterion, which is dear to import)
 RESOLVED = 8.0  # h that Irwin's length has where cells follow a crack as it opens
 PART = 5.0  # times that Irwin's length goes into the body, from which on a crack has room for its tip
 
 
-def tearing(study: Study, h: float, side: float) -> Iterator[str]:
+def energy_criterion_notes(study: Study, h: float, side: float) -> Iterator[str]:
     """What cracks take and where they begin, of each region that differs, and what to change.
 
     l_ch = E' G_c / f_t^2 (Irwin) against the finest cells `h` and the body's longest `side`, m.
@@ -24,7 +24,9 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
     assert table is not None
     regions = study.material.regions.items()
     differ = ("young", "poisson", "strength", "fracture_energy")
-    every = [("", Region())] + [each for each in regions if any(getattr(each[1], key) is not None for key in differ)]
+    every = [("", RegionSettings())] + [
+        each for each in regions if any(getattr(each[1], key) is not None for key in differ)
+    ]
     for name, region in every:
         energy, strength = region.fracture_energy or table.energy, region.strength or table.strength
         assert energy is not None
@@ -42,7 +44,7 @@ def tearing(study: Study, h: float, side: float) -> Iterator[str]:
         yield from _branching(study, h)
 
 
-def refuse_forks(study: Study, dim: int) -> None:
+def check_branching_dimension(study: Study, dim: int) -> None:
     """InputError where cracks in space are to branch."""
     if dim == 3 and study.fracture is not None and study.fracture.branching:
         raise InputError("fracture.branching: cracks branch in the plane only; remove it, or take a 2D mesh")
@@ -51,7 +53,7 @@ def refuse_forks(study: Study, dim: int) -> None:
 def _branching(study: Study, h: float) -> Iterator[str]:
     """When tips branch, and whether steps are short enough for it."""
     yield "cracks run at up to half of the Rayleigh speed; tips branch to which 2 G_c flows"
-    material, step = study.material, study.time.breaking_step or study.time.longest
+    material, step = study.material, study.time.breaking_step or study.time.max_step
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
     wave = RADIUS * h / rayleigh_speed(shear, material.poisson)
     if step > wave:
@@ -59,7 +61,7 @@ def _branching(study: Study, h: float) -> Iterator[str]:
         yield f"breaking_step = {wave / 2:.1g} s would do"
 
 
-def plane_modulus(study: Study, region: Region) -> float:
+def plane_modulus(study: Study, region: RegionSettings) -> float:
     """E' of a region, or of the rest of the body, Pa."""
     material = study.material
     young, poisson = region.young or material.young, material.poisson if region.poisson is None else region.poisson

@@ -35,13 +35,13 @@ _PATTERNS = {
 }
 
 
-def explain(errors: Sequence[Any], table: str = "") -> str:
+def validation_message(errors: Sequence[Any], table: str = "") -> str:
     """The error to mend first as a sentence. An unknown key goes before a missing one: it is mostly the same key."""
     error = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     location = _location(error["loc"])
     where = ".".join(map(str, [table, *location] if table else location))
     if error["type"] == "extra_forbidden":
-        return unknown_key(where, _known_keys(location[:-1]))
+        return unknown_key_message(where, _known_keys(location[:-1]))
     if error["type"] == "missing":
         return f"{where} is missing; {_owner(location)} needs it"
     if error["type"] == "value_error":
@@ -49,7 +49,7 @@ def explain(errors: Sequence[Any], table: str = "") -> str:
     return f"{where} = {_show(error['input'])}: {_sentence(error)}"
 
 
-def unknown_key(where: str, known: Iterable[str]) -> str:
+def unknown_key_message(where: str, known: Iterable[str]) -> str:
     """`where` is not a key; the nearest one, or all that are known at its place."""
     known = sorted(known)
     near = difflib.get_close_matches(where.rpartition(".")[2], known, n=1, cutoff=0.5)

@@ -6,17 +6,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from .values import Finite, Flag, NonNegative, Positive, Seed, Strength, Table, Unbounded, Vector
+from .values import Finite, Flag, NonNegative, Positive, Seed, Strength, StudyTable, Unbounded, Vector
 
 
-class Heterogeneity(Table):
+class HeterogeneitySettings(StudyTable):
     """Scatter of the strength from edge to edge, Weibull-distributed with mean 1; the same at any number of ranks."""
 
     modulus: Annotated[Finite, Field(ge=0.1)]  # Weibull's m: 5 scatters like stone, 50 hardly at all
     seed: Seed = 0
 
 
-class Fibre(Table):
+class FibreSettings(StudyTable):
     """Strength that depends on direction: `ratio` times as high along the fibre as across it."""
 
     direction: Vector
@@ -30,7 +30,7 @@ class Fibre(Table):
         return direction
 
 
-class Fracture(Table):
+class FractureSettings(StudyTable):
     """[fracture]: edges break where the averaged normal stress along them reaches `strength`."""
 
     strength: Strength
@@ -48,16 +48,16 @@ class Fracture(Table):
     passes: Annotated[int, Field(ge=1, strict=True)] | None = None
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = None  # share of all edges that may break in one pass
     crumbs: Flag = True  # false: a node that would lose its last whole cell stays with the neighbours that hold it best
-    heterogeneity: Heterogeneity | None = None
-    fibre: Fibre | None = None
+    heterogeneity: HeterogeneitySettings | None = None
+    fibre: FibreSettings | None = None
 
-    def joins(self, energy: str) -> bool:
+    def retains_nodes(self, energy: str) -> bool:
         """Whether nodes without a whole cell stay joined. Not with crumbs, nor where cells are turned back before their
         strain is projected: what hangs on one edge is held along it alone, has no rotation, and steps fail."""
         return not (self.crumbs or (self.approach == "edge" and energy == "corotated"))
 
     @model_validator(mode="after")
-    def _neighbours_have_no_radius(self) -> Fracture:
+    def _neighbours_have_no_radius(self) -> FractureSettings:
         if self.kernel == "neighbours" and self.radius:
             raise ValueError(
                 f'kernel = "neighbours" averages over the cells that share a node, whatever their size, and radius = '
@@ -66,29 +66,29 @@ class Fracture(Table):
         return self
 
 
-class CrackPlane(Table):
+class CrackPlaneSettings(StudyTable):
     """All of the body's section with a plane (2D: a line)."""
 
     point: Vector
     normal: Vector
 
 
-class Crack(Table):
+class CrackSettings(StudyTable):
     """[[crack]]: broken before the start, with the places of its cuts. Give exactly one of the three."""
 
     segment: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = None  # m, 2D
     polygon: Annotated[list[Vector], Field(min_length=3)] | None = None  # m, 3D, flat
-    plane: CrackPlane | None = None
+    plane: CrackPlaneSettings | None = None
 
     @model_validator(mode="after")
-    def _one_shape(self) -> Crack:
+    def _one_shape(self) -> CrackSettings:
         given = [key for key in ("segment", "polygon", "plane") if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(f"give exactly one of segment, polygon, plane; found {' and '.join(given) or 'none'}")
         return self
 
 
-class Plasticity(Table):
+class PlasticitySettings(StudyTable):
     """[plasticity]: cells flow where their stress exceeds the yield stress; F = F_e F_p with det F_p = 1.
 
     Rigid bodies have yield_stress and hardening alone, see rigid.denting.
@@ -102,7 +102,7 @@ class Plasticity(Table):
     update: Literal["extrapolated", "implicit", "staggered"] = "extrapolated"
 
 
-class Grains(Table):
+class GrainSettings(StudyTable):
     """Grain boundaries: regions of seeded points p_i by least k_i |x - p_i|, the same at any number of ranks."""
 
     count: Annotated[int, Field(ge=2, le=1_000_000, strict=True)]
@@ -111,7 +111,7 @@ class Grains(Table):
     mode: Literal["replace", "bias"] = "replace"  # a surface frees a grain; or runs along the boundaries nearest to it
 
 
-class Brittle(Table):
+class BrittleSettings(StudyTable):
     """[brittle]: instead of single edges, surfaces from the cells of highest averaged principal stress break."""
 
     surfaces: Annotated[int, Field(ge=1, strict=True)]  # most of the run, of each rigid body: more, more debris
@@ -119,10 +119,10 @@ class Brittle(Table):
     shape: Literal["planar", "curved"] = "planar"  # curved: turns with the principal direction
     seed: Seed = 0  # of the direction where several principal stresses are equal
     per_pass: Annotated[int, Field(ge=1, strict=True)] | None = None  # most that start in one pass; default: no limit
-    grains: Grains | None = None
+    grains: GrainSettings | None = None
 
     @model_validator(mode="after")
-    def _grains_have_their_shape(self) -> Brittle:
+    def _grains_have_their_shape(self) -> BrittleSettings:
         if self.grains is not None and self.grains.mode == "replace" and self.shape == "curved":
             raise ValueError(
                 'shape = "curved" does nothing where grains.mode = "replace": surfaces are grain boundaries; '

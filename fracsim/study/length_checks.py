@@ -18,18 +18,18 @@ from collections.abc import Iterator
 import numpy as np
 
 from . import Study
-from .body import Region
-from .conditions import conditions, initial_motion, obstacles, volume_loads
+from .body import RegionSettings
+from .conditions import boundary_conditions, initial_motion, obstacle_placements, volume_loads
 from .energy_checks import plane_modulus
 from .material_library import MATERIALS
 
-DISC = 6.0  # h that a tip needs around it
-FAR = 3.0  # times that an energy may be off without a word
-BRITTLE = 0.005  # strain at the strength, below which stretches do not matter
-MUCH = 0.1  # rad: half a percent larger
+TIP_CLEARANCE = 6.0  # h that a tip needs around it
+MAX_ENERGY_RATIO = 3.0  # times that an energy may be off without a word
+MAX_SMALL_STRAIN = 0.005  # strain at the strength, below which stretches do not matter
+MAX_LINEAR_ROTATION = 0.1  # rad: half a percent larger
 
 
-def fits(study: Study, h: float, least: float) -> Iterator[str]:
+def length_scale_notes(study: Study, h: float, least: float) -> Iterator[str]:
     """Notes on what does not fit together; `h`: size of the cells, infinite where it is not known, and `least`: the
     body's least side, m."""
     table = study.fracture
@@ -38,21 +38,24 @@ def fits(study: Study, h: float, least: float) -> Iterator[str]:
     if table.strength > 0.1 * study.material.young and table.strength < float("inf"):
         yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
     if table.energy is None:
-        yield from _spent(study, plane_modulus(study, Region()), table.radius or h)
+        yield from _spent(study, plane_modulus(study, RegionSettings()), table.radius or h)
         return
-    if table.law == "griffith" and least < 2 * DISC * h < float("inf"):
-        most = least / 2 / DISC
-        yield f"note: tips need {DISC:g} h on every side, the body is {least / h:.3g} h across: h below {most:.2g} m"
+    if table.law == "griffith" and least < 2 * TIP_CLEARANCE * h < float("inf"):
+        most = least / 2 / TIP_CLEARANCE
+        yield (
+            f"note: tips need {TIP_CLEARANCE:g} h on every side, the body is {least / h:.3g} h across: "
+            f"h below {most:.2g} m"
+        )
 
 
-def large_strains(study: Study) -> Iterator[str]:
+def small_strain_notes(study: Study) -> Iterator[str]:
     """A note where slow steps pay for large strains that a brittle material does not reach."""
     material, table, like = study.material, study.fracture, study.material.like
     strength = table.strength if table is not None else MATERIALS[like].strength if like is not None else None
     if material.energy == "linear" or study.time.scheme != "quasi-static" or strength is None or study.plasticity:
         return
     share = strength / material.young
-    if share < BRITTLE and not any(each.young or each.strength for each in material.regions.values()):
+    if share < MAX_SMALL_STRAIN and not any(each.young or each.strength for each in material.regions.values()):
         yield f"note: strains stay below strength / young = {100 * share:.2g} %, and energy = {material.energy} is one"
         yield 'of large strains: energy = "linear" gives the same loads in less time, unless thin parts bend far'
 
@@ -67,25 +70,25 @@ def _spent(study: Study, stiff: float, cell: float) -> Iterator[str]:
     of = MATERIALS[like].energy if like is not None else None
     word = "radius" if table.radius else "h"
     yield f"edges break one by one: a crack takes some f_t^2 {word} / 2 E' = {spent:.2g} J/m^2, as much as h has it"
-    if of is not None and not of / FAR < spent < of * FAR:
+    if of is not None and not of / MAX_ENERGY_RATIO < spent < of * MAX_ENERGY_RATIO:
         yield (
             f"note: {like} takes {of:g} J/m^2: give fracture.energy = true (2D), or {word} = "
             f"{2 * stiff * of / table.strength**2:.2g} m"
         )
 
 
-def turned(study: Study, dim: int, least: float) -> float:
+def estimated_rotation(study: Study, dim: int, least: float) -> float:
     """rad; `least`: the body's least side, m. 0 where nothing breaks or there is no inertia."""
-    if study.fracture is None or not study.time.kind.inertia or not study.fracture.strength < np.inf:
+    if study.fracture is None or not study.time.scheme_class.inertia or not study.fracture.strength < np.inf:
         return 0.0
     end, material = study.time.end, study.material
     ways = [study.fracture.strength / np.sqrt(material.young * material.density) * end]
-    ways += [_way(each.function, end) for each in conditions(study, dim) if each.moves]
-    for each in obstacles(study, dim):
-        if each.moved is not None:
-            ways.append(_way(each.moved, end))
-        if each.loose is not None:
-            ways.append(float(np.abs(each.loose.rate).max(initial=0.0)) * end)
+    ways += [_way(each.function, end) for each in boundary_conditions(study, dim) if each.prescribes_motion]
+    for each in obstacle_placements(study, dim):
+        if each.displacement is not None:
+            ways.append(_way(each.displacement, end))
+        if each.free_motion is not None:
+            ways.append(float(np.abs(each.free_motion.initial_rate).max(initial=0.0)) * end)
     if (load := volume_loads(study, dim)) and "gravity" in load:
         ways.append(float(np.linalg.norm(load["gravity"](end))) * end**2 / 2)
     velocity, spin = initial_motion(study, dim) or (None, None)

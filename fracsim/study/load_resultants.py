@@ -13,30 +13,32 @@ from ..mesh.selectors import Group, Place
 from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, facets_where, signed_measures
 from . import Study
-from .conditions import Condition, conditions, volume_loads
+from .conditions import BoundaryCondition, boundary_conditions, volume_loads
 
 Values = npt.NDArray[np.float64]
 
-MOST_CELLS = 60_000  # of a builder's mesh that is built to be measured: a few seconds
+MAX_CHECK_CELLS = 60_000  # of a builder's mesh that is built to be measured: a few seconds
 
 
-def loaded(study: Study, dim: int) -> list[Condition]:
+def facet_loads(study: Study, dim: int) -> list[BoundaryCondition]:
     """Conditions that are loads on facets."""
-    return [each for each in conditions(study, dim) if not each.moves]
+    return [each for each in boundary_conditions(study, dim) if not each.prescribes_motion]
 
 
-def resultants(study: Study, dim: int, mesh: MeshData | None) -> Iterator[str]:
+def resultant_lines(study: Study, dim: int, mesh: MeshData | None) -> Iterator[str]:
     """A line for each load, where one acts on facets. InputError where one selects none; `mesh`: None where it has too
     many cells to be built for that."""
-    loads = loaded(study, dim)
+    loads = facet_loads(study, dim)
     if not loads:
         return
     if mesh is None:
-        yield f"areas and resultants are not worked out of meshes of more than {MOST_CELLS:,} cells; coarsen mesh.h"
+        yield (
+            f"areas and resultants are not worked out of meshes of more than {MAX_CHECK_CELLS:,} cells; coarsen mesh.h"
+        )
         return
     thick = study.thickness if dim == 2 else 1.0
     for load in loads:
-        each, total = facet_areas(mesh, load)
+        each, total = facet_area_vectors(mesh, load)
         yield f"{load.key}.{load.kind} on {load.place}: {_on_facets(load, each, total, thick, dim)}"
     for name, function in volume_loads(study, dim).items():
         assert isinstance(function, Tabulated)
@@ -44,7 +46,7 @@ def resultants(study: Study, dim: int, mesh: MeshData | None) -> Iterator[str]:
         yield f"load.{name}: {_said(rows, function.times, 'N' if dim == 3 or thick != 1 else 'N/m')} on the body"
 
 
-def facet_areas(mesh: MeshData, load: Condition) -> tuple[Values, float]:
+def facet_area_vectors(mesh: MeshData, load: BoundaryCondition) -> tuple[Values, float]:
     """Sum of the outward area vectors of the facets of a load, (d,), and of their areas, m^2 (2D: m). InputError where
     it selects none."""
     facets = _facets(mesh, load.place)
@@ -79,7 +81,7 @@ def _area_vectors(mesh: MeshData, facets: npt.NDArray[np.int64]) -> Values:
     return np.where(inward[:, None], -vectors, vectors)
 
 
-def _on_facets(load: Condition, vector: Values, area: float, thick: float, dim: int) -> str:
+def _on_facets(load: BoundaryCondition, vector: Values, area: float, thick: float, dim: int) -> str:
     function = load.function
     assert isinstance(function, Tabulated)
     rows = function.rows * thick

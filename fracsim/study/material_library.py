@@ -14,7 +14,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Known:
+class NamedMaterial:
     """What is known of a material.
 
     Attributes:
@@ -44,102 +44,102 @@ def _toughness(k: float, young: float, poisson: float) -> float:
 
 
 # M22 gives E, nu, rho, strength and yield stress of what it names; no fracture energies
-MATERIALS: dict[str, Known] = {
-    "soda-lime glass": Known(
+MATERIALS: dict[str, NamedMaterial] = {
+    "soda-lime glass": NamedMaterial(
         7.0e10, 0.22, 2500.0, 4.5e7, _toughness(7.5e5, 7.0e10, 0.22),
         "E, nu, rho, f_t (annealed float, characteristic): EN 572-1; K_c 0.75 MPa m^1/2: Lawn (1993)",
     ),
-    "borosilicate glass": Known(
+    "borosilicate glass": NamedMaterial(
         6.4e10, 0.20, 2230.0, 2.5e7, _toughness(7.7e5, 6.4e10, 0.20),
         "E, nu, rho: ISO 3585; f_t as ground: DIN EN 1595; K_c 0.77 MPa m^1/2: Wiederhorn (1969)",
     ),
-    "fused silica": Known(
+    "fused silica": NamedMaterial(
         7.25e10, 0.17, 2203.0, 5.0e7, _toughness(7.5e5, 7.25e10, 0.17),
         "E, nu, rho, f_t: Heraeus data sheet; K_c 0.75 MPa m^1/2: Wiederhorn (1969)",
     ),
-    "porcelain": Known(
+    "porcelain": NamedMaterial(
         7.0e10, 0.22, 2400.0, 3.5e7, _toughness(1.1e6, 7.0e10, 0.22),
         "quartz porcelain C 110: IEC 60672-3 (f_t unglazed, tension); K_c about 1.1 MPa m^1/2: Ashby & Jones. "
         "M22 has E = 1e10, rho = 1000, 5e7",
     ),
-    "alumina": Known(
+    "alumina": NamedMaterial(
         4.16e11, 0.231, 3984.0, 2.67e8, _toughness(3.5e6, 4.16e11, 0.231),
         "sintered, 99.5 %: Munro, J. Am. Ceram. Soc. 80 (1997)",
     ),
-    "granite": Known(
+    "granite": NamedMaterial(
         4.5e10, 0.33, 2750.0, 9.56e6, _toughness(1.6e6, 4.5e10, 0.33),
         "E, nu, rho, f_t: M22 after Ghouli et al. (2021); K_c 1.6 MPa m^1/2: Westerly, Atkinson & Meredith (1987)",
     ),
-    "marble": Known(
+    "marble": NamedMaterial(
         4.9e10, 0.23, 2710.0, 6.9e6, _toughness(8.5e5, 4.9e10, 0.23),
         "Carrara: f_t (Brazilian) and K_c 0.85 MPa m^1/2: Atkinson & Meredith (1987); E: Wong & Einstein (2009)",
     ),
-    "concrete": Known(
+    "concrete": NamedMaterial(
         3.3e10, 0.20, 2400.0, 2.9e6, 140.0,
         "C30/37: EN 1992-1-1 (E, f_ctm); G_F = 73 f_cm^0.18 N/m: fib Model Code 2010",
     ),
-    "ice": Known(
+    "ice": NamedMaterial(
         9.3e9, 0.33, 917.0, 1.5e6, _toughness(1.0e5, 9.3e9, 0.33),
         "freshwater, -10 C: Petrovic, J. Mater. Sci. 38 (2003): f_t 0.7 to 3.1 MPa, K_c 0.05 to 0.15 MPa m^1/2",
     ),
-    "steel A516 Gr.70 at -40 C": Known(
+    "steel A516 Gr.70 at -40 C": NamedMaterial(
         2.2e11, 0.28, 7700.0, 6.55e8, _toughness(4.0e7, 2.2e11, 0.28),
         "E, nu, rho, f_t: M22 after Tronskar et al. (2002); K_c 40 MPa m^1/2: ferritic steel on its lower shelf, "
         "ASTM E1921 (20 to 60)",
     ),
-    "steel NVE 36 at 23 C": Known(
+    "steel NVE 36 at 23 C": NamedMaterial(
         1.9e11, 0.28, 7700.0, 5.4e8, _toughness(2.0e8, 1.9e11, 0.28),
         "E, nu, rho, f_t, yield: M22 after Tronskar et al. (2002) (it is sold with a yield stress of 3.55e8); "
         "K_Jc 200 MPa m^1/2: ship plate on its upper shelf",
         yield_stress=8.3e7,
     ),
-    "steel S355": Known(
+    "steel S355": NamedMaterial(
         2.1e11, 0.30, 7850.0, 5.1e8, _toughness(1.7e8, 2.1e11, 0.30),
         "f_t, yield: EN 10025-2; K_Jc 170 MPa m^1/2: mild steel, Ashby & Jones (100 kJ/m^2 and more)",
         yield_stress=3.55e8,
     ),
-    "maraging steel": Known(
+    "maraging steel": NamedMaterial(
         1.9e11, 0.30, 8000.0, 1.9e9, 2.213e4,
         "18Ni1900: Kalthoff, Int. J. Fract. 101 (2000), G_c of K_c 68 MPa m^1/2",
         yield_stress=1.72e9,
     ),
-    "aluminium 7075-T6": Known(
+    "aluminium 7075-T6": NamedMaterial(
         7.17e10, 0.33, 2810.0, 5.72e8, _toughness(2.9e7, 7.17e10, 0.33),
         "ASM; K_c 29 MPa m^1/2 (L-T)",
         yield_stress=5.03e8,
     ),
-    "grey cast iron": Known(
+    "grey cast iron": NamedMaterial(
         1.1e11, 0.26, 7150.0, 2.0e8, _toughness(1.5e7, 1.1e11, 0.26),
         "EN-GJL-200: EN 1561 (f_t); K_c 15 MPa m^1/2: Ashby & Jones (6 to 20)",
     ),
-    "PMMA": Known(
+    "PMMA": NamedMaterial(
         3.0e9, 0.36, 1190.0, 7.0e7, _toughness(1.05e6, 3.0e9, 0.36),
         "ISO 7823-1 sheet (E, f_t); K_c 1.05 MPa m^1/2: Ashby & Jones (300 to 400 J/m^2)",
     ),
-    "epoxy": Known(
+    "epoxy": NamedMaterial(
         3.0e9, 0.38, 1200.0, 6.5e7, 200.0,
         "unfilled: Ashby & Jones (G_c 100 to 300 J/m^2)",
     ),
-    "natural rubber": Known(
+    "natural rubber": NamedMaterial(
         1.5e6, 0.45, 930.0, 2.0e7, 1.0e4,
         "unfilled, f_t of the section at rest: Treloar; G_c: tearing, Rivlin & Thomas (1953), 3 to 30 kJ/m^2",
     ),
-    "bone": Known(
+    "bone": NamedMaterial(
         1.7e10, 0.30, 1900.0, 1.33e8, _toughness(5.0e6, 1.7e10, 0.30),
         "cortical, human, along the shaft: Reilly & Burstein (1975); K_c 5 MPa m^1/2 across the osteons: "
         "Koester, Ager & Ritchie (2008), where cracks are short",
     ),
-    "wood along its grain": Known(
+    "wood along its grain": NamedMaterial(
         1.1e10, 0.40, 420.0, 8.0e7, 1.0e4,
         "softwood pulled along its grain: E, rho: EN 338, C24; f_t clear, G_c of cracks across the grain "
         "(8 to 20 kJ/m^2): Ashby & Jones",
     ),
-    "wood across its grain": Known(
+    "wood across its grain": NamedMaterial(
         3.7e8, 0.40, 420.0, 2.5e6, 290.0,
         "softwood split along its grain: E, rho: EN 338, C24; G_f = 1.07 rho - 162 J/m^2: Larsen & Gustafsson (1990)",
     ),
-    "bread": Known(1.0e7, 0.35, 1000.0, 4.0e6, None, "M22: figures of a picture, not measured", 1.0e6),
-    "gelatine": Known(
+    "bread": NamedMaterial(1.0e7, 0.35, 1000.0, 4.0e6, None, "M22: figures of a picture, not measured", 1.0e6),
+    "gelatine": NamedMaterial(
         1.8e4, 0.45, 1020.0, 1.0e4, 1.1,
         "10 % by weight: E: Bonavia (2025), 4 to 277 kPa by water; G_c, slow: Forte et al. (2015); f_t an estimate, "
         "at half of E",
@@ -149,7 +149,7 @@ MATERIALS: dict[str, Known] = {
 _OF_MATERIAL = ("young", "poisson", "density")
 
 
-def known(name: str, key: str) -> Known:
+def find_material(name: str, key: str) -> NamedMaterial:
     """A material by its name. ValueError with the nearest one; `key`: where the study names it."""
     if name not in MATERIALS:
         near = difflib.get_close_matches(name, MATERIALS, n=1, cutoff=0.5)
@@ -158,7 +158,7 @@ def known(name: str, key: str) -> Known:
     return MATERIALS[name]
 
 
-def filled(data: dict[str, Any]) -> dict[str, Any]:
+def fill_from_library(data: dict[str, Any]) -> dict[str, Any]:
     """The tables of a study with what `like` says of keys that they leave out; `fracture.energy = true` asks for G_c.
     ValueError where a name is not known, or nothing says what is asked for."""
     material, fracture = data.get("material"), data.get("fracture")
@@ -166,7 +166,7 @@ def filled(data: dict[str, Any]) -> dict[str, Any]:
         return data
     data = data | {"material": _of_body(data, material)}
     like = material.get("like")
-    found = known(like, "material.like") if isinstance(like, str) else None
+    found = find_material(like, "material.like") if isinstance(like, str) else None
     if isinstance(fracture, dict):
         data["fracture"] = _of_fracture(fracture, found)
     plasticity = data.get("plasticity")
@@ -182,7 +182,7 @@ def _of_body(data: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
     inner = result if regions is None else dict(regions)
     for name, region in list(inner.items()):
         if isinstance(region, dict) and isinstance(region.get("like"), str) and name != "regions":
-            of = known(region["like"], f"material.{name}.like")
+            of = find_material(region["like"], f"material.{name}.like")
             given = {key: getattr(of, key) for key in _OF_MATERIAL}
             if "fracture" in data:
                 given["strength"] = of.strength
@@ -192,12 +192,12 @@ def _of_body(data: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
     if regions is not None:
         result["regions"] = inner
     if isinstance(result.get("like"), str):
-        of = known(result["like"], "material.like")
+        of = find_material(result["like"], "material.like")
         result = {key: getattr(of, key) for key in _OF_MATERIAL} | result
     return result
 
 
-def _of_fracture(table: dict[str, Any], found: Known | None) -> dict[str, Any]:
+def _of_fracture(table: dict[str, Any], found: NamedMaterial | None) -> dict[str, Any]:
     """[fracture]."""
     result = dict(table)
     if found is not None:

@@ -18,15 +18,15 @@ from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import SHORTEST, check_extent, is_number
 from ..meshes.plain_files import MISSING, wrong_with
-from . import Mesh
-from .error_messages import explain, unknown_key
+from . import MeshSettings
+from .error_messages import unknown_key_message, validation_message
 
 if TYPE_CHECKING:
     from ..meshes.random_points.outline_file import Drawn
     from ..meshes.surfaces.closed import ClosedSurface
 
 
-def find_builder(mesh: Mesh) -> Any:
+def find_builder(mesh: MeshSettings) -> Any:
     """The builder of a [mesh] table with its parameters checked, None for a file or surface. No mesh is built."""
     if mesh.builder is None:
         _check_source(mesh)
@@ -42,12 +42,12 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
     known = [field.name for field in dataclasses.fields(kind)]
     for key in parameters:
         if key not in known:
-            raise InputError(unknown_key(f"mesh.{key}", known))
+            raise InputError(unknown_key_message(f"mesh.{key}", known))
     try:
         # through JSON: strict about numbers, and yet a list becomes a tuple
         return _reader(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
-        raise InputError(explain(error.errors(), "mesh")) from None
+        raise InputError(validation_message(error.errors(), "mesh")) from None
     except ArithmeticError:  # the count of its cells overflows, or there are none
         given = ", ".join(f"{key} = {value}" for key, value in parameters.items())
         raise InputError(
@@ -87,7 +87,7 @@ NEEDED = ("h", "thickness")  # of those that have it
 SWITCHES = ("join", "repair")  # keys that are true or false
 
 
-def _check_source(mesh: Mesh) -> None:
+def _check_source(mesh: MeshSettings) -> None:
     key = next(key for key in BESIDE if getattr(mesh, key) is not None)
     for name in mesh.parameters:
         if name not in BESIDE[key]:
@@ -111,7 +111,7 @@ def check_file(path: Path, key: str) -> None:
 REPAIR = "Or set [mesh] repair = true: it fills holes, makes parts that cross one body, and says what it changed."
 
 
-def open_surface(mesh: Mesh) -> ClosedSurface | None:
+def open_surface(mesh: MeshSettings) -> ClosedSurface | None:
     """The closed surface of a [mesh] table in metres, checked but not filled; None where it names none. InputError."""
     if mesh.surface is None:
         return None
@@ -130,7 +130,7 @@ def open_surface(mesh: Mesh) -> ClosedSurface | None:
             raise MeshError(str(error) if repair else f"{error} {REPAIR}") from None
 
 
-def open_outline(mesh: Mesh) -> Drawn | None:
+def open_outline(mesh: MeshSettings) -> Drawn | None:
     """The outline of a [mesh] table in metres, not filled; None where it names none. InputError."""
     if mesh.outline is None:
         return None
@@ -141,7 +141,7 @@ def open_outline(mesh: Mesh) -> Drawn | None:
         return read_outline(mesh.outline, float(mesh.parameters.get("scale", 1.0)))
 
 
-def open_solid(file: Path, scale: float, key: str) -> ClosedSurface:
+def read_obstacle_surface(file: Path, scale: float, key: str) -> ClosedSurface:
     """The closed surface of an obstacle in metres. InputError; `key`: of its table."""
     from ..meshes.surfaces.closed import read_surface
 
@@ -151,7 +151,7 @@ def open_solid(file: Path, scale: float, key: str) -> ClosedSurface:
         raise InputError(f"{key}.file: {error}") from None
 
 
-def cells_inside(mesh: Mesh, surface: ClosedSurface) -> int:
+def estimate_filled_cells(mesh: MeshSettings, surface: ClosedSurface) -> int:
     """About how many cells will fill the surface. InputError where they are too many, or larger than it."""
     from ..meshes.surfaces.fill import expected_cells
 
@@ -159,7 +159,7 @@ def cells_inside(mesh: Mesh, surface: ClosedSurface) -> int:
         return expected_cells(surface, float(mesh.parameters["h"]))
 
 
-def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
+def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> MeshData:
     """Build, read or fill, then check (rank 0); `surface`: that of the table, where it is open. InputError."""
     from ..meshes.check import check_mesh
     from ..meshes.read import read_mesh
@@ -187,7 +187,7 @@ def build_mesh(mesh: Mesh, surface: ClosedSurface | None = None) -> MeshData:
         return _scaled(check_mesh(data, join=join), mesh)
 
 
-def _scaled(data: MeshData, mesh: Mesh) -> MeshData:
+def _scaled(data: MeshData, mesh: MeshSettings) -> MeshData:
     """A mesh from file in metres: after its check, which tells coordinates of single precision by their bits."""
     scale = float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
     if scale == 1:
@@ -196,7 +196,7 @@ def _scaled(data: MeshData, mesh: Mesh) -> MeshData:
     return dataclasses.replace(data, points=data.points * scale)
 
 
-def _filled(mesh: Mesh, surface: ClosedSurface) -> MeshData:
+def _filled(mesh: MeshSettings, surface: ClosedSurface) -> MeshData:
     from ..meshes.surfaces.fill import fill_closed
 
     given = mesh.parameters

@@ -18,8 +18,8 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.text import format_point
 from ..meshes.topology import boundary_facets, edges_of
-from .conditions import Placing, obstacles
-from .mesh_source import open_solid
+from .conditions import ObstaclePlacement, obstacle_placements
+from .mesh_source import read_obstacle_surface
 
 if TYPE_CHECKING:
     from ..rigid.instance_placement import Place
@@ -34,7 +34,7 @@ DEEP = 0.05  # of the mean edge: rigid bodies may lie in an obstacle by so much,
 PAIRS = 1 << 21  # of cells and points that are compared at a time
 
 
-def shape_of(entry: Placing, number: int) -> Shape:
+def build_shape(entry: ObstaclePlacement, number: int) -> Shape:
     """The shape of an entry of [[obstacle]] that is not read from a file. InputError where there is no such shape."""
     try:
         return SHAPES[entry.shape](**entry.geometry)
@@ -42,7 +42,7 @@ def shape_of(entry: Placing, number: int) -> Shape:
         raise InputError(f"obstacle.{number}: {error}") from None
 
 
-def places_of(study: Study) -> list[Place]:
+def body_placements(study: Study) -> list[Place]:
     """All copies of all entries of [[body]]; one body where the mesh has it without any."""
     from ..rigid.instance_placement import Place
 
@@ -56,13 +56,13 @@ def places_of(study: Study) -> list[Place]:
     return places
 
 
-def near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]:
+def find_near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]:
     """Names of obstacles that may overlap a body in the box between two corners (d,), m, at the start.
 
     InputError where an entry is no shape, or a free obstacle overlaps another one.
     """
     corners = _corners(lower, upper)
-    entries = obstacles(study, len(lower))
+    entries = obstacle_placements(study, len(lower))
     placed = [None if each.shape == "mesh" else _placed(each, number) for number, each in enumerate(entries)]
     if study.time.scheme == "rigid":
         bodies = _of_copies(study, corners)
@@ -73,9 +73,9 @@ def near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]:
     return [each.name for each, at in every if at is None or any(at.beyond(body) <= 0 for body in bodies)]
 
 
-def check_room(study: Study, mesh: MeshData) -> None:
+def check_initial_overlap(study: Study, mesh: MeshData) -> None:
     """InputError where the body lies in an obstacle at the start, or an obstacle in the body."""
-    entries = obstacles(study, mesh.dim)
+    entries = obstacle_placements(study, mesh.dim)
     if not entries:
         return
     if study.time.scheme == "rigid":
@@ -88,14 +88,18 @@ def check_room(study: Study, mesh: MeshData) -> None:
             _check_shape(entry, number, mesh)
 
 
-def _placed(entry: Placing, number: int) -> Placed:
+def _placed(entry: ObstaclePlacement, number: int) -> Placed:
     """An obstacle where it is at the start."""
-    return Placed(shape_of(entry, number), Pose.at(_reference(entry)))
+    return Placed(build_shape(entry, number), Pose.at(_reference(entry)))
 
 
-def _reference(entry: Placing) -> Values:
+def _reference(entry: ObstaclePlacement) -> Values:
     """(d,) the reference point at the start, m."""
-    return entry.at if entry.moved is None else np.asarray(entry.at + entry.moved(0.0))
+    return (
+        entry.reference_point
+        if entry.displacement is None
+        else np.asarray(entry.reference_point + entry.displacement(0.0))
+    )
 
 
 def _corners(lower: Values, upper: Values) -> Values:
@@ -105,10 +109,10 @@ def _corners(lower: Values, upper: Values) -> Values:
     return np.asarray(np.take_along_axis(ends, choice, axis=0), float)
 
 
-def _check_free(entries: list[Placing], placed: list[Placed | None]) -> None:
+def _check_free(entries: list[ObstaclePlacement], placed: list[Placed | None]) -> None:
     """InputError where an obstacle that moves freely overlaps another one; those from files are left to the run."""
     shapes = [(number, each, at) for number, (each, at) in enumerate(zip(entries, placed, strict=True)) if at]
-    every = pairs([_Named(each.name, each.loose is not None) for _, each, _ in shapes])  # type: ignore[misc]
+    every = pairs([_Named(each.name, each.free_motion is not None) for _, each, _ in shapes])  # type: ignore[misc]
     boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in every}
     among = [(a, b) for a, b in every if not shapes[b][2].beyond(boxes[a]) > 0]
     for a, b, deep in overlaps([at for _, _, at in shapes], among):
@@ -131,7 +135,7 @@ class _Named:
         self.name, self.free = name, free
 
 
-def _check_shape(entry: Placing, number: int, mesh: MeshData) -> None:
+def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     placed = _placed(entry, number)
     if placed.beyond(mesh.points) > 0:
         return
@@ -144,7 +148,7 @@ def _check_shape(entry: Placing, number: int, mesh: MeshData) -> None:
     if not placed.shape.convex or not np.isfinite(placed.shape.volume):
         return  # all corners of the body are in a convex room, so the body is
     points = placed.pose.points_to_space(placed.shape.outline()[0])
-    inside = least_coordinates(np.concatenate([points, placed.pose.centre[None]]), mesh) > WITHIN
+    inside = containment_depth(np.concatenate([points, placed.pose.centre[None]]), mesh) > WITHIN
     if inside.any():
         where = format_point(np.concatenate([points, placed.pose.centre[None]])[np.flatnonzero(inside)[0]])
         raise InputError(
@@ -153,7 +157,7 @@ def _check_shape(entry: Placing, number: int, mesh: MeshData) -> None:
         )
 
 
-def least_coordinates(x: Values, mesh: MeshData) -> Values:
+def containment_depth(x: Values, mesh: MeshData) -> Values:
     """(n,) of points x (n, d): the greatest, over cells around a point, of its least barycentric coordinate.
 
     Not below 0 where a point lies in the mesh; -1 where it does not.
@@ -178,12 +182,12 @@ def least_coordinates(x: Values, mesh: MeshData) -> Values:
     return np.maximum(result, -1.0)
 
 
-def _check_solid(entry: Placing, number: int, mesh: MeshData) -> None:
+def _check_solid(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     """The same of an obstacle that is read from a file."""
     from ..contact.triangle_mesh_shape import crosses, depth
 
     given: dict[str, Any] = entry.geometry
-    solid = open_solid(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
+    solid = read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
     points = solid.points + _reference(entry)
     if np.any(points.min(axis=0) > mesh.points.max(axis=0)) or np.any(points.max(axis=0) < mesh.points.min(axis=0)):
         return
@@ -202,15 +206,15 @@ def _of_copies(study: Study, x: Values) -> Values:
     """(copies, n, 3) points x (n, 3) of the mesh where copies have them at the start, m."""
     from ..rigid.instance_placement import Poses
 
-    poses = Poses.of(places_of(study))
+    poses = Poses.of(body_placements(study))
     return np.asarray(np.einsum("kij,nj->kni", poses.turn, x) + poses.place[:, None])
 
 
-def _check_rigid(study: Study, mesh: MeshData, entries: list[Placing]) -> None:
+def _check_rigid(study: Study, mesh: MeshData, entries: list[ObstaclePlacement]) -> None:
     """The same of all copies of the mesh; obstacles from files, and bodies among themselves, are left to the run."""
     from ..rigid.instance_placement import Poses
 
-    places = places_of(study)
+    places = body_placements(study)
     poses, edge = Poses.of(places), edges_of(mesh.cells)
     deep = DEEP * float(np.linalg.norm(np.diff(mesh.points[edge], axis=1)[:, 0], axis=1).mean())
     middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2

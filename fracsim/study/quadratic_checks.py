@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 ORDER = "mesh.order = 2 (quadratic displacement)"
 
 
-def check_order(study: Study) -> None:
+def check_displacement_order(study: Study) -> None:
     """ValueError where a table of the study takes linear displacement."""
     if study.mesh.order == 1:
         return
@@ -45,17 +45,17 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
     ]
 
 
-def has_round_sides(study: Study, builder: Any) -> bool:
+def has_curved_cells(study: Study, builder: Any) -> bool:
     """Whether cells of the study are bent; `builder`: of its mesh, None of a file."""
     straight = study.mesh.order == 1 or study.fracture is not None or study.plasticity is not None
     return not straight and bool(getattr(builder, "rounds", ()))
 
 
-def bent(study: Study, mesh: MeshData, builder: Any) -> MeshData:
+def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData:
     """The mesh with the middles of edges on the round faces that its builder knows of, where cells are to have nodes
     there: straight sides would cost what quadratic displacement gains. What breaks or flows stays straight: energies of
     cells are sums over their volume."""
-    if not has_round_sides(study, builder):
+    if not has_curved_cells(study, builder):
         return mesh
     from ..meshes.curved_boundaries import middles_on
 

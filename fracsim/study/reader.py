@@ -15,13 +15,13 @@ from pydantic import BaseModel, ValidationError
 from ..errors import InputError
 from ..meshes.plain_files import MISSING, wrong_with
 from ..studies import folder as packaged_studies
-from . import Mesh, Obstacle, Study
-from .error_messages import explain
+from . import MeshSettings, ObstacleSettings, Study
+from .error_messages import validation_message
 from .mesh_source import find_builder
 
 _PATHS: dict[type[BaseModel], list[str]] = {
     kind: [key for key, field in kind.model_fields.items() if field.annotation == Path | None]
-    for kind in (Mesh, Obstacle)
+    for kind in (MeshSettings, ObstacleSettings)
 }
 _TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or so"
 
@@ -55,7 +55,7 @@ def validate(data: dict[str, Any], name: str) -> Study:
     try:
         study = Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{name}: {explain(error.errors())}") from None
+        raise InputError(f"{name}: {validation_message(error.errors())}") from None
     return study
 
 
@@ -69,7 +69,7 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
     return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
 
 
-def completed(values: dict[str, Any]) -> dict[str, Any]:
+def add_missing_defaults(values: dict[str, Any]) -> dict[str, Any]:
     """What `study_text` of an earlier version wrote, with the defaults of keys that it did not know; as it is, where it
     is no study of this one."""
     try:
@@ -116,8 +116,8 @@ def _anchor(data: dict[str, Any], folder: Path) -> None:
     folder)."""
     obstacles = data.get("obstacle")
     entries = obstacles if isinstance(obstacles, list) else []
-    tables: list[tuple[str, type[BaseModel], Any]] = [("mesh", Mesh, data.get("mesh"))]
-    tables += [(f"obstacle.{i}", Obstacle, each) for i, each in enumerate(entries)]
+    tables: list[tuple[str, type[BaseModel], Any]] = [("mesh", MeshSettings, data.get("mesh"))]
+    tables += [(f"obstacle.{i}", ObstacleSettings, each) for i, each in enumerate(entries)]
     for name, kind, table in tables:
         for key in _PATHS[kind]:
             if isinstance(table, dict) and isinstance(table.get(key), str):

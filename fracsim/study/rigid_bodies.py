@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from annotated_types import Ge, Len
 from pydantic import Field, Strict, model_validator
 
-from .values import Finite, Table
+from .values import Finite, StudyTable
 
 if TYPE_CHECKING:
     from .study import Study
@@ -19,7 +19,7 @@ MOST_TURN = 1e3  # rad a step, of a spin that is given
 NOUGHT, ONCE = (0.0, 0.0, 0.0), (1, 1, 1)
 
 
-class Body(Table):
+class BodySettings(StudyTable):
     """[[body]]: the mesh once, or on a grid, at x = position + R X of its points X."""
 
     position: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m
@@ -30,14 +30,14 @@ class Body(Table):
     spacing: Gaps | None = None  # m, between copies; of any size where there is one
 
     @model_validator(mode="after")
-    def _copies_have_room(self) -> Body:
+    def _copies_have_room(self) -> BodySettings:
         spacing = self.spacing or NOUGHT
         if any(count > 1 and not gap for count, gap in zip(self.copies, spacing, strict=True)):
             raise ValueError(f"copies = {self.copies} lie in one another: give spacing = [x, y, z] in m")
         return self
 
 
-def of_rigid(data: dict[str, Any]) -> dict[str, Any]:
+def with_rigid_defaults(data: dict[str, Any]) -> dict[str, Any]:
     """The tables of a study; where bodies are rigid and nobody says which energy, it is the one there is for them."""
     time, material = data.get("time"), data.get("material")
     if not (isinstance(time, dict) and time.get("scheme") == "rigid" and isinstance(material, dict)):
@@ -93,7 +93,7 @@ def check_rigid(study: Study) -> None:
                 f'obstacle {each.name} has a {held[0]}, which time.scheme = "rigid" does not have: let it move freely, '
                 "or drive it"
             )
-        if each.spin is not None and not each.free:
+        if each.spin is not None and not each.is_free:
             raise ValueError(
                 f'obstacle {each.name} is turned by spin, which time.scheme = "rigid" does not do: give it a mass, or '
                 "drive it without"

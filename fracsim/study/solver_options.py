@@ -37,10 +37,10 @@ def _is_setting(value: Any) -> Any:
     return value
 
 
-Setting = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
+OptionValue = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
 
 
-def refuse_what_is_no_data(options: Options) -> None:
+def check_options(options: Options) -> None:
     """ValueError that names the first option which would load code or name a file."""
     for key, value in options.items():
         if (
@@ -52,7 +52,7 @@ def refuse_what_is_no_data(options: Options) -> None:
             raise ValueError(f"solver.{_short(key)} = {_short(json.dumps(value))}: {wrong}")
 
 
-def spoken(options: Options) -> Options:
+def expand_print_options(options: Options) -> Options:
     """The options as PETSc reads them: `ksp_monitor = true` is a bare `-ksp_monitor`, and with false there is none."""
     printing = {key for key in options if _SPEAKS & set(key.split("_"))}
     kept = {key: value for key, value in options.items() if key not in printing or value is not False}

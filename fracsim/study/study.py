@@ -6,55 +6,57 @@ from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from .body import Damping, Material, Mesh
-from .boundary_conditions import Boundary, Initial, Load
-from .contact import Contact, Obstacle
-from .fracture import Brittle, Crack, Fracture, Plasticity
-from .material_library import filled
-from .quadratic_checks import check_order
-from .rigid_bodies import MOST_TURN, Body, check_rigid, of_rigid
-from .solver_options import Options, Setting, refuse_what_is_no_data, spoken
-from .time_and_output import FRACTURE_FIELDS, Output, Probe, Time, frame_interval, frame_notes
-from .values import Later, Table
+from .body import DampingSettings, MaterialSettings, MeshSettings
+from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
+from .contact import ContactSettings, ObstacleSettings
+from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
+from .material_library import fill_from_library
+from .quadratic_checks import check_displacement_order
+from .rigid_bodies import MOST_TURN, BodySettings, check_rigid, with_rigid_defaults
+from .solver_options import Options, OptionValue, check_options, expand_print_options
+from .time_and_output import FRACTURE_FIELDS, OutputSettings, ProbeSettings, TimeSettings, frame_interval, frame_notes
+from .values import Deferred, StudyTable
 
 
-def _moduli(material: Material) -> list[tuple[float, float]]:
+def _moduli(material: MaterialSettings) -> list[tuple[float, float]]:
     """(Young, Poisson) of the material and of every region."""
     regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
     regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
     return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
 
 
-class Study(Table):
+class Study(StudyTable):
     """A whole study. A table that is absent costs nothing."""
 
     title: str
-    mesh: Mesh
-    material: Material
-    time: Time
-    fracture: Later[Fracture] | None = None
-    plasticity: Later[Plasticity] | None = None
-    brittle: Later[Brittle] | None = None
-    crack: list[Later[Crack]] = Field(default_factory=list)
-    damping: Later[Damping] | None = None
-    boundary: list[Boundary] = Field(default_factory=list)
-    load: Later[Load] | None = None
-    initial: Later[Initial] | None = None
-    solver: dict[str, Setting] = Field(default_factory=dict)  # PETSc options
-    obstacle: list[Later[Obstacle]] = Field(default_factory=list)
-    body: list[Later[Body]] = Field(default_factory=list)
-    contact: Later[Contact] | None = None
-    probe: list[Later[Probe]] = Field(default_factory=list)
-    output: Output = Output()
+    mesh: MeshSettings
+    material: MaterialSettings
+    time: TimeSettings
+    fracture: Deferred[FractureSettings] | None = None
+    plasticity: Deferred[PlasticitySettings] | None = None
+    brittle: Deferred[BrittleSettings] | None = None
+    crack: list[Deferred[CrackSettings]] = Field(default_factory=list)
+    damping: Deferred[DampingSettings] | None = None
+    boundary: list[BoundarySettings] = Field(default_factory=list)
+    load: Deferred[LoadSettings] | None = None
+    initial: Deferred[InitialSettings] | None = None
+    solver: dict[str, OptionValue] = Field(default_factory=dict)  # PETSc options
+    obstacle: list[Deferred[ObstacleSettings]] = Field(default_factory=list)
+    body: list[Deferred[BodySettings]] = Field(default_factory=list)
+    contact: Deferred[ContactSettings] | None = None
+    probe: list[Deferred[ProbeSettings]] = Field(default_factory=list)
+    output: OutputSettings = OutputSettings()
 
     @model_validator(mode="before")
     @classmethod
     def _what_is_not_said(cls, data: Any) -> Any:
-        return of_rigid(filled(data)) if isinstance(data, dict) else data
+        return with_rigid_defaults(fill_from_library(data)) if isinstance(data, dict) else data
 
     @field_validator("probe", "obstacle")
     @classmethod
-    def _told_apart[Entry: (Probe, Obstacle)](cls, entries: list[Entry], info: ValidationInfo) -> list[Entry]:
+    def _told_apart[Entry: (ProbeSettings, ObstacleSettings)](
+        cls, entries: list[Entry], info: ValidationInfo
+    ) -> list[Entry]:
         names = [each.name for each in entries]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two {info.field_name}s have the name {twice[0]}")
@@ -63,11 +65,11 @@ class Study(Table):
     @field_validator("solver")
     @classmethod
     def _printing_is_a_bare_option(cls, options: Options) -> Options:
-        return spoken(options)
+        return expand_print_options(options)
 
     @model_validator(mode="after")
     def _options_are_data(self) -> Study:
-        refuse_what_is_no_data(self.solver)
+        check_options(self.solver)
         return self
 
     @model_validator(mode="after")
@@ -169,7 +171,7 @@ class Study(Table):
                 raise ValueError(f"fracture.energy does not go with {key}: {why}")
         return self
 
-    def _cohesive_stands_alone(self, table: Fracture) -> None:
+    def _cohesive_stands_alone(self, table: FractureSettings) -> None:
         if table.energy is None:
             raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
         others = {
@@ -206,17 +208,17 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _explicit_steps_once(self) -> Study:
-        if not self.time.kind.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
+        if not self.time.scheme_class.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 
     @model_validator(mode="after")
     def _contact_fits_the_scheme(self) -> Study:
         scheme = f'time.scheme = "{self.time.scheme}"'
-        if self.contact is not None and not self.time.kind.implicit and self.contact.creep is not None:
+        if self.contact is not None and not self.time.scheme_class.implicit and self.contact.creep is not None:
             raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
         solids = [number for number, each in enumerate(self.obstacle) if each.shape == "mesh"]
-        if solids and not self.time.kind.implicit:
+        if solids and not self.time.scheme_class.implicit:
             raise ValueError(
                 f"obstacle.{solids[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
                 '"backward-euler", or another shape'
@@ -227,8 +229,8 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _free_obstacles_have_inertia(self) -> Study:
-        loose = [number for number, each in enumerate(self.obstacle) if each.free]
-        if loose and not self.time.kind.inertia:
+        loose = [number for number, each in enumerate(self.obstacle) if each.is_free]
+        if loose and not self.time.scheme_class.inertia:
             raise ValueError(
                 f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
                 'choose time.scheme = "backward-euler", or drive it by displacement'
@@ -240,16 +242,16 @@ class Study(Table):
         spins = [(f"body.{number}", each.spin) for number, each in enumerate(self.body)]
         spins += [(f"obstacle.{number}", each.spin) for number, each in enumerate(self.obstacle) if each.spin]
         for key, spin in spins:
-            if (turned := max(map(abs, spin)) * self.time.longest) > MOST_TURN:
+            if (turned := max(map(abs, spin)) * self.time.max_step) > MOST_TURN:
                 raise ValueError(
-                    f"{key}.spin turns it by {turned:.3g} rad in a step of {self.time.longest:g} s; at most "
+                    f"{key}.spin turns it by {turned:.3g} rad in a step of {self.time.max_step:g} s; at most "
                     f"{MOST_TURN:g} rad are followed: give a slower spin or a shorter time.step"
                 )
         return self
 
     @model_validator(mode="after")
     def _order_fits(self) -> Study:
-        check_order(self)
+        check_displacement_order(self)
         return self
 
     @model_validator(mode="after")
@@ -271,7 +273,7 @@ class Study(Table):
         raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
 
     @property
-    def watched(self) -> str:
+    def monitored_load(self) -> str:
         """Name of the probe or obstacle whose load ends the run (time.until)."""
         names = [each.name for each in self.probe if each.quantity == "reaction"] + [e.name for e in self.obstacle]
         assert self.time.until is not None
@@ -293,12 +295,12 @@ class Study(Table):
         return frame_notes(self.time, self.output)
 
     @property
-    def at_rest(self) -> bool:
+    def starts_at_rest(self) -> bool:
         """Whether nothing moves at the start."""
-        return self.initial is None and not any(each.free and (each.velocity or each.spin) for each in self.obstacle)
+        return self.initial is None and not any(each.is_free and (each.velocity or each.spin) for each in self.obstacle)
 
     @model_validator(mode="after")
     def _rest_has_no_velocity(self) -> Study:
-        if not self.time.kind.inertia and self.initial is not None:
+        if not self.time.scheme_class.inertia and self.initial is not None:
             raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
         return self

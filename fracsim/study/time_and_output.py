@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
 
 from ..forms.schemes import SCHEMES, Scheme
-from .boundary_conditions import Where
-from .values import Finite, Flag, InTime, Name, NonNegative, Positive, Seconds, Table, TimeTable, Vector
+from .boundary_conditions import Selector
+from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, Seconds, StudyTable, TimeTable, Vector
 
 
-class Until(Table):
+class StopCriterion(StudyTable):
     """[time] until: the run ends before `end` once a load has fallen from its peak."""
 
     drop: Annotated[Finite, Field(gt=0, lt=1)]  # share of the peak that is lost
@@ -21,72 +21,72 @@ class Until(Table):
     above: NonNegative = 0.0  # N: peaks below do not count
 
 
-class Timing(Table):
+class BaseTimeSettings(StudyTable):
     """[time]: scheme and steps, without the parameters of the schemes."""
 
     scheme: str = "generalized-alpha"
-    step: InTime[Seconds]  # s; a table: of the time at which a step begins
+    step: OverTime[Seconds]  # s; a table: of the time at which a step begins
     end: Seconds  # s
     adapt: Flag = True  # halve a step that fails, grow back after easy ones
     smallest: Seconds | None = None  # s; default step / 1024
     breaking_step: Seconds | None = None  # s: a longer step in which edges break is taken again, half as long
-    until: Until | None = None
+    until: StopCriterion | None = None
     mass: Literal["lumped", "consistent"] = "lumped"
 
     @property
-    def kind(self) -> type[Scheme]:
+    def scheme_class(self) -> type[Scheme]:
         """The class of the scheme."""
         return SCHEMES[self.scheme]
 
     @property
-    def longest(self) -> float:
+    def max_step(self) -> float:
         """The longest step, s."""
         return max(self.step.value) if isinstance(self.step, TimeTable) else self.step
 
     @property
-    def shortest(self) -> float:
+    def min_step(self) -> float:
         """The shortest step that a study asks for, s."""
         return min(self.step.value) if isinstance(self.step, TimeTable) else self.step
 
     @property
-    def constant(self) -> bool:
+    def has_constant_steps(self) -> bool:
         """Whether all steps are equal, but for those that fail or break edges; explicit ones are as the body allows."""
-        return not isinstance(self.step, TimeTable) and (self.kind.implicit or self.scheme == "rigid")
+        return not isinstance(self.step, TimeTable) and (self.scheme_class.implicit or self.scheme == "rigid")
 
     @property
-    def parameters(self) -> dict[str, float]:
+    def scheme_parameters(self) -> dict[str, float]:
         """What the scheme takes: the table has the parameters of all schemes, whichever it is."""
-        return {each.name: getattr(self, each.name) for each in fields(self.kind)}
+        return {each.name: getattr(self, each.name) for each in fields(self.scheme_class)}
 
     @model_validator(mode="after")
-    def _order(self) -> Timing:
-        if self.longest > self.end:
-            raise ValueError(f"step = {self.longest:g} s is longer than the run: end = {self.end:g} s")
-        if self.smallest is not None and self.smallest > self.shortest:
-            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.shortest:g} s")
+    def _order(self) -> BaseTimeSettings:
+        if self.max_step > self.end:
+            raise ValueError(f"step = {self.max_step:g} s is longer than the run: end = {self.end:g} s")
+        if self.smallest is not None and self.smallest > self.min_step:
+            raise ValueError(f"smallest = {self.smallest:g} s is longer than step = {self.min_step:g} s")
         if self.scheme == "rigid" and isinstance(self.step, TimeTable):
             raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
         if self.breaking_step is not None:
             self._check_breaking_step(self.breaking_step)
-        self.kind(**self.parameters).check()
-        if not self.kind.implicit and self.mass == "consistent":
+        self.scheme_class(**self.scheme_parameters).check()
+        if not self.scheme_class.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
 
     def _check_breaking_step(self, step: float) -> None:
-        if not self.kind.implicit:
+        if not self.scheme_class.implicit:
             raise ValueError(f'breaking_step is for implicit and quasi-static steps, not scheme = "{self.scheme}"')
-        smallest = self.smallest or self.shortest / 1024
-        if not smallest <= step <= self.longest:
+        smallest = self.smallest or self.min_step / 1024
+        if not smallest <= step <= self.max_step:
             raise ValueError(
-                f"breaking_step = {step:g} s must lie between smallest = {smallest:g} s and step = {self.longest:g} s"
+                f"breaking_step = {step:g} s must lie between smallest = {smallest:g} s and step = {self.max_step:g} s"
             )
 
 
 def _keys_of_schemes() -> dict[str, Any]:
     """Key -> (type with its limits, default) of the parameters of all schemes. TypeError where two disagree."""
     keys: dict[str, Any] = {}
-    limits: dict[str, Any] = dict.fromkeys(Timing.model_fields)
+    limits: dict[str, Any] = dict.fromkeys(BaseTimeSettings.model_fields)
     for kind in SCHEMES.values():
         for each in fields(kind):
             own = each.default, each.metadata
@@ -99,24 +99,24 @@ def _keys_of_schemes() -> dict[str, Any]:
 
 
 if TYPE_CHECKING:
-    Time = Timing
+    TimeSettings = BaseTimeSettings
 else:
-    Time = create_model(
-        "Time", __base__=Timing, __module__=__name__, __doc__="[time]: scheme and steps.",
-        scheme=(Literal[tuple(SCHEMES)], Timing.model_fields["scheme"].default), **_keys_of_schemes(),
+    TimeSettings = create_model(
+        "TimeSettings", __base__=BaseTimeSettings, __module__=__name__, __doc__="[time]: scheme and steps.",
+        scheme=(Literal[tuple(SCHEMES)], BaseTimeSettings.model_fields["scheme"].default), **_keys_of_schemes(),
     )  # fmt: skip
 
 
-class Probe(Table):
+class ProbeSettings(StudyTable):
     """[[probe]]: what history.csv records at a point (nearest node) or over a group."""
 
     name: Name
     point: Vector | None = None  # m, reference configuration
-    on: Where | None = None
+    on: Selector | None = None
     record: Literal["displacement", "reaction"] | None = None  # default: reaction over a group, displacement at a point
 
     @model_validator(mode="after")
-    def _place(self) -> Probe:
+    def _place(self) -> ProbeSettings:
         if (self.point is None) == (self.on is None):
             raise ValueError("give either point or on")
         if self.point is not None and self.record == "reaction":
@@ -133,7 +133,7 @@ FRAMES = 50  # of a run whose study says neither every nor interval
 FEWEST_FRAMES, MOST_FRAMES = 34, 75  # where steps are constant, so that the last one comes in time if it can
 
 
-def frame_interval(timing: Timing, output: Output) -> float:
+def frame_interval(timing: BaseTimeSettings, output: OutputSettings) -> float:
     """Simulated time between two frames, s; 0 where they are counted in steps (output.every).
 
     A whole number of steps where these are constant: frames are evenly spaced, and a film of them does not stutter. An
@@ -142,22 +142,22 @@ def frame_interval(timing: Timing, output: Output) -> float:
     if output.every is not None:
         return 0.0
     wanted = output.interval or timing.end / FRAMES
-    step = timing.longest
-    if not timing.constant:
+    step = timing.max_step
+    if not timing.has_constant_steps:
         return wanted
     if output.interval is None:
         return _steps_between(math.ceil(timing.end / step * (1 - 1e-9))) * step
     return round(wanted / step) * step if wanted > step else wanted
 
 
-def frame_notes(timing: Timing, output: Output) -> list[str]:
+def frame_notes(timing: BaseTimeSettings, output: OutputSettings) -> list[str]:
     """What is to be said where frames are not as far apart as the study asks."""
     interval = frame_interval(timing, output)
     if output.interval is None or abs(interval - output.interval) <= 1e-6 * interval:
         return []
-    steps = round(interval / timing.longest)
+    steps = round(interval / timing.max_step)
     return [
-        f"output.interval = {output.interval:g} s is no multiple of time.step = {timing.longest:g} s: "
+        f"output.interval = {output.interval:g} s is no multiple of time.step = {timing.max_step:g} s: "
         f"there is a frame every {interval:g} s, {steps} step{'s'[: steps != 1]}, so that they are evenly spaced"
     ]
 
@@ -189,7 +189,7 @@ LOOKS = ("plain", "bread", "porcelain", "jade", "granite", "steel", "wood")
 Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 
 
-class Colours(Table):
+class ColourSettings(StudyTable):
     """[output] look: own colours."""
 
     skin: Colour  # of what was the boundary
@@ -198,10 +198,10 @@ class Colours(Table):
 
 def _look(value: Any) -> str:
     """Tag of a look."""
-    return "<colours>" if isinstance(value, dict | Colours) else "<name>"
+    return "<colours>" if isinstance(value, dict | ColourSettings) else "<name>"
 
 
-class Output(Table):
+class OutputSettings(StudyTable):
     """[output]: what is written, and how often."""
 
     every: Annotated[int, Field(ge=1, strict=True)] | None = None  # steps
@@ -213,7 +213,7 @@ class Output(Table):
     cut: Literal["middle", "forces", "smooth"] | None = None
     picture: Flag = True  # a PNG of the last frame
     look: Annotated[  # type: ignore[valid-type]
-        Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[Colours, Tag("<colours>")],
+        Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[ColourSettings, Tag("<colours>")],
         Discriminator(_look),
     ] = "plain"  # of pictures
     checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
@@ -226,7 +226,7 @@ class Output(Table):
         return fields
 
     @model_validator(mode="after")
-    def _one_clock(self) -> Output:
+    def _one_clock(self) -> OutputSettings:
         if self.every is not None and self.interval is not None:
             raise ValueError("give every (in steps) or interval (in s), not both")
         return self

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from math import inf, sqrt
 
 from . import Study
-from .body import Region
+from .body import RegionSettings
 from .energy_checks import plane_modulus
 
 LONG, SHORT = 20.0, 1e-6  # m, sides of bodies that are seldom broken as one, or are no continuum
@@ -23,13 +23,16 @@ NEAR = 1e-9  # m, of Irwin's length: a few atoms
 GRAVITY = 1000.0  # m/s^2
 
 
-def questions(study: Study, side: float) -> Iterator[str]:
+def unit_questions(study: Study, side: float) -> Iterator[str]:
     """Lines that begin with "question:", or go on; `side`: the body's longest, m."""
     if side > LONG:
         yield f"question: the body is {side:.4g} m long: is the mesh in mm? {_in_metres(study)}"
     if side < SHORT:
         yield f"question: the body is {side:.4g} m long: {_in_metres(study)} (lengths are in m)"
-    for where, region in [("", Region()), *((f"{name}.", each) for name, each in study.material.regions.items())]:
+    for where, region in [
+        ("", RegionSettings()),
+        *((f"{name}.", each) for name, each in study.material.regions.items()),
+    ]:
         if not where or (region.young or region.density or region.strength or region.fracture_energy):
             yield from _of_material(study, f"material.{where}", region)
     gravity = study.load.gravity if study.load is not None else None
@@ -43,7 +46,7 @@ def _in_metres(study: Study) -> str:
     return "Give mesh.scale, metres for each unit of length of the file (a file in mm: mesh.scale = 1e-3)"
 
 
-def _of_material(study: Study, key: str, region: Region) -> Iterator[str]:
+def _of_material(study: Study, key: str, region: RegionSettings) -> Iterator[str]:
     material = study.material
     young, density = region.young or material.young, region.density or material.density
     dense = _dense(density, young)

@@ -78,7 +78,7 @@ Component = Annotated[
 Motion = Annotated[list[Component], Len(2, 3)]
 
 
-class Table(BaseModel):
+class StudyTable(BaseModel):
     """A table of the study file: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants", defer_build=True)
@@ -92,12 +92,12 @@ class _Later:
 
 
 if TYPE_CHECKING:
-    type Later[Model] = Model
+    type Deferred[Model] = Model
 else:
-    type Later[Model] = Annotated[Model, _Later()]
+    type Deferred[Model] = Annotated[Model, _Later()]
 
 
-class TimeTable[Value](Table):
+class TimeTable[Value](StudyTable):
     """Values at times in s, linear in between and constant outside."""
 
     time: Annotated[list[Finite], Len(1)]
@@ -118,8 +118,8 @@ def _shape(value: Any) -> str:
 
 
 if TYPE_CHECKING:
-    type InTime[Value] = Value | TimeTable[Value]
+    type OverTime[Value] = Value | TimeTable[Value]
 else:
-    type InTime[Value] = Annotated[
+    type OverTime[Value] = Annotated[
         Annotated[Value, Tag("<constant>")] | Annotated[TimeTable[Value], Tag("<table>")], Discriminator(_shape)
     ]

@@ -213,11 +213,11 @@ def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
     from ....solvers.linear_solver import DEFAULTS
     from ....solvers.preconditioner import MULTIGRID
-    from ....study import Plasticity, Time
+    from ....study import PlasticitySettings, TimeSettings
 
     ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}
-    fields = {key: Time.model_fields[key].default for key in ("scheme", "mass", "rho")}
-    fields["update"] = Plasticity.model_fields["update"].default
+    fields = {key: TimeSettings.model_fields[key].default for key in ("scheme", "mass", "rho")}
+    fields["update"] = PlasticitySettings.model_fields["update"].default
     return ours | fields | {"pc_type": MULTIGRID["pc_type"]}
 
 

@@ -29,11 +29,11 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
     from ....mechanics.loads import surface_measures
     from ....mesh.domain import distribute
     from ....mesh.selectors import Group
-    from ....study.check import checked_mesh
+    from ....study.check import build_checked_mesh
     from ....study.reader import validate
 
     checked = validate(study | {"mesh": study["mesh"] | {"order": 2}}, "quadratic")
-    domain = distribute(MPI.COMM_SELF, checked_mesh(checked), 2)  # for its round sides
+    domain = distribute(MPI.COMM_SELF, build_checked_mesh(checked), 2)  # for its round sides
     d, material = domain.dim, checked.material
     V = fem.functionspace(domain.mesh, ("Lagrange", 2, (d,)))
     u, v, w = fem.Function(V), ufl.TrialFunction(V), ufl.TestFunction(V)
