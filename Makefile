@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all attack readers paraview bench table report report-full gallery lint format clean
+.PHONY: demo test test-all attack readers paraview bench table report report-full study-file gallery lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -69,6 +69,10 @@ report:
 report-full:
 	./env python3 -m fracsim.studies.evidence out/evidence --full
 	./env fracsim report out/evidence
+
+# docs/study-file.md, from the descriptions of keys in fracsim/study.
+study-file:
+	./env python3 -m fracsim.study.documentation docs/study-file.md
 
 # Pictures of docs/gallery.md: what has been run is not run again.
 gallery:

@@ -89,7 +89,7 @@ PLATE = {
     },
     "output": {"interval": 0.01, "picture": False, "fields": ["stress", "energy_density", "damage"]},
 }  # fmt: skip
-PER_METRE = {  # what is J, N or kg by its name, as the README lists columns and figures; all else is the same
+PER_METRE = {  # what is J, N or kg by its name, as docs/output.md lists columns and figures; all else is the same
     "history": ("kinetic", "elastic", "dissipated", "external_work", "reaction_", "contact_", "work_"),
     "pieces": ("mass",),
     "summary": ("dust_mass", "external_work", "dissipated", "peak_reactions", "load.peak"),

@@ -130,8 +130,8 @@ def test_the_page_has_what_packaged_studies_have() -> None:
     """Those in the plane, a round body, a thin wall and a figure; the ranges are those that docs/fracture.md quotes."""
     text = (Path(__file__).parent.parent / "docs" / "fracture.md").read_text().replace("\n", " ")
     found = re.search(
-        r"have ([0-9.]+) to ([0-9.]+) in the plane; in space ([0-9.]+) to ([0-9.]+), ([0-9.]+) to ([0-9.]+) in walls "
-        r"of two or three cells, and ([0-9.]+) to ([0-9.]+) on faces. A lattice has ([0-9.]+)", text,
+        r"random points, 2D \| ([0-9.]+) to ([0-9.]+) \|.*3D \| ([0-9.]+) to ([0-9.]+); ([0-9.]+) to ([0-9.]+) in "
+        r"walls of two or three cells; ([0-9.]+) to ([0-9.]+) on faces.*\| lattice \| ([0-9.]+)", text,
     )  # fmt: skip
     assert found is not None
     plane, space, walls, faces = (tuple(map(float, found.group(k, k + 1))) for k in (1, 3, 5, 7))

@@ -37,7 +37,7 @@ def test_a_gain_is_told_with_its_share() -> None:
 
 
 def test_the_step_that_gained_most_is_named() -> None:
-    """0.1 J a step of work that is held, then 4 J in the fifth step: what the energy of README's study without crumbs
+    """0.1 J a step of work that is held, then 4 J in the fifth step: what the energy of a torn bar without crumbs
     does. Where every step gains as much, no step is named. A restart goes on with what was."""
     held = [(0.1 * n, 0.0, 0.0, 0.1 * n) for n in range(1, 5)]
     told = "gained 4 J of energy from nowhere (100% of it in the step to t = 0.5 s), 89% of all"

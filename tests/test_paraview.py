@@ -13,7 +13,7 @@ import paraview_reader
 from cases import BAR, study
 from fracsim.run import Run
 from fracsim.scene import build_scene
-from support.demo import readme_damage, run_demo
+from support.demo import run_demo, threshold_damage
 from support.strained import strained, stress
 
 pytestmark = pytest.mark.slow
@@ -62,7 +62,7 @@ def test_stress_has_the_right_names_on_the_surface(evenly: Path, tmp_path: Path)
     assert_stress(found["arrays"]["Cell"]["stress"])
 
 
-# --- what the README tells users to do ---
+# --- what docs/output.md tells users to do ---
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_the_crack_of_the_demo_opens_as_the_readme_says(demo: Path, tmp_path: Pa
     warp = ("WarpByVector", {"Vectors": ["POINTS", "displacement"]})
     threshold = (
         "Threshold",
-        {"Scalars": ["CELLS", "damage"], "LowerThreshold": 0.0, "UpperThreshold": readme_damage()},
+        {"Scalars": ["CELLS", "damage"], "LowerThreshold": 0.0, "UpperThreshold": threshold_damage()},
     )
     whole = shown(demo / "fields.xdmf", "Xdmf3ReaderS", tmp_path / "whole.json", warp, ("Connectivity", {}))
     opened = shown(

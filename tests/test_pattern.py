@@ -63,9 +63,9 @@ def test_a_consistent_mass_goes_to_its_own_entries(dim: int) -> None:
     assert rate > 0
 
 
-def _readme() -> dict[str, Any]:
-    """The study that the README shows."""
-    text = (Path(__file__).parents[1] / "README.md").read_text()
+def _complete_study() -> dict[str, Any]:
+    """The study that docs/study-file.md shows."""
+    text = (Path(__file__).parents[1] / "docs" / "study-file.md").read_text()
     return tomllib.loads(text.split("```toml")[1].split("```")[0])
 
 
@@ -77,10 +77,15 @@ SHATTERED: dict[str, Any] = {
 }  # fmt: skip
 # with ties, contact and cells that die, in the plane and in space
 MANY: dict[str, Any] = {
-    "readme": changed(_readme(), fracture={"crumbs": False}),
-    "readme-touching": changed(_readme(), fracture={"crumbs": False}, contact={}, mesh={"h": 0.03}, time={"end": 0.3}),
-    "readme-closing": changed(
-        _readme(), fracture={"crumbs": False, "unilateral": True}, mesh={"h": 0.03}, time={"scheme": "backward-euler"}
+    "complete": changed(_complete_study(), fracture={"crumbs": False}),
+    "complete-touching": changed(
+        _complete_study(), fracture={"crumbs": False}, contact={}, mesh={"h": 0.03}, time={"end": 0.3}
+    ),
+    "complete-closing": changed(
+        _complete_study(),
+        fracture={"crumbs": False, "unilateral": True},
+        mesh={"h": 0.03},
+        time={"scheme": "backward-euler"},
     ),
     "torn": TORN,
     "torn-consistent": changed(TORN, time={"mass": "consistent", "scheme": "newmark"}),

@@ -22,7 +22,14 @@ class GeneralizedAlpha:
     a mode far above 1/dt shrinks by rho a step; rho = 1 is the trapezoidal rule at the mid-point.
     """
 
-    rho: float = field(default=0.8, metadata={"ge": 0, "le": 1})
+    rho: float = field(
+        default=0.8,
+        metadata={
+            "ge": 0,
+            "le": 1,
+            "description": "Of `generalized-alpha`: amplitude of the fastest vibrations after a step.",
+        },
+    )
     summary: ClassVar[str] = "second order; rho sets how much of the fastest modes is left after a step"
     inertia: ClassVar[bool] = True
     carries_acceleration: ClassVar[bool] = True

@@ -20,8 +20,18 @@ class Newmark(AtTheEnd):
     Element Method, 1987, sec. 9.1).
     """
 
-    beta: float = field(default=0.25, metadata={"gt": 0, "le": 0.5})
-    gamma: float = field(default=0.5, metadata={"ge": 0.5, "le": 1})
+    beta: float = field(
+        default=0.25,
+        metadata={
+            "gt": 0,
+            "le": 0.5,
+            "description": "Of `newmark`: weight of the new acceleration in u, at least gamma / 2.",
+        },
+    )
+    gamma: float = field(
+        default=0.5,
+        metadata={"ge": 0.5, "le": 1, "description": "Of `newmark`: weight of the new acceleration in v; > 1/2 damps."},
+    )
     summary: ClassVar[str] = "second order; the trapezoidal rule unless beta and gamma say otherwise"
     inertia: ClassVar[bool] = True
     carries_acceleration: ClassVar[bool] = True

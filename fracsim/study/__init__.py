@@ -44,13 +44,13 @@ from .fracture import (
 )
 from .rigid_bodies import BodySettings
 from .study import Study
-from .time_and_output import FIELDS, OutputSettings, ProbeSettings, TimeSettings
+from .time_and_output import FIELDS, ColourSettings, OutputSettings, ProbeSettings, TimeSettings
 from .values import StudyTable, TimeTable
 
 __all__ = [
     "CONDITIONS", "FIELDS", "MOTIONS", "BodySettings", "BoundarySettings", "BoxSelector", "BrittleSettings",
-    "ContactSettings", "CrackSettings", "DampingSettings", "ElasticSettings", "FibreSettings", "FractureSettings",
-    "GrainSettings", "HeterogeneitySettings", "HingeSettings", "InitialSettings", "LoadSettings", "MaterialSettings",
-    "MeshSettings", "ObstacleSettings", "OutputSettings", "PlaneSelector", "PlasticitySettings", "ProbeSettings",
-    "RegionSettings", "Study", "StudyTable", "TimeSettings", "TimeTable",
+    "ColourSettings", "ContactSettings", "CrackSettings", "DampingSettings", "ElasticSettings", "FibreSettings",
+    "FractureSettings", "GrainSettings", "HeterogeneitySettings", "HingeSettings", "InitialSettings", "LoadSettings",
+    "MaterialSettings", "MeshSettings", "ObstacleSettings", "OutputSettings", "PlaneSelector", "PlasticitySettings",
+    "ProbeSettings", "RegionSettings", "Study", "StudyTable", "TimeSettings", "TimeTable",
 ]  # fmt: skip

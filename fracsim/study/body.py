@@ -1,100 +1,208 @@
-"""[mesh], [material] and [damping]: the body and what it is made of."""
+"""Schema of [mesh], [material] and [damping]."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
-from .values import LONGEST_REGION, NonNegative, Poisson, Positive, Strength, StudyTable
+from .values import MAX_REGION_NAME, NonNegative, Poisson, Positive, Strength, StudyTable, key
 
 SOURCES = ("builder", "file", "surface", "outline", "shell")
 
 
 class MeshSettings(BaseModel):
-    """`builder` with its own parameters, or `file` with named groups, or a closed `surface` or a plane `outline` filled
-    at size `h`, or a `shell` of some thickness."""
+    """The mesh, from exactly one source: a builder, a mesh file, a closed surface or a plane outline that is filled
+    with cells, or a shell. Parameters of a builder are keys of this table, too."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    builder: str | None = None
-    file: Path | None = None
-    surface: Path | None = None
-    outline: Path | None = None
-    shell: Path | None = None
-    order: Literal[1, 2] = 1  # of the displacement in a cell: linear or quadratic
+    builder: str | None = key(
+        "Name of a builder (`fracsim list`). Its parameters are further keys of this table.",
+        default=None,
+        example="box",
+    )
+    file: Path | None = key("Path of a mesh file, relative to the study file.", default=None, example="part.msh")
+    surface: Path | None = key(
+        "Path of a closed surface of triangles that gmsh fills with tetrahedra.", default=None, example="part.stl"
+    )
+    outline: Path | None = key(
+        "Path of a CSV file with polygons that are filled with triangles between random points. A line `x, y` is a "
+        "corner, `x, y, group` names the side that begins there, an empty line ends a polygon. Inner polygons are "
+        "holes.",
+        default=None, example="part.csv",
+    )  # fmt: skip
+    shell: Path | None = key(
+        'Path of a surface of triangles with a `thickness`, for `time.scheme = "rigid"`.',
+        default=None,
+        example="hull.stl",
+    )
+    order: Literal[1, 2] = key(
+        "Polynomial order of the displacement in a cell: 1 linear, 2 quadratic "
+        "([limits](accuracy.md#quadratic-displacement)).",
+        default=1, example=2,
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _one_source(self) -> MeshSettings:
-        given = [key for key in SOURCES if getattr(self, key) is not None]
+        given = [name for name in SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
-            found = " and ".join(given) or "none of them"
-            raise ValueError(f"give exactly one of {', '.join(SOURCES)}; found {found}")
+            listed = " and ".join(given) or "none of them"
+            raise ValueError(f"give exactly one of {', '.join(SOURCES)}; found {listed}")
         return self
 
     @property
     def source(self) -> str | Path:
-        """What it is made of."""
-        return next(value for key in SOURCES if (value := getattr(self, key)) is not None)
+        """Name of the builder or path of the file."""
+        return next(value for name in SOURCES if (value := getattr(self, name)) is not None)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything besides the source: the builder's parameters, or h of a surface, or the thickness of a shell."""
+        """Keys beside the source: parameters of the builder, or those of `SOURCE_KEYS`."""
         return dict(self.model_extra or {})
 
 
-class ElasticSettings(StudyTable):
-    """What may differ between the named regions of a mesh."""
+@dataclass(frozen=True)
+class SourceKey:
+    """A key of [mesh] that belongs to one kind of source.
 
-    young: Positive  # Pa
-    poisson: Poisson
-    density: Positive  # kg/m^3
+    Attributes:
+        meaning: what the key is, for the error message.
+        description: for the documentation.
+        unit: of its values.
+        default: as in a study file; None if the key may be left out without a default.
+        required: whether the source needs it.
+        boolean: whether its values are true and false.
+        integer: whether its values are whole numbers.
+        example: a valid value.
+    """
+
+    meaning: str
+    description: str
+    unit: str = ""
+    default: float | bool | None = None
+    required: bool = False
+    boolean: bool = False
+    integer: bool = False
+    example: float | bool | None = None
+
+
+_SCALE = SourceKey(
+    "metres for each unit of length of the file, a number > 0", "Metres per unit of length of the file.", "m", 1.0,
+    example=1e-3,
+)  # fmt: skip
+# source -> key -> what it is; [mesh] accepts these keys beside the source
+SOURCE_KEYS: dict[str, dict[str, SourceKey]] = {
+    "file": {
+        "scale": _SCALE,
+        "join": SourceKey(
+            "whether nodes of different bodies at the same place become one, true or false",
+            "Merge coincident nodes of different bodies, within 1e-6 of the size of the mesh.",
+            default=False, boolean=True, example=True,
+        ),
+    },
+    "surface": {
+        "h": SourceKey(
+            "a surface is filled with cells of size h > 0 (m)", "Cell size.", "m", required=True, example=0.01
+        ),
+        "scale": _SCALE,
+        "time_limit": SourceKey(
+            "seconds that gmsh may take, a number > 0",
+            "Time limit of gmsh, and again of the repair.", "s", example=600.0
+        ),
+        "repair": SourceKey(
+            "whether holes are filled and parts that cross are made one, true or false",
+            "Close holes, remove self-intersections and merge intersecting parts, with a note on each change "
+            "([repair](meshes.md#repair-of-surfaces)).",
+            default=False, boolean=True, example=True,
+        ),
+    },
+    "outline": {
+        "h": SourceKey(
+            "an outline is filled with cells of size h > 0 (m)", "Cell size.", "m", required=True, example=0.001
+        ),
+        "scale": _SCALE,
+        "seed": SourceKey("of its random points, a whole number > 0", "Seed of the random points.", default=1,
+                          integer=True, example=2),
+    },
+    "shell": {
+        "thickness": SourceKey("a shell has a thickness > 0 (m)", "Thickness of the shell.", "m", required=True,
+                               example=2e-3),
+        "scale": _SCALE,
+    },
+}  # fmt: skip
+
+
+class ElasticSettings(StudyTable):
+    """Elastic constants and density."""
+
+    young: Positive = key("Young's modulus.", "Pa", example=1e5)
+    poisson: Poisson = key("Poisson's ratio.", example=0.35)
+    density: Positive = key("Mass density of the body at rest.", "kg/m^3", example=300.0)
 
 
 class RegionSettings(StudyTable):
-    """[material.NAME]: what differs from [material] in the region NAME of the mesh."""
+    """[material.NAME]: values that differ in the region NAME of the mesh."""
 
-    like: str | None = None  # name of a material that says what else differs: see materials
-    young: Positive | None = None
-    poisson: Poisson | None = None
-    density: Positive | None = None
-    strength: Strength | None = None
-    fracture_energy: Positive | None = None  # J/m^2, in place of fracture.energy
-    yield_stress: Strength | None = None
+    like: str | None = key("Named material whose values apply in the region.", default=None, example="granite")
+    young: Positive | None = key("Young's modulus.", "Pa", default=None, example=4e5)
+    poisson: Poisson | None = key("Poisson's ratio.", default=None, example=0.3)
+    density: Positive | None = key("Mass density.", "kg/m^3", default=None, example=500.0)
+    strength: Strength | None = key("Replaces `fracture.strength`.", "Pa", default=None, example=5e4)
+    fracture_energy: Positive | None = key("Replaces `fracture.energy`.", "J/m^2", default=None, example=40.0)
+    yield_stress: Strength | None = key("Replaces `plasticity.yield_stress`.", "Pa", default=None, example=5e4)
 
 
 class MaterialSettings(ElasticSettings):
-    """[material]; tables inside it are regions."""
+    """The elastic material. Tables inside are regions of the mesh: `[material.crust]`."""
 
-    like: str | None = None  # name of a material whose values those left out are: see materials
-    energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = "neo-hookean"
-    plane: Literal["strain", "stress"] = "strain"  # of a 2D mesh
-    thickness: Positive | None = None  # m, of a 2D mesh out of its plane; None: forces and energies are those of 1 m
-    regions: dict[str, RegionSettings] = Field(default_factory=dict)
+    like: str | None = key(
+        "Named material (`fracsim list materials`). It supplies young, poisson, density and `fracture.strength` where"
+        " the study does not give them.",
+        default=None, example="soda-lime glass",
+    )  # fmt: skip
+    energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = key(
+        "Elastic energy: Hooke's law for small strains and rotations, Hooke's law with the rotation of each cell, "
+        "Saint Venant-Kirchhoff, or stable neo-Hookean. Rigid bodies have `linear` only, which is their default.",
+        default="neo-hookean", example="corotated",
+    )  # fmt: skip
+    plane: Literal["strain", "stress"] = key(
+        "Plane strain or plane stress of a 2D mesh. Plane stress has the energies linear and stvk.",
+        default="strain", example="stress",
+    )  # fmt: skip
+    thickness: Positive | None = key(
+        "Thickness of a 2D body.",
+        "m",
+        default=None,
+        example=0.01,
+        otherwise="forces, energies and masses are per metre",
+    )
+    regions: dict[str, RegionSettings] = key("Regions by name.", factory=dict)
 
     @model_validator(mode="before")
     @classmethod
     def _tables_are_regions(cls, data: Any) -> Any:
         if not isinstance(data, dict) or "regions" in data:
             return data
-        regions = {key: value for key, value in data.items() if isinstance(value, dict)}
-        rest = {key: value for key, value in data.items() if key not in regions}
-        return rest | ({"regions": regions} if regions else {})
+        regions = {name: value for name, value in data.items() if isinstance(value, dict)}
+        values = {name: value for name, value in data.items() if name not in regions}
+        return values | ({"regions": regions} if regions else {})
 
     @field_validator("regions")
     @classmethod
     def _names_are_short(cls, regions: dict[str, RegionSettings]) -> dict[str, RegionSettings]:
         for name in regions:
-            if len(name) > LONGEST_REGION or not name.isprintable():
+            if len(name) > MAX_REGION_NAME or not name.isprintable():
                 raise ValueError(
-                    f"the name of a region has {LONGEST_REGION} letters or fewer, and no control characters; this one "
+                    f"the name of a region has {MAX_REGION_NAME} letters or fewer, and no control characters; this one "
                     f'has not: "{name}"'
                 )
         return regions
 
     @model_validator(mode="after")
-    def _plane_stress_needs_a_form(self) -> MaterialSettings:
+    def _plane_stress_has_an_energy(self) -> MaterialSettings:
         if self.plane == "stress" and self.energy not in ("linear", "stvk"):
             raise ValueError(f'plane = "stress" is offered by the energies linear and stvk, not by {self.energy}')
         return self
@@ -103,5 +211,5 @@ class MaterialSettings(ElasticSettings):
 class DampingSettings(StudyTable):
     """Rayleigh damping a M + b K."""
 
-    mass: NonNegative = 0.0  # a, 1/s
-    stiffness: NonNegative = 0.0  # b, s
+    mass: NonNegative = key("Coefficient a of the mass matrix.", "1/s", default=0.0, example=5.0)
+    stiffness: NonNegative = key("Coefficient b of the stiffness matrix.", "s", default=0.0, example=1e-4)

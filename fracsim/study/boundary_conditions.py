@@ -1,4 +1,4 @@
-"""[[boundary]], [load] and [initial], and the places that they act on."""
+"""Schema of [[boundary]], [load] and [initial], and of the selectors of nodes and facets."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from .values import Finite, Motion, OverTime, Positive, StudyTable, Vector
+from .values import Finite, Motion, OverTime, Positive, StudyTable, Vector, key
 
 
 class BoxSelector(StudyTable):
-    """Nodes inside a box (m)."""
+    """Nodes inside a box. Loads act on facets all of whose nodes are inside."""
 
-    box: Annotated[list[Vector], Field(min_length=2, max_length=2)]
+    box: Annotated[list[Vector], Field(min_length=2, max_length=2)] = key(
+        "Lower and upper corner.", "m", example=[[0.0, 0.0], [0.1, 0.02]]
+    )
 
     @model_validator(mode="after")
-    def _corners(self) -> BoxSelector:
+    def _corners_are_ordered(self) -> BoxSelector:
         lower, upper = self.box
         if any(a > b for a, b in zip(lower, upper, strict=False)):
             raise ValueError(f"box = {self.box}: give the lower corner first, then the upper one")
@@ -23,15 +25,21 @@ class BoxSelector(StudyTable):
 
 
 class PlaneSelector(StudyTable):
-    """Nodes on a plane, within `within` (m; default 1e-6 of the body's size)."""
+    """Nodes on a plane. Loads act on facets all of whose nodes are on it."""
 
-    point: Vector
-    normal: Vector
-    within: Positive | None = None
+    point: Vector = key("A point of the plane.", "m", example=[0.0, 0.05])
+    normal: Vector = key("Normal of the plane, of any length.", example=[0.0, 1.0])
+    within: Positive | None = key(
+        "Greatest distance of a node from the plane.",
+        "m",
+        default=None,
+        example=1e-6,
+        otherwise="1e-6 of the body's size",
+    )
 
 
 def _selector(value: Any) -> str:
-    """Tag of a place: a group's name, a box or a plane."""
+    """Tag of a selector in the union: a group's name, a box or a plane."""
     if isinstance(value, BoxSelector) or (isinstance(value, dict) and "box" in value):
         return "<box>"
     return "<plane>" if isinstance(value, dict | PlaneSelector) else "<group>"
@@ -44,17 +52,29 @@ Selector = Annotated[
 
 
 class BoundarySettings(StudyTable):
-    """[[boundary]]: one condition on a group of facets, a box or a plane. Give exactly one of the kinds."""
+    """A boundary condition on a facet group, a box or a plane. Give exactly one of fix, displacement, velocity,
+    traction, force and pressure. Conditions that contradict each other at the same place are refused."""
 
-    on: Selector
-    fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # components held at zero
-    displacement: OverTime[Motion] | None = None  # m; "free" leaves a component alone
-    velocity: OverTime[Motion] | None = None  # m/s
-    traction: OverTime[Vector] | None = None  # Pa of the reference area
-    force: OverTime[Vector] | None = (
-        None  # N in all, spread evenly over the reference area; 2D: on `material.thickness`
+    on: Selector = key("Name of a facet group, or a table that selects a box or a plane.", example="left")
+    fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = key(
+        "Components of the displacement that are held at zero.", default=None, example="xyz"
     )
-    pressure: OverTime[Finite] | None = None  # Pa, pushes where > 0, follows the surface
+    displacement: OverTime[Motion] | None = key(
+        'Prescribed displacement. "free" leaves a component free.', "m", default=None,
+        example={"time": [0.0, 0.4], "value": [[0.0, "free", 0.0], [0.2, "free", 0.0]]},
+    )  # fmt: skip
+    velocity: OverTime[Motion] | None = key(
+        'Prescribed velocity. "free" leaves a component free.', "m/s", default=None, example=[0.5, "free", 0.0]
+    )
+    traction: OverTime[Vector] | None = key("Force per area at rest.", "Pa", default=None, example=[0.0, 0.0, -1e3])
+    force: OverTime[Vector] | None = key(
+        "Resultant force, distributed uniformly over the area at rest; in 2D on `material.thickness`.",
+        "N", default=None,
+        example=[0.0, 0.0, -100.0],
+    )  # fmt: skip
+    pressure: OverTime[Finite] | None = key(
+        "Pressure that follows the surface; positive values push.", "Pa", default=None, example=1e4
+    )
 
     @model_validator(mode="after")
     def _one_condition(self) -> BoundarySettings:
@@ -64,11 +84,11 @@ class BoundarySettings(StudyTable):
         return self
 
     def _given(self) -> list[str]:
-        return [key for key in CONDITIONS if getattr(self, key) is not None]
+        return [name for name in CONDITIONS if getattr(self, name) is not None]
 
     @property
     def kind(self) -> str:
-        """Which of the conditions it is."""
+        """Name of the condition, one of `CONDITIONS`."""
         return self._given()[0]
 
 
@@ -77,14 +97,18 @@ MOTIONS = ("fix", "displacement", "velocity")
 
 
 class LoadSettings(StudyTable):
-    """[load]: forces on the whole body."""
+    """Forces on the volume of the body."""
 
-    gravity: Vector | None = None  # m/s^2
-    body_force: OverTime[Vector] | None = None  # N/m^3
+    gravity: Vector | None = key("Acceleration of gravity.", "m/s^2", default=None, example=[0.0, 0.0, -9.81])
+    body_force: OverTime[Vector] | None = key(
+        "Force per volume at rest.", "N/m^3", default=None, example=[0.0, 0.0, -1e3]
+    )
 
 
 class InitialSettings(StudyTable):
-    """[initial]: velocity at the start, v = velocity + spin x (X - centre of mass)."""
+    """Velocity at the start, v = velocity + spin x (X - centre of mass)."""
 
-    velocity: Vector | None = None  # m/s
-    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None  # rad/s; one number in 2D
+    velocity: Vector | None = key("Translational velocity.", "m/s", default=None, example=[0.0, 0.0, -2.0])
+    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = key(
+        "Angular velocity about the centre of mass; one number in 2D.", "rad/s", default=None, example=[0.0, 0.0, 1.0]
+    )

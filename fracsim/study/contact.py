@@ -1,4 +1,4 @@
-"""[[obstacle]] and [contact]: what the body cannot pass through."""
+"""Schema of [[obstacle]] and [contact]."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, StudyTable, TimeTable, Vector
+from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, StudyTable, TimeTable, Vector, key
 
-# shape -> (keys that it needs, keys that it may have)
-OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+# shape -> (required keys, optional keys)
+SHAPE_KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "plane": (("normal",), ()),
     "sphere": (("radius",), ("hollow",)),
     "capsule": (("radius", "length", "axis"), ()),
@@ -19,59 +19,94 @@ OF_SHAPE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "mesh": (("file",), ("scale",)),
 }
 GEOMETRY = ("normal", "radius", "length", "axis", "size", "rounding", "hollow", "file", "scale")
-
-
-FREE = ("spin", "hinge", "guide")  # of a free obstacle alone
+FREE = ("spin", "hinge", "guide")  # keys of free obstacles
 
 
 class HingeSettings(StudyTable):
-    """What a free obstacle turns about: a point, in 3D an axis through it."""
+    """Hinge of a free obstacle: a point, in 3D an axis through it."""
 
-    point: Vector  # m
-    axis: Vector | None = None  # 3D
+    point: Vector = key("A point of the axis of rotation.", "m", example=[0.0, 0.0, 0.5])
+    axis: Vector | None = key("Direction of the axis, in 3D.", default=None, example=[0.0, 1.0, 0.0])
 
 
 class ObstacleSettings(StudyTable):
-    """[[obstacle]]: a rigid shape that is held, or driven by a displacement or a velocity; free where it has a mass."""
+    """A rigid obstacle that the body cannot penetrate: fixed, driven by a displacement or velocity, or free with a
+    mass."""
 
-    name: Name
-    shape: Literal["plane", "sphere", "capsule", "cylinder", "box", "mesh"]
-    at: Vector  # its centre, a point of the plane, or where the file has its origin, at t = 0, m
-    normal: Vector | None = None  # of a plane, out of the half space behind it
-    radius: Positive | None = None  # m
-    length: Positive | None = None  # m; of a capsule between the centres of its round ends
-    axis: Vector | None = None
-    size: Annotated[list[Positive], Field(min_length=2, max_length=3)] | None = None  # m, of a box
-    rounding: Positive | None = None  # m, of the edges; default 5 % of the smallest radius or half side
-    file: Path | None = None  # of a mesh: a closed surface of triangles (STL, OBJ, PLY, ...)
-    scale: Positive | None = None  # of a mesh: metres for each unit of length of the file; default 1
-    hollow: Flag = False  # the body is inside: a bowl, a container
-    displacement: OverTime[Vector] | None = None  # m
-    velocity: OverTime[Vector] | None = None  # m/s; of a free obstacle at the start
-    mass: Positive | None = None  # kg (2D: of material.thickness, or of 1 m): it moves freely
-    density: Positive | None = None  # kg/m^3, in place of the mass
-    # rad/s at the start, if free; of a mesh that is held or driven all along, about `at`
-    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = None
-    hinge: HingeSettings | None = None  # free to turn about it
-    guide: Annotated[str, Field(pattern="^[xyz]+$")] | None = None  # free to move along these axes, without turning
-    friction: NonNegative = 0.0  # Coulomb's coefficient
+    name: Name = key(
+        "Name in the columns of history.csv: contact_NAME_x (force on it), gap_NAME, work_NAME, ...", example="hammer"
+    )
+    shape: Literal["plane", "sphere", "capsule", "cylinder", "box", "mesh"] = key(
+        "plane (`normal`), sphere (`radius`), capsule or cylinder (`radius`, `length`, `axis`), box (`size`), or a "
+        "closed surface from a file (`file`, 3D).",
+        example="sphere",
+    )  # fmt: skip
+    at: Vector = key(
+        "Position at t = 0: the centre, a point of the plane, or the origin of the file.", "m", example=[0.0, 0.0, 0.5]
+    )
+    normal: Vector | None = key(
+        "Normal of a plane, out of the half space behind it.", default=None, example=[0.0, 0.0, 1.0]
+    )
+    radius: Positive | None = key("Radius of a sphere, capsule or cylinder.", "m", default=None, example=0.05)
+    length: Positive | None = key(
+        "Length of a cylinder; of a capsule between the centres of its ends.", "m", default=None, example=0.2
+    )
+    axis: Vector | None = key("Axis of a capsule or cylinder.", default=None, example=[0.0, 1.0, 0.0])
+    size: Annotated[list[Positive], Field(min_length=2, max_length=3)] | None = key(
+        "Side lengths of a box.", "m", default=None, example=[0.1, 0.1, 0.2]
+    )
+    rounding: Positive | None = key(
+        "Radius of the edges of a box or cylinder.", "m", default=None, example=0.005,
+        otherwise="5 % of the smallest radius or half side",
+    )  # fmt: skip
+    file: Path | None = key(
+        "Path of a closed surface of triangles (STL, OBJ, PLY, ...).", default=None, example="hammer.stl"
+    )
+    scale: Positive | None = key(
+        "Metres per unit of length of the file.", "m", default=None, example=1e-3, otherwise="1"
+    )
+    hollow: Flag = key("The body is inside a sphere, cylinder or box.", default=False, example=True)
+    displacement: OverTime[Vector] | None = key(
+        "Prescribed displacement.", "m", default=None,
+        example={"time": [0.0, 0.1], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -0.02]]},
+    )  # fmt: skip
+    velocity: OverTime[Vector] | None = key(
+        "Prescribed velocity; of a free obstacle its velocity at the start.",
+        "m/s",
+        default=None,
+        example=[0.0, 0.0, -3.0],
+    )
+    mass: Positive | None = key(
+        "Mass of an obstacle that moves freely; in 2D of `material.thickness`.", "kg", default=None, example=2.0
+    )
+    density: Positive | None = key("Density, in place of the mass.", "kg/m^3", default=None, example=7800.0)
+    spin: Annotated[list[Finite], Field(min_length=1, max_length=3)] | None = key(
+        "Angular velocity: of a free obstacle at the start (one number in 2D and on a hinge); of a fixed or driven "
+        "obstacle from a file at all times, about `at`.",
+        "rad/s", default=None, example=[0.0, 0.0, 1.0],
+    )  # fmt: skip
+    hinge: HingeSettings | None = key("Axis about which a free obstacle turns.", default=None)
+    guide: Annotated[str, Field(pattern="^[xyz]+$")] | None = key(
+        "Axes along which a free obstacle moves without rotation.", default=None, example="z"
+    )
+    friction: NonNegative = key("Coulomb's coefficient of friction.", default=0.0, example=0.3)
 
     @model_validator(mode="after")
-    def _fits_its_shape(self) -> ObstacleSettings:
-        needed, allowed = OF_SHAPE[self.shape]
-        given = [key for key in GEOMETRY if getattr(self, key) not in (None, False)]
-        if missing := [key for key in needed if key not in given]:
+    def _has_the_keys_of_its_shape(self) -> ObstacleSettings:
+        needed, allowed = SHAPE_KEYS[self.shape]
+        given = [name for name in GEOMETRY if getattr(self, name) not in (None, False)]
+        if missing := [name for name in needed if name not in given]:
             raise ValueError(f'shape = "{self.shape}" needs {" and ".join(missing)}')
-        if beyond := [key for key in given if key not in (*needed, *allowed)]:
-            raise ValueError(f'shape = "{self.shape}" has no {beyond[0]}; remove it')
+        if excess := [name for name in given if name not in (*needed, *allowed)]:
+            raise ValueError(f'shape = "{self.shape}" has no {excess[0]}; remove it')
         if self.displacement is not None and self.velocity is not None:
             raise ValueError("give displacement or velocity, not both")
         return self
 
     @model_validator(mode="after")
-    def _is_free_or_not(self) -> ObstacleSettings:
+    def _keys_of_free_obstacles(self) -> ObstacleSettings:
         if not self.is_free:
-            given = [key for key in FREE if getattr(self, key) is not None]
+            given = [name for name in FREE if getattr(self, name) is not None]
             if given and not (self.shape == "mesh" and given == ["spin"]):
                 raise ValueError(f"{given[0]} is for an obstacle that moves freely: give mass or density, or remove it")
             return self
@@ -88,7 +123,7 @@ class ObstacleSettings(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _is_held_in_one_way(self) -> ObstacleSettings:
+    def _one_constraint(self) -> ObstacleSettings:
         if self.hinge is not None and self.guide is not None:
             raise ValueError("give hinge or guide, not both")
         if self.hinge is not None and self.velocity is not None:
@@ -99,23 +134,41 @@ class ObstacleSettings(StudyTable):
 
     @property
     def is_free(self) -> bool:
-        """Whether it moves by itself."""
+        """True if the obstacle has a mass or density."""
         return self.mass is not None or self.density is not None
 
     @property
     def geometry(self) -> dict[str, Any]:
-        """What is given of the shape."""
-        return {key: value for key in GEOMETRY if (value := getattr(self, key)) is not None}
+        """Keys of the shape that are given."""
+        return {name: value for name in GEOMETRY if (value := getattr(self, name)) is not None}
 
 
 class ContactSettings(StudyTable):
-    """[contact]: of the body and its pieces with themselves; and how obstacles act."""
+    """Contact of the body with itself and of its fragments with each other, and parameters of the contact of
+    obstacles."""
 
-    # false: obstacles alone; "pieces": not the cracks inside a piece, nor crumbs that have lost their last whole cell
-    itself: Flag | Literal["pieces"] = True
-    friction: NonNegative = 0.0  # Coulomb's coefficient of the body with itself
-    distance: Positive | None = None  # m, gap from which on it acts; default 3 % of the mean edge, obstacles 5 %
-    stiffness: Positive | None = None  # Pa; default 0.3 of Young's modulus, obstacles a tenth
-    restitution: Annotated[Finite, Field(ge=0, lt=1)] | None = None  # of rigid bodies; default 0
-    contact_time: Positive | None = None  # s that a blow on a rigid body lasts; default: Hertz's, from its speed
-    creep: Positive | None = None  # m/s, slip that passes for sticking; default 1e-3 of the size, 0.05 of the speed
+    itself: Flag | Literal["pieces"] = key(
+        'true: the body with itself. "pieces": fragments with each other, without cracks inside a fragment and nodes '
+        'without an unsplit cell, in a fraction of the time. false: obstacles only.',
+        default=True, example="pieces",
+    )  # fmt: skip
+    friction: NonNegative = key("Coulomb's coefficient of the body with itself.", default=0.0, example=0.3)
+    distance: Positive | None = key(
+        "Gap below which contact acts. Obstacles that start nearer are moved back.", "m", default=None, example=1e-4,
+        otherwise="3 % of the mean edge, at most half the least gap at rest; for obstacles 5 %",
+    )  # fmt: skip
+    stiffness: Positive | None = key(
+        "Contact stiffness. It is raised where a gap falls below 0.3 % of the distance.",
+        "Pa", default=None, example=1e5,
+        otherwise="0.3 of Young's modulus, for obstacles a tenth of it",
+    )  # fmt: skip
+    restitution: Annotated[Finite, Field(ge=0, lt=1)] | None = key(
+        "Coefficient of restitution of rigid bodies.", default=None, example=0.2, otherwise="0"
+    )
+    contact_time: Positive | None = key(
+        "Duration of an impact on a rigid body.", "s", default=None, example=1e-3, otherwise="Hertz's contact time"
+    )
+    creep: Positive | None = key(
+        "Sliding speed below which friction counts as sticking.", "m/s", default=None, example=1e-3,
+        otherwise="1e-3 of the body's size per second; between fragments at least 0.05 of their speed",
+    )  # fmt: skip

@@ -19,6 +19,7 @@ from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import SHORTEST, check_extent, is_number
 from ..meshes.plain_files import MISSING, wrong_with
 from . import MeshSettings
+from .body import SOURCE_KEYS
 from .error_messages import unknown_key_message, validation_message
 
 if TYPE_CHECKING:
@@ -61,45 +62,24 @@ def _reader(kind: type) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-# keys beside the source, and what each of them is
-BESIDE = {
-    "file": {
-        "scale": "metres for each unit of length of the file, a number > 0",
-        "join": "whether nodes of different bodies at the same place become one, true or false",
-    },
-    "surface": {
-        "h": "a surface is filled with cells of size h > 0 (m)",
-        "scale": "metres for each unit of length of the file, a number > 0",
-        "time_limit": "seconds that gmsh may take, a number > 0",
-        "repair": "whether holes are filled and parts that cross are made one, true or false",
-    },
-    "outline": {
-        "h": "an outline is filled with cells of size h > 0 (m)",
-        "scale": "metres for each unit of length of the file, a number > 0",
-        "seed": "of its random points, a whole number > 0",
-    },
-    "shell": {
-        "thickness": "a shell has a thickness > 0 (m)",
-        "scale": "metres for each unit of length of the file, a number > 0",
-    },
-}
-NEEDED = ("h", "thickness")  # of those that have it
-SWITCHES = ("join", "repair")  # keys that are true or false
-
-
 def _check_source(mesh: MeshSettings) -> None:
-    key = next(key for key in BESIDE if getattr(mesh, key) is not None)
+    """InputError for a key that the source does not have, a file that is missing, or a value out of range."""
+    source = next(name for name in SOURCE_KEYS if getattr(mesh, name) is not None)
+    keys = SOURCE_KEYS[source]
     for name in mesh.parameters:
-        if name not in BESIDE[key]:
-            known = ", ".join((key, *BESIDE[key]))
-            raise InputError(f"mesh.{name} is not a known key beside mesh.{key}; known here: {known}")
-    check_file(getattr(mesh, key), f"mesh.{key}")
-    for name, meaning in BESIDE[key].items():
+        if name not in keys:
+            raise InputError(
+                f"mesh.{name} is not a known key beside mesh.{source}; known here: {', '.join((source, *keys))}"
+            )
+    check_file(getattr(mesh, source), f"mesh.{source}")
+    for name, entry in keys.items():
         value: Any = mesh.parameters.get(name)
-        whole = name != "seed" or isinstance(value, int)
-        sound = isinstance(value, bool) if name in SWITCHES else is_number(value) and value >= SHORTEST and whole
-        if (name in mesh.parameters or name in NEEDED) and not sound:
-            raise InputError(f"mesh.{name} = {value}: {meaning}")
+        if entry.boolean:
+            valid = isinstance(value, bool)
+        else:
+            valid = is_number(value) and value >= SHORTEST and (not entry.integer or isinstance(value, int))
+        if (name in mesh.parameters or entry.required) and not valid:
+            raise InputError(f"mesh.{name} = {value}: {entry.meaning}")
 
 
 def check_file(path: Path, key: str) -> None:

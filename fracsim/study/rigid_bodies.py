@@ -1,44 +1,53 @@
-"""[[body]]: where rigid bodies are at the start; and what else a study with time.scheme = "rigid" may say."""
+"""Schema of [[body]], and the limits of a study with `time.scheme = "rigid"`."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Len
-from pydantic import Field, Strict, model_validator
+from pydantic import Strict, model_validator
 
-from .values import Finite, StudyTable
+from .values import Finite, StudyTable, key
 
 if TYPE_CHECKING:
     from .study import Study
 
-InSpace = Annotated[list[Finite], Len(3, 3)]
+Vector3 = Annotated[list[Finite], Len(3, 3)]
 Counts = Annotated[list[Annotated[int, Strict(), Ge(1)]], Len(3, 3)]
-Gaps = Annotated[list[Annotated[Finite, Ge(0)]], Len(3, 3)]
-MOST_TURN = 1e3  # rad a step, of a spin that is given
-NOUGHT, ONCE = (0.0, 0.0, 0.0), (1, 1, 1)
+Distances = Annotated[list[Annotated[Finite, Ge(0)]], Len(3, 3)]
+MAX_ROTATION_PER_STEP = 1e3  # rad, of a given spin; larger angles lose their digits
+
+
+def _zeros() -> list[float]:
+    return [0.0, 0.0, 0.0]
 
 
 class BodySettings(StudyTable):
-    """[[body]]: the mesh once, or on a grid, at x = position + R X of its points X."""
+    """A rigid body, or copies of it on a grid: x = position + R X for a point X of the mesh. Only with
+    `time.scheme = "rigid"`; without any [[body]] there is one body at the position of the mesh."""
 
-    position: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m
-    rotation: InSpace = Field(default_factory=lambda: [*NOUGHT])  # rotation vector of R, rad
-    velocity: InSpace = Field(default_factory=lambda: [*NOUGHT])  # m/s
-    spin: InSpace = Field(default_factory=lambda: [*NOUGHT])  # rad/s, about the centre of the mesh
-    copies: Counts = Field(default_factory=lambda: [*ONCE])  # along x, y, z
-    spacing: Gaps | None = None  # m, between copies; of any size where there is one
+    position: Vector3 = key("Displacement of the origin.", "m", factory=_zeros, example=[0.0, 0.0, 0.3])
+    rotation: Vector3 = key("Rotation vector of R.", "rad", factory=_zeros, example=[0.0, 0.2, 0.0])
+    velocity: Vector3 = key("Velocity at the start.", "m/s", factory=_zeros, example=[0.0, 0.0, -3.0])
+    spin: Vector3 = key(
+        "Angular velocity at the start, about the centre of the mesh.", "rad/s", factory=_zeros, example=[0.0, 0.0, 1.0]
+    )
+    copies: Counts = key("Number of copies along x, y and z.", factory=lambda: [1, 1, 1], example=[3, 3, 1])
+    spacing: Distances | None = key(
+        "Distance between copies along x, y and z; required with several copies.", "m", default=None,
+        example=[0.5, 0.5, 1.0],
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _copies_have_room(self) -> BodySettings:
-        spacing = self.spacing or NOUGHT
+        spacing = self.spacing or _zeros()
         if any(count > 1 and not gap for count, gap in zip(self.copies, spacing, strict=True)):
             raise ValueError(f"copies = {self.copies} lie in one another: give spacing = [x, y, z] in m")
         return self
 
 
 def with_rigid_defaults(data: dict[str, Any]) -> dict[str, Any]:
-    """The tables of a study; where bodies are rigid and nobody says which energy, it is the one there is for them."""
+    """Returns the tables of a study with the energy linear, if it is rigid and gives no energy."""
     time, material = data.get("time"), data.get("material")
     if not (isinstance(time, dict) and time.get("scheme") == "rigid" and isinstance(material, dict)):
         return data
@@ -46,16 +55,21 @@ def with_rigid_defaults(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_rigid(study: Study) -> None:
-    """ValueError where a rigid study asks for what there is none of, or another study for what only rigid ones have."""
+    """Check that a rigid study has no keys of deformable bodies, and another study none of rigid bodies.
+
+    Raises:
+        ValueError: with the first such key.
+    """
     contact = study.contact
     if study.time.scheme != "rigid":
-        own = ["[[body]]"] if study.body else []
+        rigid_keys = ["[[body]]"] if study.body else []
         if contact is not None:
-            own += [f"contact.{key}" for key in ("restitution", "contact_time") if getattr(contact, key) is not None]
+            names = ("restitution", "contact_time")
+            rigid_keys += [f"contact.{name}" for name in names if getattr(contact, name) is not None]
         if study.mesh.shell is not None:
-            own.append("mesh.shell")
-        if own:
-            raise ValueError(f'{own[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
+            rigid_keys.append("mesh.shell")
+        if rigid_keys:
+            raise ValueError(f'{rigid_keys[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
         return
     tables = {"damping": study.damping, "boundary": study.boundary, "probe": study.probe, "initial": study.initial,
               "crack": study.crack}  # fmt: skip
@@ -68,7 +82,7 @@ def check_rigid(study: Study) -> None:
     if study.material.energy != "linear":
         raise ValueError(f'time.scheme = "rigid" solves linear analyses: material.energy = "linear", not '
                          f'"{study.material.energy}"')  # fmt: skip
-    if any(each.density is not None for each in study.material.regions.values()):
+    if any(region.density is not None for region in study.material.regions.values()):
         raise ValueError('with time.scheme = "rigid" a body has one density: remove density from regions of [material]')
     if study.fracture is not None and study.brittle is None:
         raise ValueError('[fracture] with time.scheme = "rigid" needs [brittle]: stiff bodies break along surfaces')
@@ -78,30 +92,36 @@ def check_rigid(study: Study) -> None:
     if contact is not None:
         if contact.itself is not True:
             raise ValueError('contact.itself: with time.scheme = "rigid" bodies always meet one another; remove it')
-        soft = [key for key in ("distance", "stiffness", "creep") if getattr(contact, key) is not None]
-        if soft:
-            raise ValueError(f'contact.{soft[0]} is not for time.scheme = "rigid", whose contacts are hard; remove it')
-    beyond = [key for key in study.solver if not key.startswith(("ksp_", "pc_", "mg_"))]
-    if beyond:
-        raise ValueError(
-            f'solver.{beyond[0]} is not for time.scheme = "rigid": give options of ksp_, pc_ and mg_ alone'
-        )
-    for each in study.obstacle:
-        held = [key for key in ("hinge", "guide") if getattr(each, key) is not None]
-        if held:
+        compliant = [name for name in ("distance", "stiffness", "creep") if getattr(contact, name) is not None]
+        if compliant:
             raise ValueError(
-                f'obstacle {each.name} has a {held[0]}, which time.scheme = "rigid" does not have: let it move freely, '
-                "or drive it"
+                f'contact.{compliant[0]} is not for time.scheme = "rigid", whose contacts are hard; remove it'
             )
-        if each.spin is not None and not each.is_free:
+    excess = [name for name in study.solver if not name.startswith(("ksp_", "pc_", "mg_"))]
+    if excess:
+        raise ValueError(
+            f'solver.{excess[0]} is not for time.scheme = "rigid": give options of ksp_, pc_ and mg_ alone'
+        )
+    for obstacle in study.obstacle:
+        constraints = [name for name in ("hinge", "guide") if getattr(obstacle, name) is not None]
+        if constraints:
             raise ValueError(
-                f'obstacle {each.name} is turned by spin, which time.scheme = "rigid" does not do: give it a mass, or '
-                "drive it without"
+                f'obstacle {obstacle.name} has a {constraints[0]}, which time.scheme = "rigid" does not have: let it '
+                "move freely, or drive it"
+            )
+        if obstacle.spin is not None and not obstacle.is_free:
+            raise ValueError(
+                f'obstacle {obstacle.name} is turned by spin, which time.scheme = "rigid" does not do: give it a '
+                "mass, or drive it without"
             )
 
 
 def _check_denting(study: Study) -> None:
-    """ValueError where [plasticity] asks for what rigid bodies do not do."""
+    """Check that [plasticity] has the keys of dents of rigid bodies only.
+
+    Raises:
+        ValueError: with the first other key.
+    """
     table = study.plasticity
     if table is None:
         return
@@ -113,6 +133,6 @@ def _check_denting(study: Study) -> None:
             "blow is a force, under which what does not harden flows without end"
         )
     plain = type(table)(yield_stress=table.yield_stress, hardening=table.hardening)
-    beyond = [key for key in ("measure", "flow_rate", "update") if getattr(table, key) != getattr(plain, key)]
-    if beyond:
-        raise ValueError(f'plasticity.{beyond[0]} is not for time.scheme = "rigid": give yield_stress and hardening')
+    excess = [name for name in ("measure", "flow_rate", "update") if getattr(table, name) != getattr(plain, name)]
+    if excess:
+        raise ValueError(f'plasticity.{excess[0]} is not for time.scheme = "rigid": give yield_stress and hardening')

@@ -1,10 +1,10 @@
-"""A whole study, and what its tables ask of one another."""
+"""Schema of a whole study: its tables, and the conditions between them."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import ValidationInfo, field_validator, model_validator
 
 from .body import DampingSettings, MaterialSettings, MeshSettings
 from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
@@ -12,59 +12,61 @@ from .contact import ContactSettings, ObstacleSettings
 from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
 from .material_library import fill_from_library
 from .quadratic_checks import check_displacement_order
-from .rigid_bodies import MOST_TURN, BodySettings, check_rigid, with_rigid_defaults
+from .rigid_bodies import MAX_ROTATION_PER_STEP, BodySettings, check_rigid, with_rigid_defaults
 from .solver_options import Options, OptionValue, check_options, expand_print_options
 from .time_and_output import FRACTURE_FIELDS, OutputSettings, ProbeSettings, TimeSettings, frame_interval, frame_notes
-from .values import Deferred, StudyTable
+from .values import Deferred, StudyTable, key
 
 
 def _moduli(material: MaterialSettings) -> list[tuple[float, float]]:
-    """(Young, Poisson) of the material and of every region."""
+    """Young's modulus (Pa) and Poisson's ratio of the material and of every region."""
     regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
     regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
     return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
 
 
 class Study(StudyTable):
-    """A whole study. A table that is absent costs nothing."""
+    """A study. A table that is absent costs nothing: no field, no form, no import."""
 
-    title: str
-    mesh: MeshSettings
-    material: MaterialSettings
-    time: TimeSettings
-    fracture: Deferred[FractureSettings] | None = None
-    plasticity: Deferred[PlasticitySettings] | None = None
-    brittle: Deferred[BrittleSettings] | None = None
-    crack: list[Deferred[CrackSettings]] = Field(default_factory=list)
-    damping: Deferred[DampingSettings] | None = None
-    boundary: list[BoundarySettings] = Field(default_factory=list)
-    load: Deferred[LoadSettings] | None = None
-    initial: Deferred[InitialSettings] | None = None
-    solver: dict[str, OptionValue] = Field(default_factory=dict)  # PETSc options
-    obstacle: list[Deferred[ObstacleSettings]] = Field(default_factory=list)
-    body: list[Deferred[BodySettings]] = Field(default_factory=list)
-    contact: Deferred[ContactSettings] | None = None
-    probe: list[Deferred[ProbeSettings]] = Field(default_factory=list)
-    output: OutputSettings = OutputSettings()
+    title: str = key("Title, in reports, pictures and summary.json.", example="A bar pulled apart")
+    mesh: MeshSettings = key("Mesh.")
+    material: MaterialSettings = key("Elastic material.")
+    time: TimeSettings = key("Time scheme and steps.")
+    fracture: Deferred[FractureSettings] | None = key("Fracture.", default=None)
+    plasticity: Deferred[PlasticitySettings] | None = key("Plastic flow.", default=None)
+    brittle: Deferred[BrittleSettings] | None = key("Crack surfaces.", default=None)
+    crack: list[Deferred[CrackSettings]] = key("Initial cracks.", factory=list)
+    damping: Deferred[DampingSettings] | None = key("Damping.", default=None)
+    boundary: list[BoundarySettings] = key("Boundary conditions.", factory=list)
+    load: Deferred[LoadSettings] | None = key("Forces on the volume.", default=None)
+    initial: Deferred[InitialSettings] | None = key("Velocity at the start.", default=None)
+    solver: dict[str, OptionValue] = key(
+        "PETSc options by their names, without a dash.", factory=dict, example={"ksp_rtol": 1e-6}
+    )  # fmt: skip
+    obstacle: list[Deferred[ObstacleSettings]] = key("Obstacles.", factory=list)
+    body: list[Deferred[BodySettings]] = key("Rigid bodies.", factory=list)
+    contact: Deferred[ContactSettings] | None = key("Contact.", default=None)
+    probe: list[Deferred[ProbeSettings]] = key("Recorded quantities.", factory=list)
+    output: OutputSettings = key("Output.", default=OutputSettings())
 
     @model_validator(mode="before")
     @classmethod
-    def _what_is_not_said(cls, data: Any) -> Any:
+    def _fill_in_values(cls, data: Any) -> Any:
         return with_rigid_defaults(fill_from_library(data)) if isinstance(data, dict) else data
 
     @field_validator("probe", "obstacle")
     @classmethod
-    def _told_apart[Entry: (ProbeSettings, ObstacleSettings)](
+    def _names_are_unique[Entry: (ProbeSettings, ObstacleSettings)](
         cls, entries: list[Entry], info: ValidationInfo
     ) -> list[Entry]:
-        names = [each.name for each in entries]
+        names = [entry.name for entry in entries]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two {info.field_name}s have the name {twice[0]}")
         return entries
 
     @field_validator("solver")
     @classmethod
-    def _printing_is_a_bare_option(cls, options: Options) -> Options:
+    def _print_options_have_no_value(cls, options: Options) -> Options:
         return expand_print_options(options)
 
     @model_validator(mode="after")
@@ -90,7 +92,7 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _flow_needs_plasticity(self) -> Study:
+    def _yield_needs_plasticity(self) -> Study:
         if self.plasticity is None:
             special = [name for name, region in self.material.regions.items() if region.yield_stress is not None]
             if special:
@@ -100,7 +102,7 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _plasticity_fits(self) -> Study:
+    def _check_plasticity(self) -> Study:
         table, material = self.plasticity, self.material
         if table is None:
             return self
@@ -127,7 +129,7 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _surfaces_need_strength(self) -> Study:
+    def _check_surfaces(self) -> Study:
         if self.brittle is None:
             return self
         if self.fracture is None:
@@ -143,7 +145,7 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _energy_stands_alone(self) -> Study:
+    def _check_energy_criterion(self) -> Study:
         table = self.fracture
         if table is not None and table.branching:
             if table.energy is None:
@@ -154,7 +156,7 @@ class Study(StudyTable):
                     'choose time.scheme = "explicit" or "newmark"'
                 )
         if table is not None and table.law == "cohesive":
-            self._cohesive_stands_alone(table)
+            self._check_cohesive(table)
         if table is None or table.energy is None:
             return self
         others = {
@@ -166,12 +168,12 @@ class Study(StudyTable):
             "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
             "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
         }
-        for key, (given, why) in others.items():
+        for name, (given, why) in others.items():
             if given:
-                raise ValueError(f"fracture.energy does not go with {key}: {why}")
+                raise ValueError(f"fracture.energy does not go with {name}: {why}")
         return self
 
-    def _cohesive_stands_alone(self, table: FractureSettings) -> None:
+    def _check_cohesive(self, table: FractureSettings) -> None:
         if table.energy is None:
             raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
         others = {
@@ -183,9 +185,9 @@ class Study(StudyTable):
             ),
             "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
         }  # fmt: skip
-        for key, (given, why) in others.items():
+        for name, (given, why) in others.items():
             if given:
-                raise ValueError(f'fracture.law = "cohesive" does not go with {key}: {why}')
+                raise ValueError(f'fracture.law = "cohesive" does not go with {name}: {why}')
 
     @model_validator(mode="after")
     def _cracks_need_fracture(self) -> Study:
@@ -194,7 +196,7 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _projection_is_of_small_strains(self) -> Study:
+    def _check_projection(self) -> Study:
         if self.fracture is None or self.fracture.approach != "edge":
             return self
         if self.material.energy not in ("linear", "corotated"):
@@ -207,20 +209,20 @@ class Study(StudyTable):
         return self
 
     @model_validator(mode="after")
-    def _explicit_steps_once(self) -> Study:
+    def _explicit_steps_have_one_pass(self) -> Study:
         if not self.time.scheme_class.implicit and self.fracture is not None and (self.fracture.passes or 1) > 1:
             raise ValueError("fracture.passes solves a step again, which explicit steps do not; set passes = 1")
         return self
 
     @model_validator(mode="after")
-    def _contact_fits_the_scheme(self) -> Study:
+    def _check_contact(self) -> Study:
         scheme = f'time.scheme = "{self.time.scheme}"'
         if self.contact is not None and not self.time.scheme_class.implicit and self.contact.creep is not None:
             raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
-        solids = [number for number, each in enumerate(self.obstacle) if each.shape == "mesh"]
-        if solids and not self.time.scheme_class.implicit:
+        from_files = [number for number, obstacle in enumerate(self.obstacle) if obstacle.shape == "mesh"]
+        if from_files and not self.time.scheme_class.implicit:
             raise ValueError(
-                f"obstacle.{solids[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
+                f"obstacle.{from_files[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
                 '"backward-euler", or another shape'
             )
         if self.contact is not None and not self.contact.itself and not self.obstacle:
@@ -229,78 +231,81 @@ class Study(StudyTable):
 
     @model_validator(mode="after")
     def _free_obstacles_have_inertia(self) -> Study:
-        loose = [number for number, each in enumerate(self.obstacle) if each.is_free]
-        if loose and not self.time.scheme_class.inertia:
+        free = [number for number, obstacle in enumerate(self.obstacle) if obstacle.is_free]
+        if free and not self.time.scheme_class.inertia:
             raise ValueError(
-                f"obstacle.{loose[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
+                f"obstacle.{free[0]} has a mass and moves freely, which takes inertia: a quasi-static study has none; "
                 'choose time.scheme = "backward-euler", or drive it by displacement'
             )
         return self
 
     @model_validator(mode="after")
-    def _spins_are_followed(self) -> Study:
-        spins = [(f"body.{number}", each.spin) for number, each in enumerate(self.body)]
-        spins += [(f"obstacle.{number}", each.spin) for number, each in enumerate(self.obstacle) if each.spin]
-        for key, spin in spins:
-            if (turned := max(map(abs, spin)) * self.time.max_step) > MOST_TURN:
+    def _check_spins(self) -> Study:
+        spins = [(f"body.{number}", body.spin) for number, body in enumerate(self.body)]
+        spins += [(f"obstacle.{i}", obstacle.spin) for i, obstacle in enumerate(self.obstacle) if obstacle.spin]
+        for name, spin in spins:
+            if (rotation := max(map(abs, spin)) * self.time.max_step) > MAX_ROTATION_PER_STEP:
                 raise ValueError(
-                    f"{key}.spin turns it by {turned:.3g} rad in a step of {self.time.max_step:g} s; at most "
-                    f"{MOST_TURN:g} rad are followed: give a slower spin or a shorter time.step"
+                    f"{name}.spin turns it by {rotation:.3g} rad in a step of {self.time.max_step:g} s; at most "
+                    f"{MAX_ROTATION_PER_STEP:g} rad are followed: give a slower spin or a shorter time.step"
                 )
         return self
 
     @model_validator(mode="after")
-    def _order_fits(self) -> Study:
+    def _check_order(self) -> Study:
         check_displacement_order(self)
         return self
 
     @model_validator(mode="after")
-    def _rigid_or_not(self) -> Study:
+    def _check_rigid(self) -> Study:
         check_rigid(self)
         return self
 
     @model_validator(mode="after")
-    def _a_load_ends_the_run(self) -> Study:
+    def _check_stop_criterion(self) -> Study:
         if self.time.until is None:
             return self
-        named = [each.name for each in self.probe if each.quantity == "reaction"]
-        named += [each.name for each in self.obstacle]
-        of = self.time.until.of
-        if (len(named) == 1 and of is None) or of in named:
+        names, of = self._load_names(), self.time.until.of
+        if (len(names) == 1 and of is None) or of in names:
             return self
         which = f"of = {of!r} is none of them" if of is not None else "say which, of = NAME"
-        there = ", ".join(named) or "none: add a [[probe]] with on = the group that is driven"
+        there = ", ".join(names) or "none: add a [[probe]] with on = the group that is driven"
         raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
 
     @property
     def monitored_load(self) -> str:
         """Name of the probe or obstacle whose load ends the run (time.until)."""
-        names = [each.name for each in self.probe if each.quantity == "reaction"] + [e.name for e in self.obstacle]
         assert self.time.until is not None
-        return self.time.until.of or names[0]
+        return self.time.until.of or self._load_names()[0]
+
+    def _load_names(self) -> list[str]:
+        """Names of the probes of reactions and of the obstacles."""
+        reactions = [probe.name for probe in self.probe if probe.quantity == "reaction"]
+        return reactions + [obstacle.name for obstacle in self.obstacle]
 
     @property
     def thickness(self) -> float:
-        """m, of a 2D body out of its plane: what forces and energies per metre are multiplied with."""
+        """Thickness of a 2D body, m: forces and energies per metre are multiplied by it."""
         return self.material.thickness or 1.0
 
     @property
     def frame_interval(self) -> float:
-        """Simulated time between two frames, s; 0 where they are counted in steps."""
+        """Simulated time between two frames, s; 0 if `output.every` counts steps."""
         return frame_interval(self.time, self.output)
 
     @property
     def frame_notes(self) -> list[str]:
-        """What is to be said where frames are not as far apart as the study asks."""
+        """Notes on a time between frames that differs from `output.interval`."""
         return frame_notes(self.time, self.output)
 
     @property
     def starts_at_rest(self) -> bool:
-        """Whether nothing moves at the start."""
-        return self.initial is None and not any(each.is_free and (each.velocity or each.spin) for each in self.obstacle)
+        """True if neither the body nor a free obstacle moves at the start."""
+        moving = [obstacle.is_free and (obstacle.velocity or obstacle.spin) for obstacle in self.obstacle]
+        return self.initial is None and not any(moving)
 
     @model_validator(mode="after")
-    def _rest_has_no_velocity(self) -> Study:
+    def _initial_velocity_needs_inertia(self) -> Study:
         if not self.time.scheme_class.inertia and self.initial is not None:
             raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
         return self

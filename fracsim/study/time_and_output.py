@@ -1,4 +1,4 @@
-"""[time], [[probe]] and [output]: how a study is run, and what is kept of it."""
+"""Schema of [time], [[probe]] and [output]."""
 
 from __future__ import annotations
 
@@ -10,28 +10,38 @@ from pydantic import Discriminator, Field, Tag, create_model, field_validator, m
 
 from ..forms.schemes import SCHEMES, Scheme
 from .boundary_conditions import Selector
-from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, Seconds, StudyTable, TimeTable, Vector
+from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, Seconds, StudyTable, TimeTable, Vector, key
 
 
 class StopCriterion(StudyTable):
-    """[time] until: the run ends before `end` once a load has fallen from its peak."""
+    """End of the run before `end`, when a load has fallen from its peak and something has broken."""
 
-    drop: Annotated[Finite, Field(gt=0, lt=1)]  # share of the peak that is lost
-    of: str | None = None  # name of a probe that records a reaction, or of an obstacle; default: the only one
-    above: NonNegative = 0.0  # N: peaks below do not count
+    drop: Annotated[Finite, Field(gt=0, lt=1)] = key("Share of the peak that the load has lost.", example=0.8)
+    of: str | None = key(
+        "Name of a probe that records a reaction, or of an obstacle.", default=None, example="grip",
+        otherwise="the only probe or obstacle",
+    )  # fmt: skip
+    above: NonNegative = key("Peaks below this force are ignored.", "N", default=0.0, example=10.0)
 
 
 class BaseTimeSettings(StudyTable):
-    """[time]: scheme and steps, without the parameters of the schemes."""
+    """Time scheme and steps."""
 
-    scheme: str = "generalized-alpha"
-    step: OverTime[Seconds]  # s; a table: of the time at which a step begins
-    end: Seconds  # s
-    adapt: Flag = True  # halve a step that fails, grow back after easy ones
-    smallest: Seconds | None = None  # s; default step / 1024
-    breaking_step: Seconds | None = None  # s: a longer step in which edges break is taken again, half as long
-    until: StopCriterion | None = None
-    mass: Literal["lumped", "consistent"] = "lumped"
+    scheme: str = key("Time scheme (`fracsim list`).", default="generalized-alpha", example="generalized-alpha")
+    step: OverTime[Seconds] = key(
+        "Time step; a table gives it for a step that begins at that time. An upper bound for explicit steps.", "s",
+        example=5e-3,
+    )  # fmt: skip
+    end: Seconds = key("End of the run.", "s", example=0.4)
+    adapt: Flag = key("Halve a step that fails, and lengthen steps again after easy ones.", default=True, example=False)
+    smallest: Seconds | None = key(
+        "Smallest step after halving.", "s", default=None, example=1e-5, otherwise="`time.step` / 1024"
+    )
+    breaking_step: Seconds | None = key(
+        "A longer step in which edges break is repeated with half the length.", "s", default=None, example=1e-4
+    )
+    until: StopCriterion | None = key("Ends the run before `end`.", default=None)
+    mass: Literal["lumped", "consistent"] = key("Mass matrix.", default="lumped", example="consistent")
 
     @property
     def scheme_class(self) -> type[Scheme]:
@@ -102,18 +112,31 @@ if TYPE_CHECKING:
     TimeSettings = BaseTimeSettings
 else:
     TimeSettings = create_model(
-        "TimeSettings", __base__=BaseTimeSettings, __module__=__name__, __doc__="[time]: scheme and steps.",
-        scheme=(Literal[tuple(SCHEMES)], BaseTimeSettings.model_fields["scheme"].default), **_keys_of_schemes(),
+        "TimeSettings", __base__=BaseTimeSettings, __module__=__name__, __doc__=BaseTimeSettings.__doc__,
+        scheme=(Literal[tuple(SCHEMES)], BaseTimeSettings.model_fields["scheme"]), **_keys_of_schemes(),
     )  # fmt: skip
 
 
 class ProbeSettings(StudyTable):
-    """[[probe]]: what history.csv records at a point (nearest node) or over a group."""
+    """A quantity that history.csv records in every step, at a point or over a group. Give either point or on."""
 
-    name: Name
-    point: Vector | None = None  # m, reference configuration
-    on: Selector | None = None
-    record: Literal["displacement", "reaction"] | None = None  # default: reaction over a group, displacement at a point
+    name: Name = key(
+        "Name in the columns of history.csv: reaction_NAME_x and motion_NAME_x (mean displacement) of a group, "
+        "probe_NAME_x of a point.",
+        example="grip",
+    )  # fmt: skip
+    point: Vector | None = key(
+        "Position at rest; the nearest node is recorded.", "m", default=None, example=[0.4, 0.05, 0.05]
+    )
+    on: Selector | None = key(
+        "Name of a facet group, or a table that selects a box or a plane.", default=None, example="right"
+    )
+    record: Literal["displacement", "reaction"] | None = key(
+        "Quantity.",
+        default=None,
+        example="displacement",
+        otherwise="reaction and motion over `on`, displacement at `point`",
+    )
 
     @model_validator(mode="after")
     def _place(self) -> ProbeSettings:
@@ -190,10 +213,10 @@ Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 
 
 class ColourSettings(StudyTable):
-    """[output] look: own colours."""
+    """Colours of pictures, as "#rrggbb"."""
 
-    skin: Colour  # of what was the boundary
-    inside: Colour  # of what cracks lay open
+    skin: Colour = key("Colour of the boundary at rest.", example="#b9712c")
+    inside: Colour = key("Colour of crack faces.", example="#f0deb6")
 
 
 def _look(value: Any) -> str:
@@ -202,21 +225,36 @@ def _look(value: Any) -> str:
 
 
 class OutputSettings(StudyTable):
-    """[output]: what is written, and how often."""
+    """Files of the output folder, and the time between frames."""
 
-    every: Annotated[int, Field(ge=1, strict=True)] | None = None  # steps
-    interval: Positive | None = None  # s
-    fields: list[Literal[FIELDS]] | None = None  # type: ignore[valid-type]
-    surface: Flag | None = None  # the split surface and pieces.csv; default: with [fracture] or an [[obstacle]]
-    # where broken edges are cut: in proportion to the nodal forces, or so that cracks are smooth; default: smooth where
-    # there is a look and nothing touches, else in the middle
-    cut: Literal["middle", "forces", "smooth"] | None = None
-    picture: Flag = True  # a PNG of the last frame
+    every: Annotated[int, Field(ge=1, strict=True)] | None = key(
+        "Steps between frames, in place of `interval`.", default=None, example=10
+    )
+    interval: Positive | None = key(
+        "Time between frames. With constant steps it is rounded to a whole number of them.",
+        "s", default=None, example=0.02,
+        otherwise="about 50 frames",
+    )  # fmt: skip
+    fields: list[Literal[FIELDS]] | None = key(  # type: ignore[valid-type]
+        "Fields of fields.xdmf beside the displacement.", default=None, example=["damage", "chi", "von_mises", "piece"]
+    )
+    surface: Flag | None = key(
+        "Write the split surface and pieces.csv.", default=None, example=True,
+        otherwise="with [fracture] or an [[obstacle]]",
+    )  # fmt: skip
+    cut: Literal["middle", "forces", "smooth"] | None = key(
+        "Position at which broken edges are cut in the split surface: the middle, in inverse proportion to nodal "
+        "forces, or such that cracks are smooth.",
+        default=None, example="smooth", otherwise="smooth with a `look` and without contact, else middle",
+    )  # fmt: skip
+    picture: Flag = key("Write last.png, a picture of the last frame.", default=True, example=False)
     look: Annotated[  # type: ignore[valid-type]
         Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[ColourSettings, Tag("<colours>")],
         Discriminator(_look),
-    ] = "plain"  # of pictures
-    checkpoint: Positive | None = None  # s of wall time between checkpoints; default: only where a run ends early
+    ] = key("Colours of pictures, by material or given.", default="plain", example="porcelain")
+    checkpoint: Positive | None = key(
+        "Wall time between checkpoints.", "s", default=None, example=600.0, otherwise="only when a run ends early"
+    )
 
     @field_validator("fields")
     @classmethod

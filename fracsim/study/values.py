@@ -1,9 +1,10 @@
-"""What a key may hold: numbers in SI units, vectors, and tables over time."""
+"""Types of the values of keys: numbers in SI units, vectors, functions of time, and `key`, which documents a key."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 # A look for plugins in all installed packages, and a check of schemas that pydantic has just made: a tenth of a second.
@@ -17,6 +18,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Discriminator,
+    Field,
     Strict,
     StringConstraints,
     Tag,
@@ -51,10 +53,10 @@ Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
 Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
-LONGEST_NAME = 64  # letters: names of files have 255, with what stands around a name
+MAX_NAME = 64  # letters: names of files have 255, with what stands around a name
 # of obstacles and probes: part of names of files, columns and arrays
-Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=LONGEST_NAME)]
-LONGEST_REGION = 100  # letters of the name of a region, which programs that make meshes choose
+Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=MAX_NAME)]
+MAX_REGION_NAME = 100  # letters of the name of a region, which programs that make meshes choose
 
 
 def _within_reach(time: float) -> float:
@@ -79,13 +81,44 @@ Motion = Annotated[list[Component], Len(2, 3)]
 
 
 class StudyTable(BaseModel):
-    """A table of the study file: unknown keys are refused."""
+    """Base of the tables of a study file. Unknown keys are refused, values cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants", defer_build=True)
 
 
-class _Later:
-    """Its schema is made where such a table is given: that of all of them takes as long as to read a study."""
+def key(
+    description: str,
+    unit: str = "",
+    *,
+    default: Any = ...,
+    example: Any = None,
+    otherwise: str = "",
+    factory: Callable[[], Any] | None = None,
+) -> Any:
+    """Declare a key of the study file with its documentation.
+
+    The page docs/study-file.md is written from it, and a JSON schema has the same texts.
+
+    Args:
+        description: one or more sentences on the meaning of the key.
+        unit: of its values; empty where they have none.
+        default: of the key; without one the key is required.
+        example: a valid value.
+        otherwise: what applies if a key whose default is None is left out.
+        factory: makes the default, where it is a list or a table.
+    """
+    options: dict[str, Any] = {"default": default} if factory is None else {"default_factory": factory}
+    return Field(
+        description=description,
+        examples=[] if example is None else [example],
+        json_schema_extra={"unit": unit, "otherwise": otherwise},
+        **options,
+    )
+
+
+class _DeferredSchema:
+    """Marks a table whose validator is built when a study has the table: building all takes as long as reading a
+    study."""
 
     def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: Any) -> Any:
         return no_info_plain_validator_function(source.model_validate)
@@ -94,14 +127,14 @@ class _Later:
 if TYPE_CHECKING:
     type Deferred[Model] = Model
 else:
-    type Deferred[Model] = Annotated[Model, _Later()]
+    type Deferred[Model] = Annotated[Model, _DeferredSchema()]
 
 
 class TimeTable[Value](StudyTable):
-    """Values at times in s, linear in between and constant outside."""
+    """Values at increasing times, linear in between and constant outside."""
 
-    time: Annotated[list[Finite], Len(1)]
-    value: list[Value]
+    time: Annotated[list[Finite], Len(1)] = key("Increasing times.", "s", example=[0.0, 0.4])
+    value: list[Value] = key("One value for each time.")
 
     @model_validator(mode="after")
     def _increasing(self) -> TimeTable[Value]:
