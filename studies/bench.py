@@ -143,7 +143,7 @@ class Bare:
         from ..forms.balance import elastic_energy, internal_work
         from ..forms.energies import NeoHookean, lame
         from ..mechanics.jit import jit_options
-        from ..mechanics.matrix_assembly import Assembly
+        from ..mechanics.matrix_assembly import TangentAssembler
         from ..solvers.linear_solver import rigid_body_modes
         from ..solvers.preconditioner import MULTIGRID
 
@@ -170,7 +170,7 @@ class Bare:
         self.bcs = [fem.dirichletbc(self.g, np.sort(np.concatenate([bottom, top])).astype(np.int32))]
         rows, owned = self.bcs[0].dof_indices()
         self.held = rows[:owned]
-        self.assembly = Assembly(self.K) if in_lanes else None
+        self.assembly = TangentAssembler(self.K) if in_lanes else None
         self.A = self.assembly.matrix if self.assembly is not None else fem_petsc.create_matrix(self.K)
         self.b = fem_petsc.create_vector(self.R)
         self.A.setNearNullSpace(rigid_body_modes(domain))

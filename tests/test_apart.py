@@ -58,9 +58,9 @@ def test_crumbs_between_hammer_and_floor(tmp_path: Path) -> None:
     for term in terms:
 
         def watched(pattern: Any, term: Any = term, go: Any = term.edges_broke) -> None:
-            before = term.stored()
+            before = term.stored_energy()
             go(pattern)
-            rose.append(term.stored() - before)
+            rose.append(term.stored_energy() - before)
 
         term.edges_broke = watched  # type: ignore[method-assign]
     run()

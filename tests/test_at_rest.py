@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.cell_energy import CellEnergy
-from fracsim.mechanics.tangent import Stiffness
+from fracsim.mechanics.tangent import Tangent
 from fracsim.solvers import nonlinear_elimination, nonlinear_solver
 from support.ranks import OnRanks, Results, starting
 from support.reference import dense_tangent
@@ -26,12 +26,12 @@ def test_cells_add_up_to_the_body(energy: str, dim: int) -> None:
         material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
     )
     X, balance, domain = positions(scene), scene.balance, scene.domain
-    balance.displace((-0.2 * X + RANDOM.normal(scale=0.05, size=X.shape)).reshape(-1))
+    balance.set_displacement((-0.2 * X + RANDOM.normal(scale=0.05, size=X.shape)).reshape(-1))
     of_cells = CellEnergy(balance.stress)(np.arange(domain.cell_count, dtype=np.int32))
-    assert np.isclose(of_cells.energy.sum(), balance.stress.stored(), rtol=1e-12)
+    assert np.isclose(of_cells.energy.sum(), balance.stress.stored_energy(), rtol=1e-12)
     forces, n = np.zeros_like(X), domain.node_count
     np.add.at(forces, domain.cell_nodes, of_cells.forces)
-    np.testing.assert_allclose(forces.reshape(-1), balance.stress.force(), atol=1e-13)
+    np.testing.assert_allclose(forces.reshape(-1), balance.stress.assemble_forces(), atol=1e-13)
     K = np.zeros((n, n, dim, dim))
     for corners, block in zip(domain.cell_nodes, of_cells.stiffness, strict=True):
         K[np.ix_(corners, corners)] += block
@@ -42,8 +42,8 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     """A block of which a corner flies off at once, through the cell behind it: steps end as without, to the tolerance
     of Newton's method, with fewer tangents; without damage nothing of it is made."""
     made: list[int] = []
-    assemble = Stiffness._assemble_body
-    monkeypatch.setattr(Stiffness, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
+    assemble = Tangent._assemble_body
+    monkeypatch.setattr(Tangent, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
     monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)
@@ -62,20 +62,20 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
     scene, _ = thrown(steps=0)
     balance = scene.balance
-    balance.begin(0.01, 0.01, *(np.zeros(balance.owned) for _ in range(3)))
-    X, u = positions(scene), np.zeros((balance.owned // 3, 3))
+    balance.begin_step(0.01, 0.01, *(np.zeros(balance.owned_dof_count) for _ in range(3)))
+    X, u = positions(scene), np.zeros((balance.owned_dof_count // 3, 3))
     corner = X.sum(axis=1).argmax()
     u[corner] = -0.3
-    balance.displace(u.reshape(-1))
-    before, high = balance.forces().copy().reshape(-1, 3), balance.potential()[0]
+    balance.set_displacement(u.reshape(-1))
+    before, high = balance.update_forces().copy().reshape(-1, 3), balance.incremental_potential()[0]
     few = nonlinear_elimination.patches_of(balance)
     assert few is not None and few.rest(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, 3) - u).max(axis=1))
     touched = np.unique(scene.domain.cell_nodes[(scene.domain.cell_nodes == corner).any(axis=1)])
     assert set(touched) <= set(moved) and len(moved) < 0.7 * len(u)
-    after = balance.forces().reshape(-1, 3)
+    after = balance.update_forces().reshape(-1, 3)
     assert np.linalg.norm(after[moved]) < nonlinear_elimination.ENOUGH * np.linalg.norm(before)
-    assert balance.potential()[0] < high
+    assert balance.incremental_potential()[0] < high
     dofs = (3 * moved[:, None] + np.arange(3)).reshape(-1)
     K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
     assert np.linalg.eigvalsh(K[np.ix_(dofs, dofs)])[0] > 0
@@ -88,20 +88,20 @@ def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(nonlinear_elimination, "FEW", 0.5)
     scene, state, tethers = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0})
     balance = scene.balance
-    balance.begin(10.0, 10.0, state.u, np.zeros(balance.owned), np.zeros(balance.owned))
+    balance.begin_step(10.0, 10.0, state.u, np.zeros(balance.owned_dof_count), np.zeros(balance.owned_dof_count))
     u = state.u.reshape(-1, dim).copy()
     node = int(np.flatnonzero(scene.domain.node_input == tethers.ties.nodes[0, 0])[0])
     u[node] += 2.0
-    balance.displace(u.reshape(-1))
-    before, high, stored = balance.forces().copy(), balance.potential()[0], tethers.stored()
+    balance.set_displacement(u.reshape(-1))
+    before, high, stored = balance.update_forces().copy(), balance.incremental_potential()[0], tethers.stored_energy()
     few = nonlinear_elimination.patches_of(balance)
     assert few is not None and few.rest(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, dim) - u).max(axis=1))
     assert node in moved
-    assert np.linalg.norm(balance.forces().reshape(-1, dim)[moved]) < nonlinear_elimination.ENOUGH * np.linalg.norm(
-        before
-    )
-    assert balance.potential()[0] < high - 0.9 * stored
+    assert np.linalg.norm(
+        balance.update_forces().reshape(-1, dim)[moved]
+    ) < nonlinear_elimination.ENOUGH * np.linalg.norm(before)
+    assert balance.incremental_potential()[0] < high - 0.9 * stored
 
 
 @pytest.fixture(scope="module")

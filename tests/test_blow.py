@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
-from fracsim.mechanics.contact_time_weights import Blow, given
+from fracsim.mechanics.contact_time_weights import ContactTimeWeights, acceleration_change
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -24,16 +24,16 @@ def test_a_particle_that_is_struck(scheme: Scheme) -> None:
     c_a, _ = scheme.rates(dt)
     start = np.zeros(1), np.full(1, 3.0), np.full(1, 5.0)
     x, _ = scheme.references(dt, *start)
-    moved = np.full(1, Blow.of(scheme).factor * (1 - scheme.alpha_f) * f / m / c_a)
+    moved = np.full(1, ContactTimeWeights.for_scheme(scheme).factor * (1 - scheme.alpha_f) * f / m / c_a)
     (u, v, a), (u_f, v_f, a_f) = scheme.finish(dt, x, *start), scheme.finish(dt, x + moved, *start)
     newmark = getattr(scheme, "newmark", scheme)
     theta = 1.0 if isinstance(scheme, BackwardEuler) else newmark.beta / newmark.gamma
     assert [v_f - v, u_f - u] == pytest.approx([dt * f / m, theta * dt**2 * f / m], rel=1e-9)
-    assert a_f - given(scheme, dt, moved) == pytest.approx(a, rel=1e-9)
+    assert a_f - acceleration_change(scheme, dt, moved) == pytest.approx(a, rel=1e-9)
 
 
 def test_without_inertia_there_are_no_blows() -> None:
-    assert Blow.of(QuasiStatic()) == Blow()
+    assert ContactTimeWeights.for_scheme(QuasiStatic()) == ContactTimeWeights()
 
 
 def bounce(scheme: str, step: float, **more: Any) -> float:
@@ -128,7 +128,7 @@ def energies(scheme: str, energy: str, **more: Any) -> tuple[Values, list[bool]]
     start, found, touched = scene.balance.kinetic_energy(state.v), [], []
     for report in each_step(scene, state):
         found.append((report.kinetic + report.elastic) / start)
-        struck = scene.balance.struck()
+        struck = scene.balance.contact_forces()
         touched.append(struck is not None and bool(np.abs(struck).max() > 0))
     return np.array([1.0, *found]), [False, *touched]
 

@@ -137,7 +137,9 @@ def test_two_tips_in_a_disc_share_its_force() -> None:
         force = now.forces()
         released = each(force, now.tips.ahead, tangent)
         size = np.linalg.norm(reached - [0.5, 0.503], axis=1).sum()
-        books.append((scene.balance.stress.stored(), size, released.mean(), np.linalg.norm(force, axis=1).mean()))
+        books.append(
+            (scene.balance.stress.stored_energy(), size, released.mean(), np.linalg.norm(force, axis=1).mean())
+        )
     (before, start, *_), (_, _, G, whole), (after, end, *_) = books
     taken = (before - after) / (end - start)
     assert pytest.approx(taken, rel=0.2) == G

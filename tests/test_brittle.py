@@ -88,7 +88,7 @@ def test_the_gradient_of_a_quadratic_cell_is_its_mean(dim: int) -> None:
     Q = np.random.default_rng(1).normal(size=(dim, dim, dim))
     Q = 0.05 * (Q + np.swapaxes(Q, 1, 2))
     X, domain = positions(scene), scene.domain
-    scene.balance.displace((np.einsum("ni,kij,nj->nk", X, Q, X) / 2).reshape(-1))
+    scene.balance.set_displacement((np.einsum("ni,kij,nj->nk", X, Q, X) / 2).reshape(-1))
     centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
     exact = np.eye(dim) + np.einsum("kij,cj->cki", Q, centroids)
     found = scene.fracture.criterion._gradients(np.arange(domain.cell_count))

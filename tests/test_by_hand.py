@@ -11,10 +11,10 @@ from fracsim.forms.schemes import Newmark
 from fracsim.mechanics.balance import Balance
 from fracsim.mechanics.inertia import Inertia, LumpedMass
 from fracsim.mechanics.material_fields import coefficient, material_fields
-from fracsim.mechanics.matrix_assembly import Assembler
+from fracsim.mechanics.matrix_assembly import VectorAssembler
 from fracsim.mechanics.prescribed_motion import PrescribedMotion
 from fracsim.mechanics.stress import Stress
-from fracsim.mechanics.time_functions import constant
+from fracsim.mechanics.time_functions import constant_function
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.selectors import Group
 from fracsim.meshes.builders.box import Box
@@ -39,10 +39,10 @@ def test_a_bar_swings_in_its_first_mode() -> None:
     dt = 2 * np.pi / w / 100
 
     domain = distribute(MPI.COMM_SELF, Box(size=(LENGTH, 0.1), h=0.05).build())
-    assembler, u = Assembler(domain), fem.Function(domain.space)
+    assembler, u = VectorAssembler(domain), fem.Function(domain.space)
     material = material_fields(domain, "linear", young=YOUNG, poisson=0.0, density=DENSITY)
     left, right = domain.nodes_of(Group("left")), domain.nodes_of(Group("right"))
-    motion = PrescribedMotion(domain, [(left, np.array([True, True]), constant([0.0, 0.0]))])
+    motion = PrescribedMotion(domain, [(left, np.array([True, True]), constant_function([0.0, 0.0]))])
     mass = LumpedMass(assembler, coefficient(domain, DENSITY))
     terms = [Stress(assembler, u, material), Inertia(u, mass)]
     balance = Balance(assembler, u, terms, motion, mass, Newmark(), dt)

@@ -24,7 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where libraries go, and nothing is there yet."""
     made = tmp_path / "cache"
     monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": made})
-    c_library.library.cache_clear()
+    c_library.load_library.cache_clear()
     return made
 
 
@@ -32,14 +32,14 @@ def test_a_file_is_compiled_once_and_anew_where_it_changes(folder: Path, tmp_pat
     """The second time no compiler is asked for; another text is another library; nothing else is left there."""
     source = tmp_path / "twice.c"
     source.write_text("int twice(int n) { return 2 * n; }\n")
-    assert c_library.library(source).twice(c_int(21)) == 42
-    c_library.library.cache_clear()
+    assert c_library.load_library(source).twice(c_int(21)) == 42
+    c_library.load_library.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(c_library.subprocess, "run", lambda *_, **__: pytest.fail("compiled again"))
-        assert c_library.library(source).twice(c_int(4)) == 8
+        assert c_library.load_library(source).twice(c_int(4)) == 8
     source.write_text("int twice(int n) { return n + n + 1; }\n")
-    c_library.library.cache_clear()
-    assert c_library.library(source).twice(c_int(4)) == 9
+    c_library.load_library.cache_clear()
+    assert c_library.load_library(source).twice(c_int(4)) == 9
     assert sorted(path.suffix for path in folder.iterdir()) == [".lock", ".sha256", ".sha256", ".so", ".so"]
 
 
@@ -52,7 +52,7 @@ def test_what_cannot_be_compiled_says_why(
     source = tmp_path / "twice.c"
     source.write_text(text)
     with pytest.raises(InputError, match=f"twice.c.*{said}.*install a C compiler"):
-        c_library.library(source)
+        c_library.load_library(source)
     assert [path.name for path in folder.iterdir()] == ["fracsim.lock"]
 
 
@@ -64,8 +64,8 @@ def twice(folder: Path, tmp_path: Path) -> Path:
     """A C file that has been compiled."""
     source = tmp_path / "twice.c"
     source.write_text(TWICE)
-    assert c_library.library(source).twice(21) == 42
-    c_library.library.cache_clear()
+    assert c_library.load_library(source).twice(21) == 42
+    c_library.load_library.cache_clear()
     return source
 
 
@@ -78,7 +78,7 @@ def copied(folder: Path, twice: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
         other = folder.with_name(name.replace(" ", "-"))
         shutil.copytree(folder, other)
         monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": other})
-        c_library.library.cache_clear()
+        c_library.load_library.cache_clear()
         return next(other.glob("*.so"))
 
     return copy
@@ -94,7 +94,7 @@ def test_a_damaged_library_is_compiled_once_more(
         damage(library, kind)
         if not seal:
             library.with_suffix(".sha256").unlink()
-        assert c_library.library(twice).twice(21) == 42, kind
+        assert c_library.load_library(twice).twice(21) == 42, kind
         assert f"{library} was damaged; it is compiled once more" in capfd.readouterr().err, kind
         assert library_cache.is_whole(library)
 
@@ -108,7 +108,7 @@ def test_a_whole_library_is_loaded_without_a_word(
     if not seal:
         library.with_suffix(".sha256").unlink()
     before = library.stat().st_ino
-    assert c_library.library(twice).twice(21) == 42
+    assert c_library.load_library(twice).twice(21) == 42
     assert library.stat().st_ino == before
     assert library.with_suffix(".sha256").exists()
     assert not capfd.readouterr().err
@@ -124,7 +124,7 @@ def test_a_library_of_another_machine_is_compiled_once_more(
     library.unlink()
     library.write_bytes(content)
     library_cache.put_seal(library)
-    assert c_library.library(twice).twice(21) == 42
+    assert c_library.load_library(twice).twice(21) == 42
     assert f"{library} cannot be loaded; it is compiled once more" in capfd.readouterr().err
 
 
@@ -133,19 +133,19 @@ def test_what_others_may_write_is_refused(folder: Path, twice: Path, monkeypatch
     (library,) = folder.glob("*.so")
     library.chmod(0o775)
     with pytest.raises(InputError, match=f"{library} may be written by others .mode 775.*chmod -R go-w {folder}"):
-        c_library.library(twice)
+        c_library.load_library(twice)
     library.chmod(0o755)
     folder.chmod(0o777)
     library_cache._usable.cache_clear()
     with pytest.raises(InputError, match=f"{folder} may be written by others .mode 777"):
-        c_library.library(twice)
+        c_library.load_library(twice)
     folder.chmod(0o755)
     if os.getuid() == 0:
         os.chown(library, 12345, -1)
     else:
         monkeypatch.setattr(library_cache.os, "getuid", lambda: 12345)
     with pytest.raises(InputError, match=r"belongs to user .*XDG_CACHE_HOME"):
-        c_library.library(twice)
+        c_library.load_library(twice)
 
 
 def test_a_cache_that_cannot_be_written_is_somewhere_else(
@@ -179,7 +179,7 @@ def test_a_compiler_without_a_flag_compiles(folder: Path, tmp_path: Path, monkey
     monkeypatch.setenv("CC", _compiler(tmp_path / "clang", refuses))
     source = tmp_path / "twice.c"
     source.write_text(TWICE)
-    assert c_library.library(source).twice(21) == 42
+    assert c_library.load_library(source).twice(21) == 42
 
 
 def test_processes_that_ask_at_once_compile_once(tmp_path: Path) -> None:
@@ -187,8 +187,8 @@ def test_processes_that_ask_at_once_compile_once(tmp_path: Path) -> None:
     log, source = tmp_path / "log", tmp_path / "twice.c"
     source.write_text(TWICE)
     compiler = _compiler(tmp_path / "slow", f"echo started >>{log}\nsleep 1")
-    load = "from fracsim.mesh.c_library import library; from pathlib import Path"
-    code = f"{load}; exit(library(Path({str(source)!r})).twice(21))"
+    load = "from fracsim.mesh.c_library import load_library; from pathlib import Path"
+    code = f"{load}; exit(load_library(Path({str(source)!r})).twice(21))"
     environment = os.environ | {"CC": compiler, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     asking = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(3)]
     assert [each.wait(60) for each in asking] == [42] * 3
@@ -220,34 +220,34 @@ def test_arrays_are_checked(folder: Path, tmp_path: Path) -> None:
     """Contiguous ones of the right numbers are taken, also what may not be written to and what is empty; no other."""
     source = tmp_path / "sum.c"
     source.write_text(SUM)
-    function, done = c_library.library(source).sum, np.zeros(1, bool)
+    function, done = c_library.load_library(source).sum, np.zeros(1, bool)
     values, weights = np.arange(4.0), np.full(4, 2.0)
     values.flags.writeable = False
-    given = ctypes.byref(_Weights(c_library.address(weights)))
+    given = ctypes.byref(_Weights(c_library.struct_pointer(weights)))
     assert function(given, c_int64(4), c_library.at(values), c_library.at(done)) == 12.0
     assert done[0]
     assert function(given, 0, c_library.at(np.empty(0)), c_library.at(done)) == 0.0
     for wrong in (np.arange(8.0)[::2], np.zeros((4, 4)).T[1:], np.zeros(4, complex), np.arange(4.0).astype(">f8")):
-        for hand_over in (c_library.at, c_library.address):
+        for hand_over in (c_library.at, c_library.struct_pointer):
             with pytest.raises(ValueError, match="cannot be handed to C"):
                 hand_over(wrong)
     for wrong in (np.arange(4), np.zeros(4, np.float32)):
         with pytest.raises(ctypes.ArgumentError, match="argument 3"):
             function(given, c_int64(4), c_library.at(wrong), c_library.at(done))
         with pytest.raises(TypeError):
-            _Weights(c_library.address(wrong))
+            _Weights(c_library.struct_pointer(wrong))
 
 
 def test_prepared_arguments_are_checked_once(folder: Path, tmp_path: Path) -> None:
     """Before the first call, which checks none."""
     source = tmp_path / "sum.c"
     source.write_text(SUM)
-    code, done, weights = c_library.library(source), np.zeros(1, bool), np.full(4, 2.0)
-    given = ctypes.byref(_Weights(c_library.address(weights))), c_int64(4)
-    prepared = c_library.prepared(code, "sum", *given, c_library.at(weights))
+    code, done, weights = c_library.load_library(source), np.zeros(1, bool), np.full(4, 2.0)
+    given = ctypes.byref(_Weights(c_library.struct_pointer(weights))), c_int64(4)
+    prepared = c_library.unchecked_function(code, "sum", *given, c_library.at(weights))
     assert prepared(*given, c_library.at(weights), c_library.at(done)) == 16.0
     with pytest.raises(TypeError):
-        c_library.prepared(code, "sum", *given, c_library.at(np.arange(4)))
+        c_library.unchecked_function(code, "sum", *given, c_library.at(np.arange(4)))
 
 
 def test_every_function_in_c_is_declared() -> None:

@@ -47,7 +47,7 @@ def test_a_solver_that_is_renewed_leaves_nothing(tmp_path: Path, name: str) -> N
     solver, asked = run.scene.solver, iter([False, False, True])
     assert solver is not None
     run.step()
-    before = [weakref.ref(each) for each in (solver._newton, solver.linear, run.scene.balance.stiffness)]
+    before = [weakref.ref(each) for each in (solver._newton, solver.linear, run.scene.balance.tangent)]
     run.scene.stepper.heed(lambda: next(asked, True))
     run.checkpoint()
     with pytest.raises(Abandoned):

@@ -11,9 +11,9 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from cases import BAR, study
-from fracsim.mechanics.matrix_assembly import Assembly
-from fracsim.mechanics.tangent import Stiffness
-from fracsim.mechanics.tie_matrix import Tied
+from fracsim.mechanics.matrix_assembly import TangentAssembler
+from fracsim.mechanics.tangent import Tangent
+from fracsim.mechanics.tie_matrix import TieMatrix
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers import preconditioner
 from fracsim.solvers.multigrid import block_operator
@@ -86,19 +86,19 @@ def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) 
     scene, by_entries = shattered(0.025, 0, {}, 3)
     assert set(smoothers(scene)) == {("jacobi", 2)}
     monkeypatch.setattr(block_operator, "SMALL", 0)
-    monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
+    monkeypatch.setattr(Tangent, "switch_to_blocks", lambda _: None)
     scene, by_nodes = shattered(0.025, 0, {}, 3)
     assert by_nodes[-1] <= 1.5 * by_entries[-1]
     solver = scene.solver
     assert isinstance(solver, Solver)
     for due in (preconditioner.Due.NOTHING, preconditioner.Due.REFRESH, preconditioner.Due.REBUILD):
         solver.linear.preconditioner.due = due
-        solver.linear_response(np.ones(scene.balance.owned))
+        solver.linear_response(np.ones(scene.balance.owned_dof_count))
         *coarse, finest = smoothers(scene)
         assert finest == ("pbjacobi", 1) and set(coarse) == {("jacobi", 2)}
     assert set(smoothers(shattered(0.025, 0, {"mg_levels_pc_type": "jacobi"}, 1)[0])) == {("jacobi", 2)}
     solver.linear.preconditioner._change()
-    solver.linear_response(np.ones(scene.balance.owned))
+    solver.linear_response(np.ones(scene.balance.owned_dof_count))
     assert set(smoothers(scene)) == {("sor", 1)}
     monkeypatch.setattr(preconditioner, "SLOW", 99)
     assert set(smoothers(shattered(0.025, 0, {}, 1)[0])) == {("jacobi", 2)}
@@ -137,7 +137,7 @@ def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.Monk
     assert isinstance(solver, Solver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
     np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
     monkeypatch.setattr(preconditioner, "SWEPT", 1.0)
-    solver.linear_response(np.ones(scene.balance.owned))
+    solver.linear_response(np.ones(scene.balance.owned_dof_count))
     assert set(smoothers(scene)) == {("sor", 1)}
 
 
@@ -194,11 +194,11 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
         random, tied = np.random.default_rng(1), np.array([17, 3, 5])
         ties = csr_matrix(random.normal(size=(3, 3)))
         free = random.uniform(size=(3, d)) > 0.3
-        products = scene.balance.stiffness._assembly.blocks
+        products = scene.balance.tangent._assembly.blocks
         assert products is not None
-        products.beside = [Tied(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
-    x, y = scene.balance.vector.duplicate(), scene.balance.vector.duplicate()
-    rows = scene.balance.stiffness.rows(nodes).toarray()
+        products.ties = [TieMatrix(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
+    x, y = scene.balance.work_vector.duplicate(), scene.balance.work_vector.duplicate()
+    rows = scene.balance.tangent.owned_rows(nodes).toarray()
     for row, dof in zip(rows, (d * nodes[:, None] + np.arange(d)).reshape(-1), strict=True):
         x.array_w[:] = 0.0
         x.array_w[dof] = 1.0
@@ -212,21 +212,21 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
     blocks, to the last digits as with the tangent, be they assembled first or copied from single entries."""
     monkeypatch.setattr(block_operator, "SMALL", 0)
     if not first:
-        monkeypatch.setattr(Stiffness, "in_blocks", lambda _: None)
+        monkeypatch.setattr(Tangent, "switch_to_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
     assert isinstance(solver, Solver) and solver.linear._blocks is not None
     assert (solver.linear._blocks.assembled is not None) is first
     pc = solver.linear.preconditioner.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
-    tangent = scene.balance.stiffness.matrix
+    tangent = scene.balance.tangent.matrix
     x, alone = tangent.createVecs()
     x.setRandom()
     by_blocks, u = alone.duplicate(), scene.balance.u.x.array.copy()
     for factor in (1.0, 3.0):
         if first:
-            scene.balance.displace(factor * u)
-            scene.balance.stiffness.assemble(blocks_alone=True)
+            scene.balance.set_displacement(factor * u)
+            scene.balance.tangent.assemble(blocks_only=True)
             tangent = single_entries(scene)
         else:
             tangent.scale(factor)
@@ -240,7 +240,7 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
 def single_entries(scene: Scene) -> PETSc.Mat:
     """The tangent at the present displacement, assembled without blocks."""
     balance = scene.balance
-    other = Assembly(balance.stiffness.form)
+    other = TangentAssembler(balance.tangent.form)
     other(balance.motion.bcs)
     balance.mass.add_to(other.matrix, balance.level.c_a)
     return other.matrix

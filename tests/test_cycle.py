@@ -124,18 +124,18 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
     at_first = [largest_eigenvalue(B, each) for B, each in zip(inverses, A[1:], strict=True)]
     assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
-    balance, free = scene.balance, scene.balance.motion.free
+    balance, free = scene.balance, scene.balance.motion.free_dofs
     for moved in (0.0, 0.2, 0.4):
         wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge
-        balance.displace(balance.u.x.array[: len(free)] + np.where(free, wild, 0.0))
+        balance.set_displacement(balance.u.x.array[: len(free)] + np.where(free, wild, 0.0))
         preconditioner.due = Due.NOTHING
         assert linear.solve() or moved > 0.2  # where the tangent is not positive
-        linear.stiffness.bring_entries()
+        linear.stiffness.update_entries()
         before, A[-1] = A[-1], dense(linear.stiffness.matrix)
         assert np.abs(A[-1] - before).max() >= moved / 2 * np.abs(before).max()
         reference, M = (
             each[np.ix_(free, free)]
-            for each in (by_hand(A, P, made._levels), written_out(preconditioner.serving.apply, balance.vector))
+            for each in (by_hand(A, P, made._levels), written_out(preconditioner.serving.apply, balance.work_vector))
         )
         assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
         assert np.abs(M - M.T).max() < 1e-5 * np.abs(M).max()
@@ -187,18 +187,18 @@ def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch
     linear = linear_of(scene)
     context = linear.operator.getPythonContext()
     assert context.single is linear.preconditioner.finest
-    linear.stiffness.bring_entries()
+    linear.stiffness.update_entries()
     K = dense(linear.stiffness.matrix)
-    error = written_out(linear.operator.mult, scene.balance.vector) - K
+    error = written_out(linear.operator.mult, scene.balance.work_vector) - K
     assert 0 < np.abs(error).max() < 1e-6 * np.abs(K).max()
     assert np.abs(error - error.T).max() < 1e-14 * np.abs(K).max()
     moved = error.reshape(len(K) // dim, dim, -1, dim).sum(axis=2)  # what a translation meets at each node
     assert 1e-9 * np.abs(K).max() < np.abs(moved).max()
     assert np.abs(moved + moved.transpose(0, 2, 1)).max() < 1e-14 * np.abs(K).max()
     assert linear.solve() and context.single is None
-    linear.stiffness.bring_entries()
+    linear.stiffness.update_entries()
     K = dense(linear.stiffness.matrix)
-    assert np.abs(written_out(linear.operator.mult, scene.balance.vector) - K).max() < 1e-14 * np.abs(K).max()
+    assert np.abs(written_out(linear.operator.mult, scene.balance.work_vector) - K).max() < 1e-14 * np.abs(K).max()
 
 
 @pytest.mark.parametrize("step", [5e-3, 0.8])

@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from cases import BAR, study
 from fracsim.mechanics.jit import CellForm
-from fracsim.mechanics.plasticity import Extrapolated
-from fracsim.mechanics.tangent import Stiffness
+from fracsim.mechanics.plasticity import ExtrapolatedPlasticFlow
+from fracsim.mechanics.tangent import Tangent
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.timestepping.state import State
@@ -43,10 +43,10 @@ def damaged(case: str, dim: int, **tables: Any) -> tuple[Scene, State]:
     mesh = {"builder": "box", "size": [1.0, 0.7, 0.6][:dim], "h": 0.2 if dim == 2 else 0.3, "pattern": "unstructured"}
     scene, state = make_scene(**CASES[case] | {"mesh": mesh, "boundary": sides, "fracture": {"strength": 1e9}} | tables)
     plastic = scene.balance.stress.material.plastic
-    if plastic is not None and isinstance(plastic.prediction, Extrapolated):
-        plastic.prediction.memory = np.random.default_rng(4).uniform(0, 0.5, (scene.domain.cell_count, 6))
-    scene.balance.begin(0.1, 0.1, state.u, state.v, state.a)
-    scene.balance.displace(np.random.default_rng(5).uniform(-0.02, 0.02, len(state.u)))
+    if plastic is not None and isinstance(plastic.prediction, ExtrapolatedPlasticFlow):
+        plastic.prediction.rates = np.random.default_rng(4).uniform(0, 0.5, (scene.domain.cell_count, 6))
+    scene.balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
+    scene.balance.set_displacement(np.random.default_rng(5).uniform(-0.02, 0.02, len(state.u)))
     weaken(scene)
     return scene, state
 
@@ -54,8 +54,8 @@ def damaged(case: str, dim: int, **tables: Any) -> tuple[Scene, State]:
 def forces(scene: Scene) -> list[Values]:
     """Residual, forces of the stress, damping and reactions, copies."""
     balance = scene.balance
-    drag = balance.drag()
-    parts = [balance.forces().copy(), balance.stress.force(), *([] if drag is None else [drag])]
+    drag = balance.damping_forces()
+    parts = [balance.update_forces().copy(), balance.stress.assemble_forces(), *([] if drag is None else [drag])]
     balance.update_reactions()
     return [*parts, balance.reactions.copy()]
 
@@ -66,13 +66,13 @@ def test_the_force_that_went_is_that_of_the_cells_that_lost_some(case: str, dim:
     """The difference of two forces of the whole body, before and after a few cells lost half of what they had; the form
     is then again what it was."""
     stress = damaged(case, dim)[0].balance.stress
-    before, old = [field.x.array.copy() for field in stress.fields], stress.force()
+    before, old = [field.x.array.copy() for field in stress.damage_fields], stress.assemble_forces()
     stress.chi.x.array[:9] *= 0.5
-    expected = old - stress.force()
-    found = stress.force_lost(before)
+    expected = old - stress.assemble_forces()
+    found = stress.assemble_released_forces(before)
     assert np.abs(expected).max() > 1e-4
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(old).max())
-    np.testing.assert_allclose(stress.force(), old - expected, rtol=0, atol=1e-15 * np.abs(old).max())
+    np.testing.assert_allclose(stress.assemble_forces(), old - expected, rtol=0, atol=1e-15 * np.abs(old).max())
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -96,14 +96,14 @@ def test_a_smaller_tangent_is_the_same_one(case: str, dim: int) -> None:
     what is left changes."""
     scene, _ = damaged(case, dim)
     balance, tangent = scene.balance, dense_tangent(scene)
-    entries = balance.stiffness.matrix.getInfo()["nz_used"]
+    entries = balance.tangent.matrix.getInfo()["nz_used"]
     balance.damage_changed()
     alive = len(integrated_cells(scene)) / scene.domain.cell_count
-    assert not balance.stiffness.shrink(alive - 0.01)
-    assert balance.stiffness.shrink(alive + 0.01)
+    assert not balance.tangent.shrink(alive - 0.01)
+    assert balance.tangent.shrink(alive + 0.01)
     np.testing.assert_array_equal(dense_tangent(scene), tangent)
-    assert balance.stiffness.matrix.getInfo()["nz_used"] < entries
-    assert not balance.stiffness.shrink(1.0), "nothing died since"
+    assert balance.tangent.matrix.getInfo()["nz_used"] < entries
+    assert not balance.tangent.shrink(1.0), "nothing died since"
 
 
 def test_cells_that_are_back_find_room() -> None:
@@ -114,19 +114,19 @@ def test_cells_that_are_back_find_room() -> None:
     whole = dense_tangent(scene)
     chi[::2] = 0.0
     balance.damage_changed()
-    assert balance.stiffness.shrink(1.0)
+    assert balance.tangent.shrink(1.0)
     chi[:] = 0.5
     balance.damage_changed()
-    assert balance.stiffness.shrink(0.0)
+    assert balance.tangent.shrink(0.0)
     np.testing.assert_array_equal(dense_tangent(scene), whole)
 
 
 @pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
 def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     """Every edge that breaks and every displacement are those of a run whose matrix keeps its size."""
-    fit, fitted, found = Stiffness.shrink, [], []
+    fit, fitted, found = Tangent.shrink, [], []
     for choice in (lambda stiffness, share: fitted.append(fit(stiffness, share)) or fitted[-1], lambda *_: False):
-        monkeypatch.setattr(Stiffness, "shrink", choice)
+        monkeypatch.setattr(Tangent, "shrink", choice)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.05, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.4, 0.0]}],
@@ -135,7 +135,7 @@ def test_a_smaller_tangent_tears_a_plate_the_same_way(monkeypatch: pytest.Monkey
             solver={"ksp_rtol": 1e-10, "snes_rtol": 1e-10},
         )
         march(scene, state)
-        entries = scene.balance.stiffness.matrix.getInfo()["nz_used"]
+        entries = scene.balance.tangent.matrix.getInfo()["nz_used"]
         found.append((state.u.copy(), scene.fracture.graph.broken.copy(), entries))
     (small, torn, entries), (kept, same, all_entries) = found
     assert any(fitted) and entries < all_entries
@@ -153,7 +153,7 @@ def test_a_consistent_mass_keeps_its_pattern() -> None:
     )
     march(scene, state)
     assert len(integrated_cells(scene)) < scene.domain.cell_count
-    assert not scene.balance.stiffness.shrink(1.0)
+    assert not scene.balance.tangent.shrink(1.0)
 
 
 def test_no_entry_is_kept_for_nothing() -> None:
@@ -162,12 +162,12 @@ def test_no_entry_is_kept_for_nothing() -> None:
     domain, chi = scene.domain, scene.balance.stress.chi.x.array
     chi[: domain.cell_count] = np.random.default_rng(6).uniform(size=domain.cell_count) < 0.2
     scene.balance.damage_changed()
-    assert scene.balance.stiffness.shrink(1.0)
+    assert scene.balance.tangent.shrink(1.0)
     pairs = np.eye(domain.node_count, dtype=bool)
     for nodes in domain.cell_nodes[chi[: domain.cell_count] > 0]:
         pairs[np.ix_(nodes, nodes)] = True
-    scene.balance.stiffness.assemble()
-    assert scene.balance.stiffness.matrix.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
+    scene.balance.tangent.assemble()
+    assert scene.balance.tangent.matrix.getInfo()["nz_used"] == 4 * np.count_nonzero(pairs)
 
 
 def test_every_death_counts_from_all_cells() -> None:
@@ -205,8 +205,8 @@ def test_cells_that_keep_something_stay(tables: dict[str, Any]) -> None:
 def test_cells_are_left_out_as_they_die_and_not_before(monkeypatch: pytest.MonkeyPatch, strength: float) -> None:
     """A scene where nothing breaks never binds a form again; in a torn one just the living cells are integrated."""
     bound = []
-    leave_out = CellForm.leave_out
-    monkeypatch.setattr(CellForm, "leave_out", lambda form, dead: bound.append(1) or leave_out(form, dead))
+    leave_out = CellForm.exclude_cells
+    monkeypatch.setattr(CellForm, "exclude_cells", lambda form, dead: bound.append(1) or leave_out(form, dead))
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1, "pattern": "unstructured"},
         boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.0]}],

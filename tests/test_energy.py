@@ -157,7 +157,7 @@ def test_the_force_of_a_known_field(kind: str, order: int) -> None:
     point = tips(scene)
     for first, second in ((1.0, 0.0), (0.0, 1.0), (1.0, 0.4)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
-        scene.balance.displace(u.ravel())
+        scene.balance.set_displacement(u.ravel())
         force = seen(scene).forces()[0] * STIFF
         expected = np.array([first**2 + second**2, -2 * first * second])
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
@@ -191,7 +191,7 @@ def test_no_force_of_waves_that_pass(kind: str, order: int) -> None:
     criterion.cut[flags] = 0.5
     (point, *_) = tips(scene)
     shape, push = waves(nodes)
-    scene.balance.displace(shape.ravel())
+    scene.balance.set_displacement(shape.ravel())
     still = float(np.linalg.norm(seen(scene).forces(), axis=1).min())
     criterion.moving(np.zeros(shape.size), push.ravel(), 0.0, 1e-9)
     assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * still
@@ -205,7 +205,7 @@ def test_no_force_of_waves_that_pass(kind: str, order: int) -> None:
     slope = plateau_gradient(apart, np.full(len(apart), DISC[2] / 24))
     carried = float(np.linalg.norm((area * kinetic) @ slope))
     assert carried > 0.3 * still
-    scene.balance.displace(np.zeros(shape.size))
+    scene.balance.set_displacement(np.zeros(shape.size))
     criterion.moving(velocity * shape.ravel(), np.zeros(shape.size), 0.0, 1e-9)
     assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * carried
 
@@ -290,7 +290,9 @@ def test_both_tips_of_a_tilted_crack_are_told(kind: str) -> None:
     half = np.ptp(ends[:, 0]) / 2 + 0.5 / 40
     for angle in np.radians([30, 45, 60, 90]):
         first, second = np.sin(angle) ** 2, np.sin(angle) * np.cos(angle)
-        scene.balance.displace(tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half).ravel())
+        scene.balance.set_displacement(
+            tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half).ravel()
+        )
         off = np.degrees(seen(scene).phases() - (np.pi / 2 - angle))
         assert np.abs(off).max() < 2.5
 
@@ -303,7 +305,7 @@ def test_who_turns_with_a_tip_sees_no_turn() -> None:
     u, phases = near_tip(nodes - [tip[0] + 0.5 / 20, 0.507], 1e6, 0.5e6), []
     c, s = np.cos(1.2), np.sin(1.2)
     for Q in (np.eye(2), np.array([[c, -s], [s, c]])):
-        scene.balance.displace(((nodes + u) @ Q.T - nodes).ravel())
+        scene.balance.set_displacement(((nodes + u) @ Q.T - nodes).ravel())
         phases.append(seen(scene).phases()[0])
     assert phases[0] == pytest.approx(np.arctan2(0.5, 1), abs=0.03)
     assert phases[1] == pytest.approx(phases[0], abs=1e-6)
@@ -318,7 +320,7 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
     criterion, point = criterion_of(scene), tips(scene)
     for first, second in ((1.0, 0.5), (1.0, 1.0), (0.0, 1.0)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
-        scene.balance.displace(u.ravel())
+        scene.balance.set_displacement(u.ravel())
         now = seen(scene)
         released, ahead = criterion._turned(now.phases(), now.tips, now.forces())
         psi = np.arctan2([second], [first])
@@ -380,12 +382,12 @@ def test_event_by_event_the_crack_takes_its_energy(
 
     def watched(seen: Seen) -> Values:
         found = forces(seen)
-        rows.append([scene.balance.stress.stored(), *seen.tips.point[0], np.linalg.norm(found[0])])
+        rows.append([scene.balance.stress.stored_energy(), *seen.tips.point[0], np.linalg.norm(found[0])])
         return np.asarray(found)
 
     monkeypatch.setattr(Seen, "forces", watched)
     state, _ = scene.stepper.advance(state)
-    scene.balance.motion.at = lambda t, held=scene.balance.motion.at: held(1.0)
+    scene.balance.motion.displacements_at = lambda t, held=scene.balance.motion.displacements_at: held(1.0)
     while rows[-1][1] < 0.75e-3:
         state, _ = scene.stepper.advance(state)
     stored, x, y, force = np.array(rows).T

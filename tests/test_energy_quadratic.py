@@ -71,7 +71,7 @@ def test_what_a_tip_sees_of_a_cell_is_its_mean() -> None:
     scene = plate("unstructured", 12, order=2, crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
     domain, u, v, a = scene.domain, *(Parabola(2, seed) for seed in (1, 2, 3))
     v.B[:], a.B[:] = 0.0, 0.0  # products with what is linear are integrated exactly
-    scene.balance.displace(u(domain.nodes).ravel())
+    scene.balance.set_displacement(u(domain.nodes).ravel())
     criterion_of(scene).moving(v(domain.nodes).ravel(), a(domain.nodes).ravel(), 0.0, 1.0)
     look = seen(scene)
     cells = look.around.asked.own
@@ -106,7 +106,7 @@ def test_the_force_of_a_body_in_balance(kind: str) -> None:
         )  # fmt: skip
         motion, criterion = scene.balance.motion, criterion_of(scene)
         u = near_tip(scene.domain.nodes - tips(scene)[0], 1.0, 0.0).ravel()
-        criterion.toughness, motion.at = np.inf, lambda t, u=u, dofs=motion.dofs: u[dofs]
+        criterion.toughness, motion.displacements_at = np.inf, lambda t, u=u, dofs=motion.dofs: u[dofs]
         scene.stepper.advance(scene.start())
         found.append(seen(scene).forces()[0] @ [STIFF, 0.0])
     assert np.mean(found) == pytest.approx(1.0, abs=0.05)

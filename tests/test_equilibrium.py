@@ -24,17 +24,17 @@ def scene_of(energy: str, dim: int, **tables: Any) -> Scene:
     mesh = {"builder": "box", "size": [1.0, 0.7, 0.6][:dim], "h": 0.35 if dim == 2 else 0.6, "pattern": "unstructured"}
     material = {"energy": energy, "young": YOUNG, "poisson": POISSON, "density": DENSITY}
     scene, state = make_scene(mesh=mesh, material=material, **tables)
-    scene.balance.begin(0.1, 0.1, state.u, state.v, state.a)
+    scene.balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
     return scene
 
 
 def residual_at(scene: Scene, u: Values) -> Values:
     """r(u), a copy."""
-    x = scene.balance.vector.duplicate()
+    x = scene.balance.work_vector.duplicate()
     x.array_w[:] = u
-    scene.balance.free_residual(x, scene.balance.vector)
+    scene.balance.assemble_free_residual(x, scene.balance.work_vector)
     x.destroy()
-    return scene.balance.vector.array_r.copy()
+    return scene.balance.work_vector.array_r.copy()
 
 
 def randomly_deformed(scene: Scene, size: float = 0.03) -> Values:
@@ -53,7 +53,7 @@ def test_tangent_is_the_derivative_of_the_residual(energy: str, dim: int) -> Non
     u, h = randomly_deformed(scene), np.random.default_rng(6).uniform(-1, 1, len(scene.balance.mass.lumped))
     t = EPS ** (1 / 3)
     difference = (residual_at(scene, u + t * h) - residual_at(scene, u - t * h)) / (2 * t)
-    scene.balance.displace(u)
+    scene.balance.set_displacement(u)
     K = dense_tangent(scene) + scene.balance.c_a * np.diag(scene.balance.mass.lumped)
     np.testing.assert_allclose(K @ h, difference, atol=1e3 * t**2 * np.abs(K).max())
 
@@ -65,7 +65,7 @@ def test_corotated_tangent_holds_the_rotation(dim: int) -> None:
     scene = scene_of("corotated", dim)
     balance, u = scene.balance, randomly_deformed(scene)
     h = np.random.default_rng(6).uniform(-1, 1, len(u))
-    balance.displace(u)
+    balance.set_displacement(u)
     K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
     kept, balance.stress.rotation = balance.stress.rotation, None
     difference = residual_at(scene, u + h) - residual_at(scene, u)
@@ -102,7 +102,7 @@ def test_plane_stress_stiffness() -> None:
     mesh = {"builder": "box", "size": [1.0, 1.0], "h": 0.5}
     material = {"energy": "linear", "plane": "stress", "young": YOUNG, "poisson": POISSON, "density": DENSITY}
     scene, state = make_scene(mesh=mesh, material=material)
-    scene.balance.begin(0.1, 0.1, state.u, state.v, state.a)
+    scene.balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
     reduced = YOUNG * POISSON / (1 - POISSON**2)
     expected = stiffness(positions(scene), scene.domain.cell_nodes, MU, reduced)
     np.testing.assert_allclose(dense_tangent(scene), expected, atol=1e3 * EPS * YOUNG)
@@ -124,9 +124,9 @@ def test_a_finite_rotation_causes_no_force_and_stores_no_energy(energy: str, dim
     """x = Q X + c: zero nodal forces to the round-off of forces Y h^(d-1), zero energy."""
     scene, Q = scene_of(energy, dim), rotation(dim, 9)
     X = positions(scene)
-    scene.balance.displace((X @ (Q - np.eye(dim)).T + 0.3).reshape(-1))
-    np.testing.assert_allclose(scene.balance.stress.force(), 0, atol=100 * EPS * YOUNG)
-    assert scene.balance.stress.stored() == pytest.approx(0, abs=100 * EPS * YOUNG)
+    scene.balance.set_displacement((X @ (Q - np.eye(dim)).T + 0.3).reshape(-1))
+    np.testing.assert_allclose(scene.balance.stress.assemble_forces(), 0, atol=100 * EPS * YOUNG)
+    assert scene.balance.stress.stored_energy() == pytest.approx(0, abs=100 * EPS * YOUNG)
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -136,10 +136,10 @@ def test_forces_turn_with_the_body(energy: str, dim: int) -> None:
     scene, Q = scene_of(energy, dim), rotation(dim, 9)
     X = positions(scene)
     x = X + randomly_deformed(scene).reshape(X.shape)
-    scene.balance.displace((x - X).reshape(-1))
-    before = scene.balance.stress.force().reshape(X.shape)
-    scene.balance.displace((x @ Q.T - X).reshape(-1))
-    after = scene.balance.stress.force().reshape(X.shape)
+    scene.balance.set_displacement((x - X).reshape(-1))
+    before = scene.balance.stress.assemble_forces().reshape(X.shape)
+    scene.balance.set_displacement((x @ Q.T - X).reshape(-1))
+    after = scene.balance.stress.assemble_forces().reshape(X.shape)
     np.testing.assert_allclose(after, before @ Q.T, atol=1e3 * EPS * YOUNG)
 
 
@@ -151,8 +151,8 @@ def test_internal_forces_are_in_balance(energy: str, dim: int) -> None:
     scene = scene_of(energy, dim)
     X = positions(scene)
     u = randomly_deformed(scene).reshape(X.shape)
-    scene.balance.displace(u.reshape(-1))
-    force, arm = scene.balance.stress.force().reshape(X.shape), X if energy == "linear" else X + u
+    scene.balance.set_displacement(u.reshape(-1))
+    force, arm = scene.balance.stress.assemble_forces().reshape(X.shape), X if energy == "linear" else X + u
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e3 * EPS * YOUNG)
     moment = np.einsum("ni,nj->ij", arm, force)
     np.testing.assert_allclose(moment - moment.T, 0, atol=1e3 * EPS * YOUNG)
@@ -174,8 +174,8 @@ def test_dead_loads_are_the_integrals() -> None:
         "load": {"gravity": [0.5, -9.0]},
     }
     scene, state = make_scene(mesh=mesh, **tables)
-    scene.balance.begin(0.1, 0.1, state.u, state.v, state.a)
-    X, force = positions(scene), scene.balance.applied().reshape(-1, 2)
+    scene.balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
+    X, force = positions(scene), scene.balance.applied_forces().reshape(-1, 2)
     weight = scene.balance.mass.lumped.reshape(-1, 2) * [0.5, -9.0]
     right = np.isclose(X[:, 0], 1.0)
     np.testing.assert_allclose(force[~right], weight[~right], atol=100 * EPS)
@@ -204,7 +204,7 @@ def test_pressure_on_a_closed_body_is_in_balance(energy: str) -> None:
     strain = p / (2 * (MU + LAMBDA))
     relative = 0.0 if energy == "linear" else 20 * strain  # second-order terms of the nonlinear law
     np.testing.assert_allclose(u, -strain * X, atol=(1e-9 + relative) * strain)
-    np.testing.assert_allclose(scene.balance.reactions[scene.balance.motion.owned], 0, atol=1e-7 * p)
+    np.testing.assert_allclose(scene.balance.reactions[scene.balance.motion.owned_dofs], 0, atol=1e-7 * p)
 
 
 def test_tractions_on_two_groups() -> None:
@@ -222,7 +222,7 @@ def test_tractions_on_two_groups() -> None:
         time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
     )
     march(scene, state)
-    assert scene.balance.applied().sum() == pytest.approx(0, abs=10 * EPS * t)
+    assert scene.balance.applied_forces().sum() == pytest.approx(0, abs=10 * EPS * t)
     expected = positions(scene) * [t / YOUNG, 0.0]
     np.testing.assert_allclose(state.u.reshape(-1, 2), expected, atol=1e-9 * t / YOUNG)
 
@@ -242,6 +242,6 @@ def test_reactions_from_the_cells_at_the_supports(energy: str) -> None:
     balance.stress.chi.x.array[:] = np.random.default_rng(2).uniform(0, 1, scene.domain.cell_count)
     residual_at(scene, randomly_deformed(scene))
     whole = balance.reactions.copy()
-    balance.reactions[balance.motion.owned] = np.nan
+    balance.reactions[balance.motion.owned_dofs] = np.nan
     balance.update_reactions()
     np.testing.assert_allclose(balance.reactions, whole, atol=1e3 * EPS * YOUNG / 0.1)

@@ -113,7 +113,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
         x = contact._places()
         assert x is not None
-        touched += contact.stored() > 0
+        touched += contact.stored_energy() > 0
         assert surface.pairs.met(x).at.gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
@@ -134,7 +134,7 @@ def test_a_cracked_column_carries_its_upper_half() -> None:
         )  # fmt: skip
         break_across(scene, [0.0, 1.0], 0.45)
         if contact:
-            assert contact_of(scene)[0].stored() == 0
+            assert contact_of(scene)[0].stored_energy() == 0
         state.remember()
         march(scene, state)
         carried.append(scene.probes()[1])
@@ -156,16 +156,16 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     v[X[:, 0] < 1.01, 0] = 0.5
     state.v = v.reshape(-1)
     state.settle()
-    while contact.stored() < 0.5:
+    while contact.stored_energy() < 0.5:
         march(scene, state, 1)
-    before, graph, nodes = contact.stored(), scene.fracture.graph, np.flatnonzero(surface.pairs.by[:, 0] >= 0)
+    before, graph, nodes = contact.stored_energy(), scene.fracture.graph, np.flatnonzero(surface.pairs.by[:, 0] >= 0)
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
     assert again is not surface and len(again.made.points) > len(surface.made.points)
     assert (again.pairs.by[np.intersect1d(nodes, np.arange(len(X)))] >= 0).any()
-    assert 0.1 * before < contact.stored() <= before * (1 + 1e-6)
+    assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
 @pytest.mark.slow

@@ -311,12 +311,12 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     )  # fmt: skip
     march(scene, state)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    before, graph = contact.stored(), scene.fracture.graph
+    before, graph = contact.stored_energy(), scene.fracture.graph
     assert before > 0
     graph.break_edges(np.random.default_rng(3).random(len(graph.broken)) < 0.5)
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
-    assert contact.stored() <= before * (1 + 1e-6)
+    assert contact.stored_energy() <= before * (1 + 1e-6)
     skin, placed = contact.skin, contact._course.placed[0]
     x = skin.places(contact._at_end())
     assert (skin.facets.gaps(placed, x, 1.0) > 0).all()
@@ -331,6 +331,6 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
     least = [
         placed.distance(np.einsum("sc,kcd->ksd", shares, each(u)[elements]).reshape(-1, 3)).min()
-        for each in (whole, contact.apart(whole, elements, u, state.t))
+        for each in (whole, contact.separate_surface(whole, elements, u, state.t))
     ]
     assert least[0] < 0 < least[1]

@@ -63,8 +63,8 @@ def test_factors_that_are_preferred_find_a_stable_balance() -> None:
     assert scene.solver is not None
     scene.solver._choice.take(preferred=True)
     assert walk.advance().solve.converged
-    assert abs(displacement(scene, walk)[:, 0]).max() > 0.2 and scene.balance.stress.stored() < 20.0
-    free = np.flatnonzero(scene.balance.motion.free)
+    assert abs(displacement(scene, walk)[:, 0]).max() > 0.2 and scene.balance.stress.stored_energy() < 20.0
+    free = np.flatnonzero(scene.balance.motion.free_dofs)
     assert np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0] > 0
 
 
@@ -76,9 +76,9 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
     assert solver is not None
     X = scene.domain.nodes
     straight = np.stack([0.0 * X[:, 0], shift * X[:, 1]], axis=1).reshape(-1)
-    balance.displace(straight)
+    balance.set_displacement(straight)
     with solver.linear.factors.of(solver.snes.ksp):
-        balance.vector.array_w[:] = 1.0
+        balance.work_vector.array_w[:] = 1.0
         assert solver.linear.solve()
         solver.linear.factors.learn(solver.snes.ksp)
         told, beside = solver.linear.factors.worth, PETSc.PC().create(scene.domain.comm)
@@ -87,7 +87,7 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
         solver.snes.ksp.setPC(beside)
         solver.linear.factors.learn(solver.snes.ksp)
         assert solver.linear.factors.worth == told
-    free = np.flatnonzero(balance.motion.free)
+    free = np.flatnonzero(balance.motion.free_dofs)
     least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
     assert (least > 0) == positive == solver.linear.factors.positive
     assert 1 < solver.linear.factors.worth < 100

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import fracsim.mechanics.tangent as stiffness_module
+import fracsim.mechanics.tangent as tangent_module
 from fracsim.solvers.forcing_terms import LOOSE, LOOSEST, MOST, ROUGHEST, SHARE, SMALL, Forcing, Sparing
 from support.scenes import make_scene, march, positions
 from test_itself import SOFT, two_blocks
@@ -83,9 +83,9 @@ def test_no_correction_is_rougher_than_may_be() -> None:
 def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A number for each tangent that is assembled."""
     made: list[int] = []
-    assemble = stiffness_module.Stiffness._assemble_body
+    assemble = tangent_module.Tangent._assemble_body
     monkeypatch.setattr(
-        stiffness_module.Stiffness, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given)
+        tangent_module.Tangent, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given)
     )
     return made
 
@@ -152,7 +152,7 @@ def test_a_collision_ends_as_with_exact_solves(
 
     u, its, tangents = thrown()
     assert tangents < 0.8 * its
-    monkeypatch.setattr(stiffness_module, "STILL", -1.0)
+    monkeypatch.setattr(tangent_module, "MAX_MOVE_FOR_REUSE", -1.0)
     exact, exact_its, exact_tangents = thrown(ksp_rtol=1e-10)
     assert exact_tangents == exact_its
     np.testing.assert_allclose(u, exact, atol=1e-7 * np.abs(exact).max())

@@ -275,7 +275,7 @@ def test_a_pass_breaks_what_the_dense_average_says(dim: int) -> None:
     )
     graph, random = scene.fracture.graph, np.random.default_rng(1)
     graph.break_edges(random.random(len(graph.broken)) < 0.25)
-    scene.balance.displace(0.1 * np.sin(3 * positions(scene)[:, ::-1]).reshape(-1))
+    scene.balance.set_displacement(0.1 * np.sin(3 * positions(scene)[:, ::-1]).reshape(-1))
     corners, before = cell_corners(scene), graph.broken.copy()
     intact, active = ~before[graph.cell_edges], ~graph.split
     assert 0 < np.count_nonzero(active) < len(active)
@@ -347,13 +347,13 @@ def test_turning_a_stressed_body_breaks_no_edge(energy: str, dim: int, radius: f
     """
     scene = stressed_block(dim, energy)
     x, X = strain_field(scene, dim), positions(scene)
-    scene.balance.displace((x - X).reshape(-1))
+    scene.balance.set_displacement((x - X).reshape(-1))
     stress, broken = cauchy_of(scene), []
     before = along_edges(scene, stress()).copy()
     strong = make_pass(scene, before.max() * (1 + SOLVED), radius)
     weak = make_pass(scene, 0.4 * before.max(), radius)
     for Q in (np.eye(dim), rotation(dim, 2), rotation(dim, 8)):
-        scene.balance.displace((x @ Q.T - X).reshape(-1))
+        scene.balance.set_displacement((x @ Q.T - X).reshape(-1))
         np.testing.assert_allclose(along_edges(scene, stress()), before, atol=1e3 * EPS)
         assert not broken_by(strong).any()
         broken.append(broken_by(weak))
@@ -406,7 +406,7 @@ def test_broken_halves_recoil_at_s_over_rho_c0() -> None:
     )
     X = positions(scene)
     state.u = (X * [s, 0.0]).reshape(-1)
-    scene.balance.displace(state.u)
+    scene.balance.set_displacement(state.u)
     cut(scene, (n // 2 + 0.5) * dx)
     state.remember()
     start = displacement(scene, state).copy()

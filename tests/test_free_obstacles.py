@@ -228,26 +228,26 @@ def test_the_condensed_tangent_is_the_derivative_of_the_force(scheme: str, width
                    "velocity": [0.0, -1.0]}],
         time={"scheme": scheme, "step": 5e-3, "end": 1.0},
     )  # fmt: skip
-    balance, n = scene.balance, scene.balance.owned
-    balance.begin(5e-3, 5e-3, state.u, state.v, state.a)
-    u = balance.reachable(1e-4 * np.sin(1e3 * positions(scene)).reshape(-1))
-    balance.displace(u)
-    K, x, y = balance.stiffness.matrix, balance.vector.duplicate(), balance.vector.duplicate()
-    balance.stiffness.assemble()
+    balance, n = scene.balance, scene.balance.owned_dof_count
+    balance.begin_step(5e-3, 5e-3, state.u, state.v, state.a)
+    u = balance.feasible_guess(1e-4 * np.sin(1e3 * positions(scene)).reshape(-1))
+    balance.set_displacement(u)
+    K, x, y = balance.tangent.matrix, balance.work_vector.duplicate(), balance.work_vector.duplicate()
+    balance.tangent.assemble()
     change, h = 1 + np.cos(np.arange(n)), 1e-8
     x.array_w[:] = change
     K.mult(x, y)
-    ((U, C),) = balance.stiffness.low_rank
+    ((U, C),) = balance.tangent.low_rank_updates
     found = y.array_r - U @ (C @ (U.T @ change))
     sides = []
     for sign in (1, -1):
-        balance.displace(u + sign * h * change)
-        sides.append((balance.forces().copy(), balance.potential()[0]))
+        balance.set_displacement(u + sign * h * change)
+        sides.append((balance.update_forces().copy(), balance.incremental_potential()[0]))
     slope = (sides[0][0] - sides[1][0]) / (2 * h)
     np.testing.assert_allclose(found, slope, atol=1e-5 * np.abs(slope).max())
     assert np.abs(U @ (C @ (U.T @ change))).max() > 0.01 * np.abs(slope).max()
-    balance.displace(u)
-    assert balance.forces() @ change == pytest.approx((sides[0][1] - sides[1][1]) / (2 * h), rel=1e-5)
+    balance.set_displacement(u)
+    assert balance.update_forces() @ change == pytest.approx((sides[0][1] - sides[1][1]) / (2 * h), rel=1e-5)
 
 
 @pytest.mark.parametrize(("dim", "scheme"), [(2, "newmark"), (3, "backward-euler")])

@@ -58,7 +58,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -
         assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
         x = contact._places()
         assert len(contact._surface.pairs.overlaps(x)) == 0
-        touched += contact.stored() > 0
+        touched += contact.stored_energy() > 0
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
     right = X[:, 0] > 1.01
@@ -133,7 +133,7 @@ def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
     assert contact.law.stiffness > 100 * 3e-3
     again, _ = make_scene(mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"stiffness": 3e-3})
     (other,) = [term for term in again.balance.terms if isinstance(term, SelfContact)]
-    other.restore(contact.saved())
+    other.from_checkpoint(contact.to_checkpoint())
     assert other.law.stiffness == pytest.approx(contact.law.stiffness)
 
 
@@ -144,11 +144,11 @@ def test_what_stiffer_contact_stores_is_known(tmp_path: Path) -> None:
     X = positions(scene)
     for gap, stiffer in ((0.01, False), (2e-5, True)):
         u = np.where(X[:, :1] > 1.01, [[gap - 0.05, 0.0]], 0.0).reshape(-1)
-        scene.balance.look_at(0.0, u, 0 * u, dt=1e-3)
-        before, stiffness = contact.stored(), contact.law.stiffness
-        gained = contact.stiffen()
-        scene.balance.look_at(0.0, u, 0 * u, dt=1e-3)
-        assert contact.stored() - before == pytest.approx(gained, abs=1e-9 * before)
+        scene.balance.evaluate_at(0.0, u, 0 * u, dt=1e-3)
+        before, stiffness = contact.stored_energy(), contact.law.stiffness
+        gained = contact.stiffen_contact()
+        scene.balance.evaluate_at(0.0, u, 0 * u, dt=1e-3)
+        assert contact.stored_energy() - before == pytest.approx(gained, abs=1e-9 * before)
         assert (contact.law.stiffness > 2 * stiffness) == stiffer == (gained > 0)
 
 
@@ -164,7 +164,7 @@ def test_walls_thinner_than_the_barrier_do_not_push(dim: int, tmp_path: Path) ->
     thin = {"mesh": {"file": two_blocks(tmp_path, dim, 0.004)}, "material": SOFT}
     scene, _ = make_scene(**thin, contact={})
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
-    assert contact.stored() == 0 and contact.law.distance == pytest.approx(0.002)
+    assert contact.stored_energy() == 0 and contact.law.distance == pytest.approx(0.002)
     with pytest.raises(InputError, match=r"lies between parts of the body at rest, 0[.]004 m; give at most 0[.]002"):
         make_scene(**thin, contact={"distance": 0.01})
 

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from fracsim.fracture.node_retention import Joining
-from fracsim.mechanics.node_ties import Tethers
+from fracsim.mechanics.node_ties import NodeTies
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.facet_components import parts_of_nodes
 from fracsim.mesh.fragments import find_pieces
@@ -140,7 +140,7 @@ def burst(dim: int, crumbs: bool, forgetful: bool = False) -> Scene:
 # --- mechanics ---
 
 
-def tied(dim: int, **tables: Any) -> tuple[Scene, Walk, Tethers]:
+def tied(dim: int, **tables: Any) -> tuple[Scene, Walk, NodeTies]:
     """A body with some nodes near its middle that have lost all their cells, somewhat deformed as it happened."""
     plain: dict[str, Any] = {
         "mesh": MESHES[dim],
@@ -150,7 +150,7 @@ def tied(dim: int, **tables: Any) -> tuple[Scene, Walk, Tethers]:
     scene, state = make_scene(**plain | tables)
     X = scene.domain.nodes
     state.u = (0.1 * np.sin(2 * X)).reshape(-1)
-    scene.balance.displace(state.u)
+    scene.balance.set_displacement(state.u)
     graph = scene.fracture.graph
     rng, close = np.random.default_rng(6), np.linalg.norm(X - X.mean(axis=0), axis=1) < 0.3
     near = close[graph.edge_nodes].any(axis=1)
@@ -161,22 +161,22 @@ def tied(dim: int, **tables: Any) -> tuple[Scene, Walk, Tethers]:
     scene.balance.damage_changed()
     scene.balance.edges_broke(graph.pattern)
     state.remember()
-    tethers = next(term for term in scene.balance.terms if isinstance(term, Tethers))
+    tethers = next(term for term in scene.balance.terms if isinstance(term, NodeTies))
     assert len(tethers.ties.cell) > 1
     return scene, state, tethers
 
 
-def force_at(scene: Scene, tethers: Tethers, u: Values) -> Values:
-    scene.balance.displace(u)
+def force_at(scene: Scene, tethers: NodeTies, u: Values) -> Values:
+    scene.balance.set_displacement(u)
     rows = np.zeros(len(u))
-    tethers.add_force(rows)
+    tethers.add_nodal_forces(rows)
     return rows
 
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_ties_are_born_at_rest_and_give_no_resultant_and_no_moment(dim: int) -> None:
     scene, state, tethers = tied(dim)
-    assert np.abs(force_at(scene, tethers, state.u)).max() < 1e-14 and tethers.stored() < 1e-28
+    assert np.abs(force_at(scene, tethers, state.u)).max() < 1e-14 and tethers.stored_energy() < 1e-28
     u = state.u + 0.1 * np.random.default_rng(2).standard_normal(len(state.u))
     force = force_at(scene, tethers, u).reshape(-1, dim)
     x = scene.domain.nodes + u.reshape(-1, dim)
@@ -191,14 +191,14 @@ def test_ties_beside_blocks_are_those_among_single_entries(dim: int) -> None:
     columns."""
     scene, _, tethers = tied(dim)
     rng = np.random.default_rng(4)
-    free = rng.random(scene.balance.owned) < 0.7
-    beside, K = tethers.tied(free), tethers.coupling()
+    free = rng.random(scene.balance.owned_dof_count) < 0.7
+    beside, K = tethers.tie_matrix(free), tethers.coupling_matrix()
     assert beside is not None and K is not None
     x, y = K.createVecs()
     x.array_w[:] = np.where(free, rng.standard_normal(len(free)), 0.0)
     K.mult(x, y)
     found, whatever = np.zeros((len(free) // dim, dim)), np.where(free, x.array_r, 9.0).reshape(-1, dim)
-    found[beside.nodes] = beside.product(whatever[beside.nodes])
+    found[beside.nodes] = beside.multiply(whatever[beside.nodes])
     np.testing.assert_allclose(found.reshape(-1), np.where(free, y.array_r, 0.0), atol=1e-14)
     assert np.abs(found).max() > 1e-3
 
@@ -209,7 +209,7 @@ def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypat
     monkeypatch.setattr(block_operator, "SMALL", 0)
     finer = MESHES[dim] | {"h": {2: 0.6, 3: 0.7}[dim] * MESHES[dim]["h"]}
     scene, _, tethers = tied(dim, mesh=finer, solver={"snes_type": "ksponly", "ksp_rtol": 1e-8})
-    linear, stiffness = scene.solver.linear, scene.balance.stiffness  # type: ignore[union-attr]
+    linear, stiffness = scene.solver.linear, scene.balance.tangent  # type: ignore[union-attr]
     assert linear.solve()
     made, pc = linear.preconditioner._cycle, linear.preconditioner.pc
     assert made is not None
@@ -220,12 +220,12 @@ def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypat
         tethers._be(tethers.ties)
         linear.preconditioner.due = Due.NOTHING
         assert linear.solve()
-        products = written_out(linear.operator.mult, scene.balance.vector)
-        stiffness.bring_entries()
+        products = written_out(linear.operator.mult, scene.balance.work_vector)
+        stiffness.update_entries()
         before, A[-1] = A[-1], dense(stiffness.matrix)
         assert (np.abs(A[-1] - before).max() > 0.01 * np.abs(before).max()) == (stiffer > 1)
         np.testing.assert_allclose(products, A[-1], atol=1e-13 * np.abs(A[-1]).max())
-        M, reference = written_out(made.pc.apply, scene.balance.vector), by_hand(A, P, made._levels)
+        M, reference = written_out(made.pc.apply, scene.balance.work_vector), by_hand(A, P, made._levels)
         assert np.abs(M - reference).max() < 1e-5 * np.abs(reference).max()
 
 
@@ -235,10 +235,10 @@ def test_their_energy_turns_with_the_body_and_gives_force_and_stiffness(dim: int
     scene, state, tethers = tied(dim)
     rng = np.random.default_rng(3)
     u, way = state.u + 0.1 * rng.standard_normal(len(state.u)), rng.standard_normal(len(state.u))
-    force, stored = force_at(scene, tethers, u), tethers.stored()
-    moved = [(force_at(scene, tethers, u + sign * way), tethers.stored()) for sign in (1, -1)]
+    force, stored = force_at(scene, tethers, u), tethers.stored_energy()
+    moved = [(force_at(scene, tethers, u + sign * way), tethers.stored_energy()) for sign in (1, -1)]
     assert (moved[0][1] - moved[1][1]) / 2 == pytest.approx(force @ way, rel=1e-10)
-    K = tethers.coupling()
+    K = tethers.coupling_matrix()
     assert K is not None
     x, y = K.createVecs()
     x.array_w[:] = way
@@ -246,8 +246,8 @@ def test_their_energy_turns_with_the_body_and_gives_force_and_stiffness(dim: int
     np.testing.assert_allclose(y.array_r, moved[0][0] - force, atol=1e-12)
     Q = np.linalg.qr(rng.standard_normal((dim, dim)))[0]
     X = scene.domain.nodes
-    scene.balance.displace(((X + u.reshape(-1, dim)) @ Q.T - X).reshape(-1))
-    assert tethers.stored() == pytest.approx(stored, rel=1e-10)
+    scene.balance.set_displacement(((X + u.reshape(-1, dim)) @ Q.T - X).reshape(-1))
+    assert tethers.stored_energy() == pytest.approx(stored, rel=1e-10)
 
 
 def test_tied_nodes_go_with_the_body_and_nothing_is_gained() -> None:
@@ -279,7 +279,7 @@ def test_ties_come_back_with_a_state_and_from_a_checkpoint() -> None:
     """recall and restore give the same forces; with more edges broken than then the ties of now stay."""
     scene, state, tethers = tied(3)
     u = state.u + 0.05
-    was, memory, saved = tethers.ties, tethers.memory(), tethers.saved()
+    was, memory, saved = tethers.ties, tethers.snapshot(), tethers.to_checkpoint()
     wanted = force_at(scene, tethers, u * 1.1)
     graph = scene.fracture.graph
     cell = int(np.flatnonzero(np.isin(scene.domain.cell_input, was.cell))[0])
@@ -288,13 +288,13 @@ def test_ties_come_back_with_a_state_and_from_a_checkpoint() -> None:
     tethers.edges_broke(more)
     now = tethers.ties
     assert not np.array_equal(now.cell, was.cell)
-    tethers.recall(memory)
+    tethers.restore(memory)
     assert tethers.ties is now
     tethers.edges_broke(graph.pattern)
-    tethers.recall(memory)
+    tethers.restore(memory)
     np.testing.assert_array_equal(force_at(scene, tethers, u * 1.1), wanted)
     other = tied(3)[2]
-    other.restore(saved)
+    other.from_checkpoint(saved)
     np.testing.assert_array_equal(other.ties.weights, was.weights)
 
 
@@ -302,12 +302,12 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the places that no cell couples, and the same where the body's share of the tangent is kept."""
     scene, state, tethers = tied(2)
     balance = scene.balance
-    balance.begin(0.1, 0.1, state.u, state.v, state.a)
-    K = balance.stiffness.matrix
-    balance.stiffness.assemble()
+    balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
+    K = balance.tangent.matrix
+    balance.tangent.assemble()
     once = K.convert("dense").getDenseArray().copy() if K.comm.size == 1 else None
-    assert once is not None and not balance.stiffness.couples
-    added = tethers.coupling()
+    assert once is not None and not balance.tangent.has_contact_coupling
+    added = tethers.coupling_matrix()
     assert added is not None
     # a node and a corner of its cell that share no cell: nothing but the tie is there
     node, *corners = (int(np.flatnonzero(scene.domain.node_input == n)[0]) for n in tethers.ties.nodes[0])
@@ -315,30 +315,32 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert apart
     for corner in apart:
         assert once[2 * node, 2 * corner] == added.getValue(2 * node, 2 * corner) != 0.0
-    monkeypatch.setattr(type(balance.stiffness), "_serves", lambda self, small: True)
-    balance.stiffness.assemble()
+    monkeypatch.setattr(type(balance.tangent), "_serves", lambda self, small: True)
+    balance.tangent.assemble()
     np.testing.assert_array_equal(K.convert("dense").getDenseArray(), once)
 
 
 def test_what_a_tie_stored_is_booked_as_lost_when_its_cell_comes_apart() -> None:
     scene, state, tethers = tied(2)
-    scene.balance.displace(state.u + 0.05 * np.random.default_rng(4).standard_normal(len(state.u)))
-    stored, graph = tethers.stored(), scene.fracture.graph
+    scene.balance.set_displacement(state.u + 0.05 * np.random.default_rng(4).standard_normal(len(state.u)))
+    stored, graph = tethers.stored_energy(), scene.fracture.graph
     more = graph.pattern.copy()
     more[np.isin(scene.domain.cell_input, tethers.ties.cell)] = 7
     tethers.edges_broke(more)
     assert stored > 1e-6
-    assert tethers.driven() == (0.0, pytest.approx(stored - tethers.stored())) and tethers.driven()[1] == 0.0
+    assert (
+        tethers.step_work() == (0.0, pytest.approx(stored - tethers.stored_energy())) and tethers.step_work()[1] == 0.0
+    )
 
 
 def test_the_bound_on_their_frequency() -> None:
     """Above the greatest eigenvalue of M^-1 K, and by no more than ten times."""
     scene, _, tethers = tied(2)
-    K = tethers.coupling()
+    K = tethers.coupling_matrix()
     assert K is not None
     dense = K.convert("dense").getDenseArray() / scene.balance.mass.lumped[:, None]
     highest = float(np.linalg.eigvals(dense).real.max())
-    assert highest <= tethers.frequency() < 10 * highest
+    assert highest <= tethers.frequency_bound() < 10 * highest
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -348,7 +350,7 @@ def test_multigrid_knows_of_rotations_once_nodes_are_tied(dim: int) -> None:
     scene, state, _ = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0}, solver={})
     state.advance()
     assert scene.solver is not None
-    found = scene.balance.stiffness.matrix.getNearNullSpace()
+    found = scene.balance.tangent.matrix.getNearNullSpace()
     assert found and len(found.getVecs()) == {2: 3, 3: 6}[dim]
 
 
@@ -363,24 +365,24 @@ def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
     shared = np.isin(domain.cell_nodes, domain.cell_nodes[cell]).sum(axis=1)
     balance.stress.chi.x.array[: domain.cell_count][shared == dim] = 0.0
     balance.damage_changed()
-    balance.begin(1e3, 1e3, walk.state.u, walk.state.v, walk.state.a)
-    balance.stiffness.assemble()
+    balance.begin_step(1e3, 1e3, walk.state.u, walk.state.v, walk.state.a)
+    balance.tangent.assemble()
     jacobi = PETSc.PC().create(domain.comm)
     jacobi.setType("jacobi")
-    jacobi.setOperators(balance.stiffness.matrix)
+    jacobi.setOperators(balance.tangent.matrix)
     _, part = parts_of_nodes(domain, balance.stress.chi.x.array[: domain.cell_count] > 0)
     own = int(part[domain.cell_nodes[cell]].max())
     node = np.flatnonzero(domain.node_input == tethers.ties.nodes[0, 0])
     assert own > 0 and part[node] == -1
     loose = loose_parts(balance, jacobi)
-    assert loose is not None and loose.follow(balance.stiffness.matrix)
+    assert loose is not None and loose.follow(balance.tangent.matrix)
     x = domain.nodes + walk.state.u.reshape(-1, dim)
     spin = np.array([[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]])[:dim, :dim]
     goes = (part == own) | np.isin(domain.node_input, tethers.ties.nodes[tethers.ties.cell == tethers.ties.cell[0], 0])
     moved = np.where(goes[:, None], x @ spin.T + 0.5, 0.0)
     assert goes[node] and (part == own).any()
-    a, b = balance.vector.duplicate(), balance.vector.duplicate()
+    a, b = balance.work_vector.duplicate(), balance.work_vector.duplicate()
     a.array_w[:] = moved.reshape(-1)
-    balance.stiffness.matrix.mult(a, b)
+    balance.tangent.matrix.mult(a, b)
     loose.pc.apply(b, a)
     np.testing.assert_allclose(a.array_r.reshape(-1, dim), moved, atol=1e-6 * np.abs(moved).max())

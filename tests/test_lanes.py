@@ -8,8 +8,15 @@ from dolfinx import fem
 
 from fracsim.mechanics import jit, simd_kernels
 from fracsim.mechanics.jit import jit_options
-from fracsim.mechanics.matrix_assembly import Assembly
-from fracsim.mechanics.simd_kernels import ExpressionLanes, MatrixLanes, ScalarLanes, VectorLanes, compiled, in_lanes
+from fracsim.mechanics.matrix_assembly import TangentAssembler
+from fracsim.mechanics.simd_kernels import (
+    SimdBilinearForm,
+    SimdExpression,
+    SimdFunctional,
+    SimdLinearForm,
+    compile_simd_form,
+    vectorise_kernel,
+)
 from fracsim.mesh import c_library as compiling
 from fracsim.mesh.dolfinx_compat import evaluate, source_of
 from support.scenes import Values, make_scene
@@ -21,14 +28,14 @@ SIDE = [{"on": "left", "displacement": [0.1, "free", "free"]}]
 
 def summed(form: fem.Form, bcs: list[fem.DirichletBC], *, lanes: bool, by_blocks: bool) -> Values:
     """Entries of a form in a matrix with room for just them."""
-    assembly = Assembly(form)
+    assembly = TangentAssembler(form)
     if by_blocks:
-        assembly.use_blocks()
+        assembly.switch_to_blocks()
     assembly._sum.data[:] = 0.0
     if lanes:
-        several = MatrixLanes.of(form, assembly._sum)
+        several = SimdBilinearForm.for_form(form, assembly._sum)
         assert several is not None
-        several.add(assembly._sum, bcs)
+        several.add_to(assembly._sum, bcs)
     else:
         fem.assemble_matrix(assembly._sum, form, bcs)  # type: ignore[arg-type]
     values: Values = assembly._sum.data.copy()
@@ -48,7 +55,7 @@ def test_as_one_by_one(case: str, dim: int) -> None:
     """A body that is deformed and flows at random, a third of its cells dead, held at one side along one axis."""
     balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
     balance.damage_changed()
-    assert_as_one_by_one(balance.stiffness.form, balance.motion.bcs)
+    assert_as_one_by_one(balance.tangent.form, balance.motion.bcs)
 
 
 @pytest.mark.parametrize(("case", "dim"), [("damped", 2), ("damped", 3), ("extrapolated", 3)])
@@ -56,19 +63,19 @@ def test_forces_as_one_by_one(case: str, dim: int) -> None:
     """Of the same bodies, with dead cells and without, and moved otherwise: to the last digits."""
     balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
     form, assembler = balance._work, balance._assembler
-    code = compiled(form)
+    code = compile_simd_form(form)
     assert code is not None
     for change in (
         lambda: None,
         balance.damage_changed,
-        lambda: balance.displace(-3 * balance.u.x.array[: balance.owned]),
+        lambda: balance.set_displacement(-3 * balance.u.x.array[: balance.owned_dof_count]),
     ):
         change()
-        theirs, ours = assembler.vector(), assembler.vector()
-        assembler.into_unsummed(theirs, form)
+        theirs, ours = assembler.create_vector(), assembler.create_vector()
+        assembler.assemble_local_part(theirs, form)
         with ours.localForm() as local:
             local.set(0.0)
-            VectorLanes(form, code).add(local.array_w)
+            SimdLinearForm(form, code).add_to(local.array_w)
         one, other = theirs.array_r, ours.array_r
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-14 * np.abs(other).max())
         assert np.abs(other).max() > 0
@@ -79,13 +86,13 @@ def test_energies_as_one_by_one(case: str, dim: int) -> None:
     """Of the same bodies, moved otherwise, and of one that has a node nowhere."""
     balance = damaged(case, dim, boundary=[SIDE[0] | {"displacement": [0.1, "free", "free"][:dim]}])[0].balance
     form = balance.stress._energy_form
-    several = ScalarLanes.of(form)
+    several = SimdFunctional.for_form(form)
     assert several is not None
     found = []
     for factor in (1.0, -3.0, np.nan):
-        balance.displace(factor * balance.u.x.array[: balance.owned])
+        balance.set_displacement(factor * balance.u.x.array[: balance.owned_dof_count])
         expected = fem.assemble_scalar(form)
-        found.append(several.sum())
+        found.append(several.integrate())
         np.testing.assert_allclose(found[-1], expected, rtol=1e-13)
     assert 0 < found[0] != found[1]
 
@@ -99,11 +106,13 @@ def test_expressions_as_one_by_one(energy: str, dim: int) -> None:
     scene, _ = make_scene(mesh=mesh, material=MATERIAL | {"energy": energy}, fracture={"strength": 1.0})
     expression, balance = scene.fracture._undamaged._evaluate, scene.balance
     compiled_one = expression._compiled
-    lanes = ExpressionLanes.of(compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options()))
+    lanes = SimdExpression.for_expression(
+        compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options())
+    )
     assert lanes is not None and expression._lanes is None
     rng = np.random.default_rng(5)
     for _ in range(2):
-        balance.displace(rng.uniform(-0.02, 0.02, balance.owned))
+        balance.set_displacement(rng.uniform(-0.02, 0.02, balance.owned_dof_count))
         cells = rng.permutation(len(expression._all))[: -3 + len(expression._all) // 4 * 4].astype(np.int32)
         ours, theirs = np.full((2, len(cells), expression.width), np.nan)
         lanes(cells, ours)
@@ -118,9 +127,9 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
     for many in (1, 10**9):
         monkeypatch.setattr(jit, "MANY_CELLS", many)
         scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.7], "h": 0.2}, fracture={"strength": 1.0})
-        u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned)
+        u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned_dof_count)
         u[3] = np.nan
-        scene.balance.displace(u)
+        scene.balance.set_displacement(u)
         assert (scene.fracture._undamaged._evaluate._lanes is None) == (many > 1)
         found.append((*map(np.copy, scene.fracture.evaluate()), scene.fracture.not_finite))
     (ours, energy, crushed), (theirs, expected, count) = found
@@ -132,12 +141,12 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
 def test_what_is_no_number_is_told() -> None:
     """Where a node is nowhere nothing around it is a number: Newton's method has to see it."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
-    u = balance.u.x.array[: balance.owned].copy()
+    u = balance.u.x.array[: balance.owned_dof_count].copy()
     u[4] = np.nan
-    balance.displace(u)
-    code, b = compiled(balance._work), balance._assembler.vector()
+    balance.set_displacement(u)
+    code, b = compile_simd_form(balance._work), balance._assembler.create_vector()
     assert code is not None
-    VectorLanes(balance._work, code).add(b.array_w)
+    SimdLinearForm(balance._work, code).add_to(b.array_w)
     nowhere = np.isnan(balance._assembler(balance._work))
     assert nowhere.any() and not nowhere.all()
     np.testing.assert_array_equal(np.isnan(b.array_r), nowhere)
@@ -146,16 +155,18 @@ def test_what_is_no_number_is_told() -> None:
 def test_positive_moduli() -> None:
     """The same of the form that is added where moduli are made positive, of a body that is crushed at random."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
-    balance.displace(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned))
-    assert_as_one_by_one(balance.stiffness._positive_moduli(0.1), balance.motion.bcs)
+    balance.set_displacement(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned_dof_count))
+    assert_as_one_by_one(balance.tangent._positive_moduli(0.1), balance.motion.bcs)
 
 
 def test_what_dolfinx_goes_on_with() -> None:
     """Forms with integrals over facets, and of bent cells."""
-    assert compiled(damaged("rotated", 3)[0].balance.stiffness.form) is None
+    assert compile_simd_form(damaged("rotated", 3)[0].balance.tangent.form) is None
     bent = {"builder": "box", "size": [1.0, 0.7], "h": 0.4, "order": 2}
     assert (
-        compiled(damaged("rotated", 2, mesh=bent, boundary=[{"on": "left", "fix": "xy"}])[0].balance.stiffness.form)
+        compile_simd_form(
+            damaged("rotated", 2, mesh=bent, boundary=[{"on": "left", "fix": "xy"}])[0].balance.tangent.form
+        )
         is None
     )
 
@@ -164,24 +175,24 @@ def test_cells_without_room() -> None:
     """A matrix that was made while cells were dead has no room for them, which is told."""
     balance = damaged("linear", 3)[0].balance
     balance.damage_changed()
-    form = balance.stiffness.form
-    assembly = Assembly(form)
-    assembly.use_blocks()
-    several = MatrixLanes(form, compiled(form), assembly._sum)
-    several.add(assembly._sum, [])
+    form = balance.tangent.form
+    assembly = TangentAssembler(form)
+    assembly.switch_to_blocks()
+    several = SimdBilinearForm(form, compile_simd_form(form), assembly._sum)
+    several.add_to(assembly._sum, [])
     balance.stress.chi.x.array[:] = 1.0
     balance.damage_changed()
     with pytest.raises(ValueError, match="no place for cell"):
-        several.add(assembly._sum, [])
+        several.add_to(assembly._sum, [])
 
 
 @pytest.mark.parametrize("line", ("double s = a > b ? a : b;", "double s = pow(a, b);"))
 def test_what_lanes_cannot_do(line: str) -> None:
     """A choice by a condition, a function that is not taken lane by lane."""
     kernel = "\nvoid tabulate_tensor_x(double* A)\n{{\n{0}\n}}\n\nbool enabled_x[1] = {{1}};\n\nufcx_integral x\n"
-    assert in_lanes(kernel.format("double s = fabs(a);")) == "{\nreal s = (fabs(a)) - zero;\n}\n"
-    assert in_lanes(kernel.format(line)) is None
-    assert in_lanes("double s = fabs(a);") is in_lanes("\nvoid tabulate_tensor_x(double* A);\n") is None
+    assert vectorise_kernel(kernel.format("double s = fabs(a);")) == "{\nreal s = (fabs(a)) - zero;\n}\n"
+    assert vectorise_kernel(kernel.format(line)) is None
+    assert vectorise_kernel("double s = fabs(a);") is vectorise_kernel("\nvoid tabulate_tensor_x(double* A);\n") is None
 
 
 def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,10 +200,10 @@ def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
     monkeypatch.setattr(compiling, "_told", [])
     monkeypatch.setenv("CC", "no-such-compiler")
-    assert compiled(balance._work) is compiled(balance.stiffness.form) is None
+    assert compile_simd_form(balance._work) is compile_simd_form(balance.tangent.form) is None
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1 and told[0].startswith("fracsim: note: this run takes longer")
     assert "no-such-compiler" in told[0] and told[0].endswith("install a C compiler, or name yours in CC")
     monkeypatch.setattr(simd_kernels, "SOURCE", None)
     with pytest.raises(AttributeError):
-        compiled(balance._work)
+        compile_simd_form(balance._work)

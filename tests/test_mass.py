@@ -37,7 +37,7 @@ def test_consistent_mass_is_the_integral(dim: int) -> None:
     domain, inertia = scene.domain, scene.balance.mass
     M = consistent_mass(domain.nodes, domain.cell_nodes)
     a = np.random.default_rng(2).uniform(-1, 1, domain.nodes.shape)
-    np.testing.assert_allclose(inertia.times(a.reshape(-1)).reshape(a.shape), M @ a, atol=1e-14)
+    np.testing.assert_allclose(inertia.multiply(a.reshape(-1)).reshape(a.shape), M @ a, atol=1e-14)
     np.testing.assert_allclose(inertia.lumped.reshape(a.shape)[:, 0], M.sum(axis=1), atol=1e-14)
     free = np.random.default_rng(3).uniform(size=a.size) < 2  # nothing is held
     np.testing.assert_allclose(inertia.solve((M @ a).reshape(-1), free), a.reshape(-1), atol=1e-10)
@@ -57,15 +57,15 @@ def test_a_tangent_in_blocks_has_it(dim: int) -> None:
     domain, balance = scene.domain, scene.balance
     weaken(scene)
     balance.damage_changed()
-    products, chi = balance.stiffness.in_blocks(), balance.stress.chi
+    products, chi = balance.tangent.switch_to_blocks(), balance.stress.chi
     assert products is not None and chi is not None
     for step in (0.1, 0.05):
-        balance.begin(step, step, state.u, state.v, state.a)
-        balance.stiffness.assemble(blocks_alone=True)
+        balance.begin_step(step, step, state.u, state.v, state.a)
+        balance.tangent.assemble(blocks_only=True)
         M = np.kron(consistent_mass(domain.nodes, domain.cell_nodes), np.eye(dim))
         K = stiffness(domain.nodes, domain.cell_nodes, *lame(1.0, 0.0), chi.x.array[: domain.cell_count])
         expected = K + balance.c_a * M
-        held = balance.motion.owned
+        held = balance.motion.owned_dofs
         expected[held] = expected[:, held] = 0.0
         expected[held, held] = 1.0
         found = products.matrix.to_dense()
@@ -82,7 +82,7 @@ def test_a_mode_of_the_consistent_mass_vibrates_at_its_frequency() -> None:
         boundary=[{"on": "left", "fix": "xy"}],
     )
     X, cells = scene.domain.nodes, scene.domain.cell_nodes
-    free = np.setdiff1d(np.arange(X.size), scene.balance.motion.owned)
+    free = np.setdiff1d(np.arange(X.size), scene.balance.motion.owned_dofs)
     M = np.kron(consistent_mass(X, cells), np.eye(2))[np.ix_(free, free)]
     squares, vectors = eigh(stiffness(X, cells, *lame(1.0, 0.0))[np.ix_(free, free)], M)
     state.v[free] = vectors[:, 2]

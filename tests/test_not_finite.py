@@ -86,8 +86,8 @@ def test_a_checkpoint_is_of_a_finite_state(tmp_path: Path, what: str) -> None:
     if what == "chi":
         stress.chi.x.array[2] = np.nan
     elif what == "plastic":
-        stress.material.plastic.strain[1] = np.inf
-        stress.material.plastic.changed()
+        stress.material.plastic.accumulated_strain[1] = np.inf
+        stress.material.plastic.discard_snapshot()
     elif what == "integrity":
         run.scene.fracture.graph.integrity[1] = np.nan
     elif what == "u":

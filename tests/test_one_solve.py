@@ -24,7 +24,7 @@ FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
 def tangents_of(scene: Scene) -> list[int]:
     """A list that grows whenever a tangent is assembled."""
     made: list[int] = []
-    assemble = scene.balance.stiffness._assembly
+    assemble = scene.balance.tangent._assembly
 
     class Counted:
         def __call__(self, *arguments: Any) -> None:
@@ -34,7 +34,7 @@ def tangents_of(scene: Scene) -> list[int]:
         def __getattr__(self, name: str) -> Any:
             return getattr(assemble, name)
 
-    scene.balance.stiffness._assembly = Counted()  # type: ignore[assignment]
+    scene.balance.tangent._assembly = Counted()  # type: ignore[assignment]
     return made
 
 
@@ -49,7 +49,7 @@ def test_one_tangent_serves_all_steps(scheme: str) -> None:
         assert report.solve.newton <= 2
         if not late:
             scale = np.abs(balance.reactions).max()
-            rest = balance.forces()[balance.motion.free]
+            rest = balance.update_forces()[balance.motion.free_dofs]
             assert np.linalg.norm(rest) < 2e-9 * max(np.linalg.norm(balance.reactions), scale)
     assert len(made) <= 2  # the last step is a little shorter by round-off
 
@@ -109,6 +109,6 @@ def test_shorter_steps_have_another_tangent() -> None:
     for dt in (0.01, 0.005, 0.005, 0.01):
         state.dt = dt
         state.advance()
-        free = scene.balance.motion.free
-        assert np.linalg.norm(scene.balance.forces()[free]) < 2e-9 * np.linalg.norm(scene.balance.reactions)
+        free = scene.balance.motion.free_dofs
+        assert np.linalg.norm(scene.balance.update_forces()[free]) < 2e-9 * np.linalg.norm(scene.balance.reactions)
     assert len(made) == 3

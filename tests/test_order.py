@@ -69,7 +69,7 @@ def test_round_faces_are_round() -> None:
 def test_a_force_on_a_round_face_is_the_force_given() -> None:
     scene, state = disk(boundary=[{"on": "top", "force": [0.0, 3.0]}])
     march(scene, state)
-    assert scene.balance.applied().reshape(-1, 2).sum(axis=0) == pytest.approx([0.0, 3.0], abs=1e-12)
+    assert scene.balance.applied_forces().reshape(-1, 2).sum(axis=0) == pytest.approx([0.0, 3.0], abs=1e-12)
 
 
 def test_a_body_that_breaks_has_straight_sides() -> None:
@@ -147,7 +147,7 @@ def test_uniform_flow_is_that_of_linear_cells(update: str) -> None:
         scene, state = bar(order, update)
         report = list(march(scene, state))[-1]
         figures.append([report.elastic, state.dissipated, state.work])
-        strains.append(scene.balance.stress.material.plastic.strain)
+        strains.append(scene.balance.stress.material.plastic.accumulated_strain)
     assert figures[1] == pytest.approx(figures[0], rel=1e-7)
     assert len(strains[1]) == 3 * len(strains[0])
     np.testing.assert_allclose(strains[1], strains[0][0], rtol=1e-6)
@@ -258,13 +258,13 @@ def spectrum(dim: int, cells: int, order: int, mass: str) -> tuple[Values, float
         time={"scheme": "newmark", "step": 1.0, "end": 1.0, "mass": mass},
     )
     balance = scene.balance
-    balance.look_at(0.0, state.u, state.v, dt=1.0)
-    free = np.flatnonzero(balance.motion.free)
+    balance.evaluate_at(0.0, state.u, state.v, dt=1.0)
+    free = np.flatnonzero(balance.motion.free_dofs)
     K, M = (np.zeros((len(free), len(free))) for _ in range(2))
-    balance.stiffness.assemble()
-    K[:] = dense(balance.stiffness.matrix)[np.ix_(free, free)]
+    balance.tangent.assemble()
+    K[:] = dense(balance.tangent.matrix)[np.ix_(free, free)]
     for column, dof in enumerate(free):
-        M[:, column] = balance.mass.times(np.eye(1, balance.owned, dof)[0])[free]
+        M[:, column] = balance.mass.multiply(np.eye(1, balance.owned_dof_count, dof)[0])[free]
     K -= balance.c_a * M
     return eigh(K, M, eigvals_only=True), float(cell_frequencies(balance.stress).max())
 

@@ -193,7 +193,7 @@ def test_crushed_cells_have_no_stress(tmp_path: Path) -> None:
     scene = build_scene(MPI.COMM_SELF, data)
     run = Run(scene, tmp_path / "out")
     run.state = replace(run.state, u=-scene.domain.nodes.ravel())
-    scene.balance.displace(run.state.u)
+    scene.balance.set_displacement(run.state.u)
     with np.errstate(all="ignore"):
         run.write_frame()
     run.history.close()

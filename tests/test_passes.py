@@ -63,8 +63,8 @@ def test_passes_with_inertia(scheme: str) -> None:
     scene, state, broken = pulled(scheme, passes=20)
     assert sum(broken) > 0 and state.t == pytest.approx(10.0)
     assert np.isfinite(state.u).all() and state.work > 0
-    held = scene.balance.motion.owned
-    np.testing.assert_allclose(state.u[held], scene.balance.motion.at(10.0)[: len(held)], atol=1e-14)
+    held = scene.balance.motion.owned_dofs
+    np.testing.assert_allclose(state.u[held], scene.balance.motion.displacements_at(10.0)[: len(held)], atol=1e-14)
 
 
 def test_unbroken_steps_are_the_same_with_more_passes() -> None:

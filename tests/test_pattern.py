@@ -25,17 +25,17 @@ def test_factors_are_made_anew_once_nodes_are_tied(dim: int) -> None:
     """Kept from before the nodes were tied, while iterations have solved with the longer pattern in between: they find
     what dense elimination finds. With the old symbolic factors MUMPS writes past the end of its arrays."""
     scene, _, tethers = tied(dim, solver=PLAIN)
-    linear, vector = scene.solver.linear, scene.balance.vector  # type: ignore[union-attr]
+    linear, vector = scene.solver.linear, scene.balance.work_vector  # type: ignore[union-attr]
     ties = tethers.ties
-    force = np.random.default_rng(2).standard_normal(scene.balance.owned)
-    for each in (Ties.none(dim), ties):
+    force = np.random.default_rng(2).standard_normal(scene.balance.owned_dof_count)
+    for each in (Ties.empty(dim), ties):
         tethers._be(each)
         vector.array_w[:] = force
         assert linear.solve()
         vector.array_w[:] = force
         with linear.factors.of(linear.ksp):
             assert linear.solve()
-        exact = np.linalg.solve(dense(scene.balance.stiffness.matrix), force)
+        exact = np.linalg.solve(dense(scene.balance.tangent.matrix), force)
         assert np.abs(linear.correction.array_r - exact).max() < 1e-9 * np.abs(exact).max()
     scene.destroy()
 
@@ -46,7 +46,7 @@ def test_a_consistent_mass_goes_to_its_own_entries(dim: int) -> None:
     found = {}
     for mass in ("lumped", "consistent"):
         scene, _, _ = tied(dim, time={"step": 0.1, "end": 1.0, "mass": mass}, solver=PLAIN)
-        stiffness, balance, domain = scene.balance.stiffness, scene.balance, scene.domain
+        stiffness, balance, domain = scene.balance.tangent, scene.balance, scene.domain
         balance.c_a = 100.0
         for _ in range(3):  # the first one adds the entries of ties
             stiffness.assemble()

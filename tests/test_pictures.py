@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.errors import InputError
-from fracsim.mechanics.surface_data import Drawn
+from fracsim.mechanics.surface_data import SurfaceData
 from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import Surface
 from fracsim.output.surface.vtk_files import SurfaceFiles
@@ -277,7 +277,7 @@ def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
     none = np.zeros_like(frame.skeleton.points)
     behind = np.array([[-1.0, 3, 0], [1, 3, 0], [0, 3, 1]])
     drawn = {
-        name: Drawn(each, np.array([[0, 1, 2]]), np.empty((0, 2), int))
+        name: SurfaceData(each, np.array([[0, 1, 2]]), np.empty((0, 2), int))
         for name, each in (("wall", behind), ("table", x))
     }
     SurfaceFiles(folder, 3).write(frame.at(0.0, none, none), drawn)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from fracsim.forms.energies import ENERGIES
 from fracsim.forms.schemes import SCHEMES
-from fracsim.mechanics.plasticity import WEAKEST, Implicit
+from fracsim.mechanics.plasticity import WEAKEST, ImplicitPlasticFlow
 from fracsim.mechanics.return_mapping import CLOSE
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
@@ -64,12 +64,12 @@ def bilinear(strain: float, hardening: float, limit: float = TINY * YOUNG) -> fl
 
 def memory_of(scene: Scene) -> Values:
     """(cells, 10) F_p^-1 and alpha."""
-    rows: Values = scene.balance.stress.material.plastic.memory()
+    rows: Values = scene.balance.stress.material.plastic.snapshot()
     return rows[:, [*range(9), -1]]
 
 
 def plastic_strain(scene: Scene) -> Values:
-    strain: Values = scene.balance.stress.material.plastic.strain
+    strain: Values = scene.balance.stress.material.plastic.accumulated_strain
     return strain
 
 
@@ -166,26 +166,26 @@ def test_a_step_is_solved_with_the_last_flow_once_more(energy: str) -> None:
     deform(scene, before)
     scene.stepper.flow.begin(0.1)
     scene.stepper.flow()
-    rows = plastic.rows.copy()
+    rows = plastic.inverse_rows.copy()
     G = rows[0].reshape(3, 3)
     F, H = before + 0.1 * random.uniform(-1, 1, (3, 3)), random.uniform(-1, 1, (3, 3))
     points, law = scene.domain.nodes[: scene.domain.node_count], law_of(ENERGIES[energy](MU, LAMBDA), 3)
     for dt, ratio in ((0.1, 1.0), (0.05, 0.5), (0.0, 0.0)):
-        plastic.begin(dt)
+        plastic.begin_step(dt)
         deform(scene, F)  # with the rotation of what stands in for F_e
         stand_in = G @ (np.eye(3) + ratio * (G - np.eye(3)))  # F_p was I, so that S = G
         stand_in /= np.cbrt(np.linalg.det(stand_in))
         tau = np.linalg.det(F) * law.cauchy(F @ stand_in)
-        found = np.sum(scene.balance.stress.force().reshape(-1, 3) * (points @ H.T))
+        found = np.sum(scene.balance.stress.assemble_forces().reshape(-1, 3) * (points @ H.T))
         assert found == pytest.approx(np.sum(tau * (H @ np.linalg.inv(F))), rel=1e-10)
-    np.testing.assert_array_equal(plastic.rows, rows)
+    np.testing.assert_array_equal(plastic.inverse_rows, rows)
 
 
 def test_nothing_is_extrapolated_where_u_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """Explicit steps, whatever the scheme is called: no time history stands in for the flow of the step."""
     monkeypatch.setitem(SCHEMES, "newmark", SCHEMES["explicit"])
     scene, _ = pulled([0, TINY], 100, "neo-hookean", "newmark", update="extrapolated")
-    assert isinstance(scene.balance.stress.material.plastic.prediction, Implicit)
+    assert isinstance(scene.balance.stress.material.plastic.prediction, ImplicitPlasticFlow)
 
 
 def test_a_stretch_never_turns_over() -> None:
@@ -195,9 +195,9 @@ def test_a_stretch_never_turns_over() -> None:
     scene.stepper.flow.begin(0.1)
     scene.stepper.flow()
     plastic = scene.balance.stress.material.plastic
-    G = plastic.rows[0].reshape(3, 3).copy()
-    plastic.begin(1.0)
-    factors = np.linalg.eigvals(np.linalg.inv(G) @ plastic.rows[0].reshape(3, 3))
+    G = plastic.inverse_rows[0].reshape(3, 3).copy()
+    plastic.begin_step(1.0)
+    factors = np.linalg.eigvals(np.linalg.inv(G) @ plastic.inverse_rows[0].reshape(3, 3))
     assert np.all(factors.real > 0) and np.prod(factors).real == pytest.approx(1)
 
 
@@ -211,7 +211,7 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
         scene.stepper.flow.begin(0.1)
         scene.stepper.flow()
         assert plastic_strain(scene).all()
-        assert scene.stepper.flow.stored == pytest.approx(scene.balance.stress.stored(), rel=10 * CLOSE)
+        assert scene.stepper.flow.stored == pytest.approx(scene.balance.stress.stored_energy(), rel=10 * CLOSE)
 
 
 def two_halves(folder: Path) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.psd_projection import made_positive
+from fracsim.mechanics.psd_projection import psd_correction
 from fracsim.solvers import newton
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
@@ -28,7 +28,7 @@ def test_matrices_are_made_positive(size: int, small: float) -> None:
     expected = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1) * lifted[:, None, None]
     found, filled = np.full((len(A) + 1, size, size), 7.0), np.ones(len(A), np.uint8)
     for order in (slice(None), slice(None, None, -1)):  # once more with what the first time has left
-        made_positive(np.ascontiguousarray(A[order]), small, found, filled)
+        psd_correction(np.ascontiguousarray(A[order]), small, found, filled)
         np.testing.assert_allclose(found[:-1], expected[order], atol=1e-10)
         np.testing.assert_array_equal(filled, lifted[order])
     assert (found[-1] == 7.0).all()
@@ -43,10 +43,10 @@ def test_a_crumpled_body_is_made_positive(energy: str, dim: int) -> None:
         material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
     )
     X, balance = positions(scene), scene.balance
-    balance.displace((0.05 * X + RANDOM.normal(scale=1e-3, size=X.shape)).reshape(-1))
+    balance.set_displacement((0.05 * X + RANDOM.normal(scale=1e-3, size=X.shape)).reshape(-1))
     K = dense_tangent(scene)
     np.testing.assert_allclose(dense_tangent(scene, small=0.0), K, atol=1e-12)
-    balance.displace((-0.2 * X + RANDOM.normal(scale=0.05, size=X.shape)).reshape(-1))
+    balance.set_displacement((-0.2 * X + RANDOM.normal(scale=0.05, size=X.shape)).reshape(-1))
     K, made = dense_tangent(scene), dense_tangent(scene, small=0.0)
     assert np.linalg.eigvalsh(K)[0] < -1e-3
     assert np.linalg.eigvalsh(made)[0] > -1e-12
@@ -66,10 +66,12 @@ def test_a_step_that_exact_tangents_do_not_get_through_is_taken() -> None:
     )
     assert walk.advance().solve.converged
     balance = scene.balance
-    free = np.setdiff1d(np.arange(balance.owned), balance.motion.owned)
-    assert np.linalg.norm(balance.forces()[free]) < 1e-6 * np.linalg.norm(balance.reactions[balance.motion.owned])
+    free = np.setdiff1d(np.arange(balance.owned_dof_count), balance.motion.owned_dofs)
+    assert np.linalg.norm(balance.update_forces()[free]) < 1e-6 * np.linalg.norm(
+        balance.reactions[balance.motion.owned_dofs]
+    )
     assert abs(displacement(scene, walk)[:, 0]).max() > 0.2
-    assert balance.stress.stored() < 20.0
+    assert balance.stress.stored_energy() < 20.0
     assert scene.solver is not None and scene.solver._downhill is not None
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.inertia import InBlocks
-from fracsim.mechanics.matrix_assembly import Assembly
+from fracsim.mechanics.inertia import MassBlocks
+from fracsim.mechanics.matrix_assembly import TangentAssembler
 from test_dead_cells import damaged
 
 
@@ -15,11 +15,11 @@ def test_products_are_those_of_the_dense_matrix(dim: int) -> None:
     """Of a body that is deformed at random, a third of whose cells are dead, which DOLFINx writes out."""
     balance = damaged("damped", dim)[0].balance
     balance.damage_changed()
-    assembly = Assembly(balance.stiffness.form)
-    products = assembly.use_blocks()
-    assert products is not None and assembly.use_blocks() is products
-    mass = np.linspace(1.0, 2.0, balance.owned) * 1e4
-    assembly([], None, InBlocks(assembly.on_diagonal, mass.reshape(-1, dim)))
+    assembly = TangentAssembler(balance.tangent.form)
+    products = assembly.switch_to_blocks()
+    assert products is not None and assembly.switch_to_blocks() is products
+    mass = np.linspace(1.0, 2.0, balance.owned_dof_count) * 1e4
+    assembly([], None, MassBlocks(assembly.diagonal_blocks, mass.reshape(-1, dim)))
     x, y = assembly.matrix.createVecs()
     x.setRandom()
     products.mult(x, y)
@@ -29,9 +29,9 @@ def test_products_are_those_of_the_dense_matrix(dim: int) -> None:
 
 def test_without_a_compiler_single_entries_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is there serves on."""
-    assembly = Assembly(damaged("damped", 3)[0].balance.stiffness.form)
+    assembly = TangentAssembler(damaged("damped", 3)[0].balance.tangent.form)
     matrix = assembly.matrix
     monkeypatch.setenv("CC", "no-such-compiler")
-    assert assembly.use_blocks() is assembly.blocks is None
+    assert assembly.switch_to_blocks() is assembly.blocks is None
     assembly([])
     assert assembly.matrix is matrix and matrix.norm() > 0

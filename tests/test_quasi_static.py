@@ -48,9 +48,9 @@ def test_steps_end_in_balance(energy: str) -> None:
     """With chi of the step's end the residual on free dofs is what the solver leaves: a thousandth of the forces and
     less, where passes that ended when no edge broke left a tenth of them and more."""
     scene, state = torn_plate(material=PLATE["material"] | {"energy": energy}, solver=DIRECT | {"snes_rtol": 1e-8})
-    free, largest = scene.balance.motion.free, 0.0
+    free, largest = scene.balance.motion.free_dofs, 0.0
     for report in each_step(scene, state):
-        residual = np.linalg.norm(scene.balance.forces()[free])
+        residual = np.linalg.norm(scene.balance.update_forces()[free])
         largest = max(largest, float(np.linalg.norm(scene.balance.reactions[~free])))
         assert residual <= 1e-6 * largest
         assert report.solve.converged

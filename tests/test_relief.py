@@ -147,7 +147,7 @@ def test_a_slow_push_gives_the_mean_stress_of_the_motion() -> None:
     for _ in range(120):
         march(scene, state, 1)
         rows.append(stiffness.tensor(state.u.reshape(-1, 2), np.ones(domain.cell_count)))
-        loads.append(load.applied().reshape(-1, 2).copy())  # type: ignore[union-attr]
+        loads.append(load.applied_forces().reshape(-1, 2).copy())  # type: ignore[union-attr]
     body = FreeBody(stiffness, np.ones(domain.cell_count))
     expected = stiffness.tensor(body(np.mean(loads, axis=0)), body.share)
     assert np.linalg.norm(np.mean(rows, axis=0) - expected) < 0.05 * np.linalg.norm(expected)

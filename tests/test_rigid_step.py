@@ -18,7 +18,7 @@ from fracsim.contact.pose import Placed, bend, jacobian
 from fracsim.contact.rigid_body import Push, RigidStep, push
 from fracsim.contact.shapes import Sphere
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme
-from fracsim.mechanics.contact_time_weights import Blow
+from fracsim.mechanics.contact_time_weights import ContactTimeWeights
 
 Values = npt.NDArray[np.float64]
 SCHEMES: list[Scheme] = [BackwardEuler(), Newmark(), GeneralizedAlpha()]
@@ -71,7 +71,7 @@ def test_gradient_and_hessian_of_the_incremental_potential(scheme: Scheme, hinge
     held = grip(x, at_start.distance(x), area, at_start, barrier)
     assert len(held.points) > 5
     c_a, _ = scheme.rates(dt)
-    step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, Blow.of(scheme).factor)
+    step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, ContactTimeWeights.for_scheme(scheme).factor)
 
     z = np.array([0.02]) if hinged else np.array([0.02, -0.01, 0.015, 0.3, -0.25, 0.3])[: len(body.ways)]
     fixed = x if hinged else step.pose(0.8 * z).points_to_space(x)  # they have moved along: gaps are open

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mechanics.tensor_functions import Values, deviatoric_power, eigenvalues, times
+from fracsim.mechanics.tensor_functions import Values, deviatoric_power, eigenvalues, multiply_unimodular
 from support.laws import rotation
 
 EPS = np.finfo(float).eps
@@ -73,7 +73,7 @@ def test_products_whose_determinant_is_round_off(stretch: float) -> None:
     _, S = tensors((1.5, 1.0, 1 / 1.5))
     Q = np.array([rotation(3, seed) for seed in range(S.shape[1])])
     A = np.einsum("nij,j,nkj->nik", Q, np.array([stretch, 1.0, 1 / stretch]), Q[::-1])
-    found = times(A.reshape(-1, 9).T, S).T.reshape(-1, 3, 3)
+    found = multiply_unimodular(A.reshape(-1, 9).T, S).T.reshape(-1, 3, 3)
     product = A @ tensors((1.5, 1.0, 1 / 1.5))[0]
     np.testing.assert_allclose(found, product, atol=5e-2 * stretch)
 
@@ -84,6 +84,6 @@ def test_products_have_determinant_one() -> None:
     A = np.eye(3) + 0.3 * random.uniform(-1, 1, (20, 3, 3))
     S, components = tensors((1.5, 1.0, 0.4))
     product = A @ S[:20]
-    found = times(A.reshape(-1, 9).T, components[:, :20]).T.reshape(-1, 3, 3)
+    found = multiply_unimodular(A.reshape(-1, 9).T, components[:, :20]).T.reshape(-1, 3, 3)
     np.testing.assert_allclose(found, product / np.cbrt(np.linalg.det(product))[:, None, None], atol=50 * EPS)
     np.testing.assert_allclose(np.linalg.det(found), 1, atol=20 * EPS)

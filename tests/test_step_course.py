@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.errors import InputError
-from fracsim.mechanics.time_functions import Tabulated
+from fracsim.mechanics.time_functions import TabulatedFunction
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
@@ -50,7 +50,9 @@ def test_one_number_is_a_table_of_it(tmp_path: Path) -> None:
 
 
 def test_a_corner_that_is_reached_but_for_round_off_makes_no_sliver() -> None:
-    sizes = StepSizes(1.0, 9.0, 1e-3, course=Tabulated(np.array([0.0, 0.3, 5.0]), np.array([[0.1], [0.1], [1.0]])))
+    sizes = StepSizes(
+        1.0, 9.0, 1e-3, course=TabulatedFunction(np.array([0.0, 0.3, 5.0]), np.array([[0.1], [0.1], [1.0]]))
+    )
     assert sizes.at(0.1 + 0.2) == pytest.approx(0.1) and sizes.at(0.3 * (1 - 1e-12)) == pytest.approx(0.1)
     assert sizes.at(4.5) == pytest.approx(0.5) and sizes.at(6.0) == 1.0
 

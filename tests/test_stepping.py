@@ -44,7 +44,7 @@ def discrete_modes(boundary: list[dict[str, Any]]) -> tuple[Values, Values]:
     scene, _ = make_scene(mesh=MESH, material=MATERIAL, boundary=boundary)
     X, cells = positions(scene), scene.domain.cell_nodes
     free = np.ones(X.size, bool)
-    free[scene.balance.motion.owned] = False
+    free[scene.balance.motion.owned_dofs] = False
     return modes(stiffness(X, cells, MU, LAMBDA), lumped_mass(X, cells, 3.0), free)
 
 

@@ -68,7 +68,7 @@ def test_a_term_couples_what_no_cell_does(monkeypatch: pytest.MonkeyPatch, solve
     def tie(parts: Any) -> Tie:
         X = parts.domain.nodes[: parts.domain.node_count]
         near, far = (int(np.argmin(np.linalg.norm(X - corner, axis=1))) for corner in ([1.0, 0.0], [0.0, 1.0]))
-        made.append(Tie(parts.u, parts.assembler.vector(), 2 * near, 2 * far + 1, 0.7))
+        made.append(Tie(parts.u, parts.assembler.create_vector(), 2 * near, 2 * far + 1, 0.7))
         return made[-1]
 
     monkeypatch.setitem(scene_module.TERMS, "tie", tie)
@@ -83,14 +83,14 @@ def test_a_term_couples_what_no_cell_does(monkeypatch: pytest.MonkeyPatch, solve
         time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}, solver=solver,
     )  # fmt: skip
     (report,) = march(scene, state)
-    X, free = positions(scene), scene.balance.motion.free
+    X, free = positions(scene), scene.balance.motion.free_dofs
     K = stiffness(X, scene.domain.cell_nodes, 1 / 2.6, 0.3 / (1.3 * 0.4))
     b = np.zeros(X.size)
     i, j = made[0]._ends
     b[i], b[j] = 1.0, -1.0
     K = K + 0.7 * np.outer(b, b)
     expected = np.zeros(X.size)
-    expected[free] = np.linalg.solve(K[np.ix_(free, free)], scene.balance.applied()[free])
+    expected[free] = np.linalg.solve(K[np.ix_(free, free)], scene.balance.applied_forces()[free])
     np.testing.assert_allclose(state.u, expected, atol=1e-9)
     assert made[0].steps > 5 and report.solve.newton > 5
     assert state.work == pytest.approx(report.elastic, rel=1e-6)
@@ -109,8 +109,8 @@ def test_no_toy_term_without_its_line() -> None:
 def test_a_step_that_breaks_binds_its_forms_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces are compared before and after the breaks of a step, and forms bound to the living cells once, after it."""
     bound: list[int] = []
-    leave_out = CellForm.leave_out
-    monkeypatch.setattr(CellForm, "leave_out", lambda form, dead: bound.append(1) or leave_out(form, dead))
+    leave_out = CellForm.exclude_cells
+    monkeypatch.setattr(CellForm, "exclude_cells", lambda form, dead: bound.append(1) or leave_out(form, dead))
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.1, "pattern": "unstructured"},
         boundary=[{"on": "left", "fix": "xy"}, {"on": "right", "velocity": [0.2, 0.0]}],

@@ -40,7 +40,7 @@ def test_no_motion_gives_more_than_the_bound(order: int) -> None:
     """A look in any motion, and another after any other: the force has not changed by more than the bound, which is
     none too large where the body goes on as it did; where what is cut has let go there is none."""
     scene, rng = strip(1.0, 1.0, order), np.random.default_rng(5)
-    criterion, stress, size = criterion_of(scene), scene.balance.stress, scene.balance.owned
+    criterion, stress, size = criterion_of(scene), scene.balance.stress, scene.balance.owned_dof_count
     x = scene.domain.nodes[: size // 3]
     opening = np.sign(x[:, 2] - 0.52) * np.sqrt(np.maximum(1.05 - x[:, 0], 0.0))
     shape = np.column_stack([0 * opening, 0 * opening, opening]).ravel()

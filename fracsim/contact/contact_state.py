@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..mechanics.term import Level
+from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from .contact_surface import Cuts, Skin
 from .facet_contact import Facets, between, gripped_between, joined, matters
@@ -107,13 +107,13 @@ class Touching:
         """Numbers of those whose way is known: all that are held or driven."""
         return list(range(len(self.obstacles)))
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
         self._level, self._touches, self._attempts = level, None, 0
-        end = level.t + (1 - level.share) * level.dt
+        end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: grips and ways are still those of the step
-        self._end, self._dt, self._began_with = end, level.dt, level.v
+        self._end, self._dt, self._began_with = end, level.dt, level.v_n
         self._take_places(end - level.dt, end)
         self._forget_start()
         if level.dt:
@@ -125,11 +125,11 @@ class Touching:
 
     def _start_of_step(self) -> None:
         at = self._course.at_start
-        self.skin.make_room(self._level.u, partial(least_distance, at), self._cuts(at))
-        x = self.skin.places(self._level.u)
+        self.skin.make_room(self._level.u_n, partial(least_distance, at), self._cuts(at))
+        x = self.skin.places(self._level.u_n)
         gaps = [placed.distance(x) for placed in at]
         held = [grip(x, gap, self.skin.area, placed, self.law.barrier) for gap, placed in zip(gaps, at, strict=True)]
-        if self._level.blow.along:
+        if self._level.contact_weights.time_averaged:
             self._begun = [
                 Start(gap, each.points, each.normal, each.start) for gap, each in zip(gaps, held, strict=True)
             ]
@@ -149,7 +149,7 @@ class Touching:
 
     def _at_end(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
-        return self._level.at_end(self._u.x.array[: self._owned])
+        return self._level.displacement_at_end(self._u.x.array[: self._owned])
 
     def touching(self) -> list[Touch]:
         """What each obstacle does at the current u (collective)."""

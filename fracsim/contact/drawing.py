@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.surface_data import Drawn
+from ..mechanics.surface_data import SurfaceData
 from .obstacle import Obstacle
 from .pose import Placed
 from .shape_base import Shape, frame, unit
@@ -37,9 +37,9 @@ class Drawing:
         self._segments = elements if flat else none
         self._triangles = _filling(placed.shape, len(self._points)) if flat else elements
 
-    def __call__(self, placed: Placed) -> Drawn:
+    def __call__(self, placed: Placed) -> SurfaceData:
         """Where it is now."""
-        return Drawn(placed.pose.points_to_space(self._points), self._triangles, self._segments)
+        return SurfaceData(placed.pose.points_to_space(self._points), self._triangles, self._segments)
 
 
 class Drawings:
@@ -53,7 +53,7 @@ class Drawings:
     def _each(self) -> list[Drawing]:
         return [Drawing(each.placed(0.0), *self._box) for each in self._obstacles]
 
-    def __call__(self, placed: Sequence[Placed]) -> dict[str, Drawn]:
+    def __call__(self, placed: Sequence[Placed]) -> dict[str, SurfaceData]:
         """Each by its name, where it is now."""
         each = zip(self._obstacles, self._each, placed, strict=True)
         return {obstacle.name: drawing(here) for obstacle, drawing, here in each}

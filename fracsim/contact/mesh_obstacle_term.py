@@ -22,9 +22,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.low_rank_springs import Stiff
-from ..mechanics.surface_data import Drawn
-from ..mechanics.term import Level
+from ..mechanics.low_rank_springs import StiffCoupling
+from ..mechanics.surface_data import SurfaceData
+from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import Places
@@ -137,7 +137,7 @@ class Solids(SelfContact):
     """
 
     name = "solids"
-    visible = True
+    has_output_surfaces = True
     _surface: Front | None
     _rubbing: Rubbing | None  # type: ignore[assignment]
 
@@ -184,7 +184,7 @@ class Solids(SelfContact):
         self._x = self._start = self._tangent_at = self._rubbing = None
         self._moved = True
 
-    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Drawn in as the walls are that touch."""
         assert self._surface is not None
         return at.drawn_in(np.minimum(self._surface.at.share, at.share))
@@ -193,7 +193,7 @@ class Solids(SelfContact):
         """Each solid at time t, s (not collective)."""
         return [each.placed(t) for each in self.obstacles]
 
-    def drawn(self, t: float) -> dict[str, Drawn]:
+    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
         """Each solid at time t, s, by its name."""
         return self._drawings(self.where(t))
 
@@ -216,36 +216,36 @@ class Solids(SelfContact):
     def _is_far(self) -> bool:
         """Whether nothing can touch at the current u, nor could as the step began: nothing rubs then (collective)."""
         if self._far is None:
-            at_end = self._level.at_end(self._u.x.array[: self._owned])
-            self._far = not self._began_near and self._beside.is_far([self._level.u, at_end], self._between())
+            at_end = self._level.displacement_at_end(self._u.x.array[: self._owned])
+            self._far = not self._began_near and self._beside.is_far([self._level.u_n, at_end], self._between())
         return self._far
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """What touches has to be found anew."""
-        super().displaced()
+        super().update_displacement()
         self._far = None
 
     # --- what it adds to the balance: nothing, and nothing is gathered, where it is far ---
 
-    def struck(self) -> Values | None:  # type: ignore[override]
+    def contact_forces(self) -> Values | None:  # type: ignore[override]
         """(owned dofs,) forces at the end of the step, N (collective)."""
-        return None if self._is_far() else super().struck()
+        return None if self._is_far() else super().contact_forces()
 
-    def scale(self) -> Values | None:  # type: ignore[override]
+    def reference_forces(self) -> Values | None:  # type: ignore[override]
         """(owned dofs,) the same as they enter r, N (collective)."""
-        return None if self._is_far() else super().scale()
+        return None if self._is_far() else super().reference_forces()
 
-    def coupling(self) -> PETSc.Mat | Stiff | None:
+    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
         """Minus the derivative of the forces, where anything is in touch; as of SelfContact (collective)."""
-        return None if self._is_far() else super().coupling()
+        return None if self._is_far() else super().coupling_matrix()
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
-        return 0.0 if self._is_far() else super().stored()
+        return 0.0 if self._is_far() else super().stored_energy()
 
-    def stiffen(self) -> float:
+    def stiffen_contact(self) -> float:
         """As of SelfContact (collective)."""
-        return 0.0 if self._is_far() else super().stiffen()
+        return 0.0 if self._is_far() else super().stiffen_contact()
 
     def potential(self) -> float:
         """Barrier and friction as they enter that of r, on rank 0, J (collective)."""
@@ -253,20 +253,20 @@ class Solids(SelfContact):
 
     # --- a step ---
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Solids go to where they are at the end of the step; friction holds what is in touch at its start."""
         self._level, self._moved, self._far, self._attempts = level, True, None, 0
-        end = level.t + (1 - level.share) * level.dt
+        end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # a look at what a step has ended with: friction and places are still those of the step
-        self._end, self._dt, self._began_with = end, level.dt, level.v
+        self._end, self._dt, self._began_with = end, level.dt, level.v_n
         self._rubbing = self._tangent_at = None
         self._take_places(end - level.dt, end)
-        self._began_near, self._start = not self._beside.is_far([level.u], self._between()), None
+        self._began_near, self._start = not self._beside.is_far([level.u_n], self._between()), None
         none: Values = np.zeros((1, 3))
         self._pushed = [none for _ in self.obstacles]
         if level.dt and self._began_near:
-            nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
+            nodal, creep = self._gathered(level.u_n), max(self.law.creep, self.law.of_speed * self._speed(level.v_n))
             if self._surface is not None and nodal is not None:
                 self._put(0.0)
                 self._begin_at(self._surface, nodal, creep * level.dt)
@@ -285,7 +285,7 @@ class Solids(SelfContact):
         if any(each.friction for each in self._solids):
             self._rubbing = front.pairs.lag_friction(x, slip)
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """What contact has done in the step is booked (collective)."""
         self._lost, self._worked = 0.0, [0.0] * len(self.obstacles)
         read: list[Values] = [np.zeros(3) for _ in self.obstacles]
@@ -295,7 +295,7 @@ class Solids(SelfContact):
 
     def _book(self, x: Values, front: Front, read: list[Values]) -> None:
         """The same on rank 0, with the body's points at x (n, 3), m; forces on each solid go into `read`, N."""
-        end, pushed, n = self._level.blow.end, self._pushed, len(x)
+        end, pushed, n = self._level.contact_weights.end_work_share, self._pushed, len(x)
         for k, (each, start) in enumerate(zip(front.pairs.each, self._from, strict=True)):
             normal, under = each.on_both(x)[n:], 0.0  # of the solid on the body, at the places where it does
             read[k] -= normal.sum(axis=0)
@@ -307,27 +307,27 @@ class Solids(SelfContact):
                 read[k] -= friction[n:].sum(axis=0)
             self._worked[k] = float(np.vdot(end * normal + (1 - end) * pushed[k], moved)) + under
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """Work of the solids' own motion in the step, and what friction takes, on rank 0, J."""
         return sum(self._worked), self._lost
 
-    def drag(self) -> None:
+    def damping_forces(self) -> None:
         """Friction is booked step by step: `driven`."""
 
     # --- how far Newton's method may go ---
 
-    def longest_step(self, change: Values) -> float:
+    def max_step_fraction(self, change: Values) -> float:
         """Share of a change of u on the way of which nothing meets (collective)."""
         u, level = self._u.x.array[: self._owned], self._level
-        ends = [level.at_end(u), level.at_end(u + change)]
-        return 1.0 if self._beside.is_far(ends, self._between()) else super().longest_step(change)
+        ends = [level.displacement_at_end(u), level.displacement_at_end(u + change)]
+        return 1.0 if self._beside.is_far(ends, self._between()) else super().max_step_fraction(change)
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
-        if not level.dt or self._beside.is_far([level.u, level.at_end(u)], self._between()):
+        if not level.dt or self._beside.is_far([level.u_n, level.displacement_at_end(u)], self._between()):
             return u
-        start, end = self._gathered(level.u), self._gathered(level.at_end(u))
+        start, end = self._gathered(level.u_n), self._gathered(level.displacement_at_end(u))
 
         def found() -> Values | None:
             assert self._surface is not None and start is not None and end is not None
@@ -338,17 +338,17 @@ class Solids(SelfContact):
         if not self.comm.bcast(aside is not None):
             return u
         by = np.asarray(self._gather.scatter(aside)).reshape(-1)
-        return np.asarray(u + level.share * (self._domain.straight(by) if self.law.straight else by))
+        return np.asarray(u + level.fraction * (self._domain.straight(by) if self.law.straight else by))
 
     def _guided(self, front: Front, start: Values, end: Values) -> Values:
         """(nodes, 3) where the body gets to on its way from the `start` to the `end` of the step, on rank 0."""
         return led_past(front, front.pairs, start, end, self._from)
 
-    def clear(self, u: Values) -> bool:
+    def is_feasible(self, u: Values) -> bool:
         """Whether nothing is passed on the straight way from the start to u (collective)."""
-        if self._beside.is_far([self._level.u, self._level.at_end(u)], self._between()):
+        if self._beside.is_far([self._level.u_n, self._level.displacement_at_end(u)], self._between()):
             return True
-        start, end = self._gathered(self._level.u), self._gathered(self._level.at_end(u))
+        start, end = self._gathered(self._level.u_n), self._gathered(self._level.displacement_at_end(u))
 
         def found() -> bool:
             assert self._surface is not None and start is not None and end is not None
@@ -357,19 +357,19 @@ class Solids(SelfContact):
 
         return from_root(self.comm, found)
 
-    def hold_back(self) -> None:
+    def restrict_motion(self) -> None:
         """Solids wait where the step began (collective)."""
         self._put(0.0)
-        self._advance(self._level.u)
+        self._advance(self._level.u_n)
 
-    def left(self) -> float:
+    def remaining_motion(self) -> float:
         """The share of the solids' way that is left."""
         return 1.0 - self._gone
 
-    def go_on(self) -> None:
+    def continue_motion(self) -> None:
         """The rest of the way, or as far as the body where it is now lets them (collective)."""
-        if self.left():
-            self._advance(self._level.at_end(self._u.x.array[: self._owned]))
+        if self.remaining_motion():
+            self._advance(self._level.displacement_at_end(self._u.x.array[: self._owned]))
 
     def _advance(self, u: Values) -> None:
         """As far on their way as the body at the owned displacements u lets solids go (collective)."""
@@ -386,7 +386,7 @@ class Solids(SelfContact):
 
     # --- columns of history.csv, and what the end of a run tells ---
 
-    def readings(self) -> dict[str, Callable[[], Values]]:
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
         """contact_NAME_AXIS: (1,) force of the body on each solid in the last step, on rank 0, N."""
         return {
             f"contact_{each.name}_{axis}": partial(self._on_solid, number, place)
@@ -402,7 +402,7 @@ class Solids(SelfContact):
             force = self._read[number]
         return np.asarray(force[axis : axis + 1])
 
-    def least(self) -> dict[str, Callable[[], float]]:
+    def minimum_columns(self) -> dict[str, Callable[[], float]]:
         """gap_NAME: least distance between each solid and the body, m (on rank 0; infinite elsewhere)."""
         return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
 
@@ -410,7 +410,7 @@ class Solids(SelfContact):
         x = self._places()
         return np.inf if x is None or self._surface is None else self._surface.pairs.each[number].gap(x)
 
-    def works(self) -> dict[str, Callable[[], float]]:
+    def work_columns(self) -> dict[str, Callable[[], float]]:
         """work_NAME: what each solid has done on the body in the step that has ended, J."""
         return {f"work_{each.name}": partial(self._work, k) for k, each in enumerate(self.obstacles)}
 

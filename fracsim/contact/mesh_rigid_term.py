@@ -17,7 +17,7 @@ from dolfinx import fem
 
 from ..errors import InputError
 from ..forms.schemes import Scheme
-from ..mechanics.term import Level
+from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from .barrier import Barrier
@@ -93,22 +93,22 @@ class FreeSolids(Solids):
             self._from[k], self._ways[k] = each.flight.pose, np.zeros(6)
             each.look()
             if level.dt:
-                factor = level.blow.factor
-                each.begin(RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, factor))
+                factor = level.contact_weights.factor
+                each.begin(RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.fraction, factor))
                 if self.comm.rank == 0:
-                    each.stops.begin(each.pose, self._others_from, along=level.blow.along)
+                    each.stops.begin(each.pose, self._others_from, along=level.contact_weights.time_averaged)
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Free ones stay where they begin until they are looked for."""
-        super().begin(level)
+        super().begin_step(level)
         self._settled = False
 
     def _gone_to(self, number: int, gone: float) -> Pose:
         return self.free[number].pose if number in self.free else super()._gone_to(number, gone)
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """The step is over: solids have the momentum that it gave them (collective)."""
-        super().arrive()
+        super().accept_step()
         x = None if self._is_far() else self._places()
         flights = from_root(self.comm, lambda: {k: self._arrived(k, x) for k in self.free})
         for each in self.free.values():
@@ -125,9 +125,9 @@ class FreeSolids(Solids):
     def _under_way(self) -> bool:
         return bool(self._level.dt) and all(each.is_under_way for each in self.free.values())
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """All has to be found anew."""
-        super().displaced()
+        super().update_displacement()
         self._settled = False
 
     def _is_far(self) -> bool:
@@ -171,7 +171,7 @@ class FreeSolids(Solids):
 
     # --- what they add to the balance ---
 
-    def low_rank(self) -> list[tuple[Values, Values]]:
+    def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """Phi_xz and Phi_zz^-1 of each that is touched and under way (collective)."""
         if not self._under_way or self._is_far():
             return []
@@ -198,22 +198,22 @@ class FreeSolids(Solids):
         energy, level = super().potential(), self._level
         if self.comm.rank == 0 and level.dt:
             for each in self.free.values():
-                energy += each.step.own(each.z) + level.weight * level.share * self._stopped(each)[1]
+                energy += each.step.own(each.z) + level.contact_weight * level.fraction * self._stopped(each)[1]
         return energy
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """With the barriers between obstacles, on rank 0, J (collective)."""
-        energy = super().stored()
+        energy = super().stored_energy()
         return energy + sum(self._stopped(each)[0] for each in self.free.values()) if self.comm.rank == 0 else energy
 
     def _stopped(self, each: FreeSolid) -> tuple[float, float]:
         return each.stops.energies(each.pose, self._others_at)
 
-    def kinetic(self) -> float:
+    def kinetic_energy(self) -> float:
         """Energy of motion of the free solids, on rank 0, J."""
         return 0.0 if self.comm.rank else sum(float(each.body.told(each.flight)[-1]) for each in self.free.values())
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """With the work of gravity, and of other obstacles' motion, on free ones; on rank 0, J."""
         work = sum(done for k, done in enumerate(self._worked) if k not in self.free)
         if self.comm.rank == 0:
@@ -238,15 +238,15 @@ class FreeSolids(Solids):
             self._solids[k].put(before[k])
         return min(shares)
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start: free solids stop,
         or the body with them, before they meet (collective)."""
         if not self._level.dt:
-            return super().reachable(u)
+            return super().feasible_guess(u)
         for each in self.free.values():
             each.forget_way()
         self._put_free({k: each.step.ahead for k, each in self.free.items()})
-        guess = super().reachable(u)
+        guess = super().feasible_guess(u)
         self._put_free(self.comm.bcast({k: each.z for k, each in self.free.items()}))
         self._settled = False
         return guess
@@ -266,17 +266,17 @@ class FreeSolids(Solids):
         self._put_free({k: share * z for k, z in taken.items()})
         return to if share == 1 else start + share * (to - start)
 
-    def clear(self, u: Values) -> bool:
+    def is_feasible(self, u: Values) -> bool:
         """Whether nothing is passed on the straight way from the start to u, nor any stop entered (collective)."""
         at = self._others_at
         every = self.free.values()
         apart = from_root(self.comm, lambda: all(each.stops.are_open(each.pose, at) for each in every))
-        return super().clear(u) and apart
+        return super().is_feasible(u) and apart
 
-    def hold_back(self) -> None:
+    def restrict_motion(self) -> None:
         """All stay where the step began (collective)."""
         self._put_free({k: 0 * each.z for k, each in self.free.items()})
-        super().hold_back()
+        super().restrict_motion()
 
     # --- their flights are their past, and told ---
 
@@ -289,23 +289,23 @@ class FreeSolids(Solids):
         for k, each in self.free.items():
             each.flight = flights[k]
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """That of the surface, and how solids move."""
-        return super().memory(), self.flights()
+        return super().snapshot(), self.flights()
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave (not collective)."""
         surface, flights = cast("tuple[object, dict[int, Flight]]", memory)
-        super().recall(surface)
+        super().restore(surface)
         self.fly(flights)
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """With rows of how solids move (collective)."""
-        return super().saved() | {"flights": rows_of(each.flight for each in self.free.values())}
+        return super().to_checkpoint() | {"flights": rows_of(each.flight for each in self.free.values())}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        super().restore(saved)
+        super().from_checkpoint(saved)
         for row, each in enumerate(self.free.values()):
             each.flight = each.flight.like(saved["flights"][row])
 
@@ -316,6 +316,6 @@ class FreeSolids(Solids):
             here[k] = Placed(here[k].shape, each.flight.pose)
         return here
 
-    def readings(self) -> dict[str, Callable[[], Values]]:
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
         """With the columns of all that are free (flights)."""
-        return super().readings() | columns_of(self.free.values(), self.comm)
+        return super().summed_columns() | columns_of(self.free.values(), self.comm)

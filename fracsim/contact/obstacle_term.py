@@ -17,8 +17,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mechanics.extra_couplings import Coupling
-from ..mechanics.surface_data import Drawn
+from ..mechanics.extra_couplings import CouplingBuilder
+from ..mechanics.surface_data import SurfaceData
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..mesh.split_surface.surface_map import Places
@@ -45,19 +45,19 @@ class Obstacles(Touching, Term):
     """Obstacles that the body cannot pass through."""
 
     name = "obstacles"
-    keeps_apart = True
-    visible = True
+    separates_surface = True
+    has_output_surfaces = True
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
         super().__init__(domain, u, obstacles, law)
-        self._coupling, self._drawings = Coupling(domain), Drawings(obstacles, domain.lower, domain.upper)
+        self._coupling, self._drawings = CouplingBuilder(domain), Drawings(obstacles, domain.lower, domain.upper)
         # of the last step: work of each obstacle, J, what friction took, J, and forces on each, N
         self._worked, self._lost = [0.0] * len(self.obstacles), 0.0
         self._read: list[Values] | None = None  # None: not yet
         self._exact = False  # the last tangent
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """What touches has to be found anew."""
         self._touches = None
 
@@ -74,15 +74,15 @@ class Obstacles(Touching, Term):
 
     # --- what it adds to the balance ---
 
-    def struck(self) -> Values:
+    def contact_forces(self) -> Values:
         """(owned dofs,) forces at the end of the step, N (collective)."""
         return self.forces()
 
-    def scale(self) -> Values:
+    def reference_forces(self) -> Values:
         """(owned dofs,) the same as they enter r, N (collective)."""
-        return np.asarray(self._level.weight * self.forces())
+        return np.asarray(self._level.contact_weight * self.forces())
 
-    def coupling(self) -> PETSc.Mat | None:
+    def coupling_matrix(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces, where anything is in touch (collective)."""
         touches = self.touching()
         points = np.concatenate([each.points for each in touches])
@@ -97,7 +97,7 @@ class Obstacles(Touching, Term):
         for between in (each.between for each in touches if each.between is not None):
             inner = between.exact if self._exact else between.stiffness
             part = part + self.skin.stiffness_between(between.corners, inner)
-        return self._coupling((self._level.blow.factor * part).tocsr(), self.skin.columns)
+        return self._coupling((self._level.contact_weights.factor * part).tocsr(), self.skin.columns)
 
     def _changed(self, points: Ints) -> float:
         """m, by which points (k,) have moved at most since the last tangent; infinite where there was none."""
@@ -109,19 +109,19 @@ class Obstacles(Touching, Term):
         """Whether Newton's method is at its end, points in touch having moved by so much, m, at most (collective)."""
         return moved < NEAR_END[self._attempts > 1] * self.width
 
-    def set_out(self) -> None:
+    def begin_solve(self) -> None:
         """Newton's method sets out on the step: after it has failed it is exact later."""
         self._tangent_at, self._exact, self._attempts = None, False, self._attempts + 1
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
         return sum(each.energy for each in self.touching())
 
     def potential(self) -> float:
         """Barriers and friction at the end of the step as they enter that of r, this rank's share, J (collective)."""
-        return self._level.weight * self._level.share * sum(each.potential for each in self.touching())
+        return self._level.contact_weight * self._level.fraction * sum(each.potential for each in self.touching())
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """What contact has done in the step is booked (collective)."""
         self._lost, found = 0.0, self.touching()
         self._read = [_on_obstacle(each) for each in found]
@@ -132,20 +132,20 @@ class Obstacles(Touching, Term):
 
     def _pressed(self, number: int) -> float:
         """Work of normal forces on the body in the step, by the way of the obstacle, this rank's share, J."""
-        end, shift = self._level.blow.end, self._course.ways[number][: self._domain.dim]
+        end, shift = self._level.contact_weights.end_work_share, self._course.ways[number][: self._domain.dim]
         pushed = end * self.touching()[number].normal.sum(axis=0) + (1 - end) * self._pushed[number]
         return float(pushed @ shift)
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """Work of the obstacles' own motion in the step on this rank, and what friction takes, J."""
         return sum(self._worked[number] for number in self._course.led), self._lost
 
     # --- how far Newton's method may go ---
 
-    def longest_step(self, change: Values) -> float:
+    def max_step_fraction(self, change: Values) -> float:
         """Share of a change of u that closes no gap by more than nine tenths (collective)."""
         self.touching()
-        moved = self.skin.follow(np.divide(change, self._level.share))
+        moved = self.skin.follow(np.divide(change, self._level.fraction))
         along = enumerate(zip(self._course.placed, self._taken_along(moved), strict=True))
         every = [safe_shares(placed, self.x, moved, q, self._facets(number)) for number, (placed, q) in along]
         shares = [each[self.skin.area > 0] for each in every]
@@ -155,30 +155,30 @@ class Obstacles(Touching, Term):
         """(p,) how each obstacle gives way to a change `moved` (n, d) of the points, m (collective)."""
         return [np.zeros_like(way) for way in self._course.ways]
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
         level = self._level
         if not level.dt:
             return u
-        end = within_reach(self.skin, self._course.known(self._facets), level.u, level.at_end(u))
-        return np.asarray(level.u + level.share * (end - level.u))
+        end = within_reach(self.skin, self._course.known(self._facets), level.u_n, level.displacement_at_end(u))
+        return np.asarray(level.u_n + level.fraction * (end - level.u_n))
 
-    def clear(self, u: Values) -> bool:
+    def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
-        x = self.skin.places(self._level.at_end(u))
+        x = self.skin.places(self._level.displacement_at_end(u))
         return self.skin.are_apart(least_distance(self._course.placed, x)) and self._are_uncut(x)
 
-    def hold_back(self) -> None:
+    def restrict_motion(self) -> None:
         """Obstacles wait on their way where they would meet the body at the step's start: what is jammed between them
         and something else cannot be taken along by a guess (collective)."""
         self._course.back_to_start()
-        self._go_on(self.skin.places(self._level.u))
+        self._go_on(self.skin.places(self._level.u_n))
 
-    def left(self) -> float:
+    def remaining_motion(self) -> float:
         """The share of the obstacles' way that is left."""
         return self._course.left
 
-    def go_on(self) -> None:
+    def continue_motion(self) -> None:
         """The rest of the way, or as far as the body where it is now lets them (collective)."""
         self._tangent_at = None
         if self._course.left:
@@ -195,7 +195,7 @@ class Obstacles(Touching, Term):
         """Each obstacle at the time t of the state, s (not collective)."""
         return [each.placed(t) for each in self.obstacles]
 
-    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Drawn in where it would lie in an obstacle, or be cut by one that facets feel, as what touches is."""
         placed = self.where(t)
         at = clear_of(at, u, partial(least_distance, placed))
@@ -204,7 +204,7 @@ class Obstacles(Touching, Term):
         facets = self.skin.facets_of(elements)
         return uncut(at, u, elements, lambda x: ~facets.are_open([placed[number] for number in self._sharp], x))
 
-    def drawn(self, t: float) -> dict[str, Drawn]:
+    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
         """Each obstacle at time t, s, by its name."""
         return self._drawings(self.where(t))
 
@@ -214,25 +214,25 @@ class Obstacles(Touching, Term):
         self.skin.edges_broke(pattern, self._at_end(), partial(least_distance, placed), self._cuts(placed))
         self._forget_start()
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """That of what touches."""
         return self.skin.memory()
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
         self.skin.recall(memory)
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """The same for a checkpoint (collective)."""
         return {"drawn_in": self.skin.saved()} | ({"cut": self.skin.saved_cut()} if self._sharp else {})
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         self.skin.restore(saved["drawn_in"])
         if "cut" in saved:
             self.skin.restore_cut(saved["cut"])
 
-    def forget(self) -> None:
+    def clear_search(self) -> None:
         """Forget where facets were searched (not collective)."""
         self.skin.forget()
         self._touches = None
@@ -244,7 +244,7 @@ class Obstacles(Touching, Term):
 
     # --- columns of history.csv, and what the end of a run tells ---
 
-    def readings(self) -> dict[str, Callable[[], Values]]:
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
         """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, this rank's share, N."""
         return {
             f"contact_{each.name}_{axis}": partial(self._on_obstacle, number, place)
@@ -256,7 +256,7 @@ class Obstacles(Touching, Term):
         read = _on_obstacle(self.touching()[number]) if self._read is None else self._read[number]
         return read[axis : axis + 1]
 
-    def least(self) -> dict[str, Callable[[], float]]:
+    def minimum_columns(self) -> dict[str, Callable[[], float]]:
         """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite where it has none. Of
         facets that of the place where they feel it."""
         return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
@@ -268,7 +268,7 @@ class Obstacles(Touching, Term):
             return least
         return min(least, float(facets.distances(placed, self.x, self.law.barrier.width).min(initial=np.inf)))
 
-    def works(self) -> dict[str, Callable[[], float]]:
+    def work_columns(self) -> dict[str, Callable[[], float]]:
         """work_NAME: what each obstacle has done on the body in the step that has ended, J."""
         return {f"work_{each.name}": partial(self._worked.__getitem__, k) for k, each in enumerate(self.obstacles)}
 

@@ -139,18 +139,18 @@ class ExplicitObstacles(Obstacles):
             self.stiffness = np.minimum(self.stiffness, self._most * carried.masses(area))
         self._fastest, self._stiffened = carried.fastest(self.stiffness), (at, area)
 
-    def frequency(self) -> float:
+    def frequency_bound(self) -> float:
         """What contact adds at most, were all points in touch, 1/s^2."""
         return self._fastest
 
     # --- a step ---
 
     def _start_of_step(self) -> None:
-        self.skin.make_room(self._level.u, partial(least_distance, self._course.at_start))
+        self.skin.make_room(self._level.u_n, partial(least_distance, self._course.at_start))
         at, area = self._stiffened
         if self.comm.allreduce(at is not self.skin.at or area is not self.skin.area):
             self._stiffen()
-        self._from = self.skin.places(self._level.u)
+        self._from = self.skin.places(self._level.u_n)
 
     def _feel(self, number: int, placed: Placed) -> Touch:
         law, gap = self.law.barrier, placed.distance(self.x)
@@ -180,7 +180,7 @@ class ExplicitObstacles(Obstacles):
             self._springs = list(self._past.springs)
         return super().touching()
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """The step is over: its work is summed, and its springs are those that the next begins with (collective)."""
         found, past = self.touching(), self._past
         pushed = [(each.normal + each.friction).sum(axis=0) for each in found]
@@ -209,16 +209,16 @@ class ExplicitObstacles(Obstacles):
         kept = kept[np.argsort(at[kept])]
         return Springs(at[kept], spring.slip[kept], spring.stiffness[kept])
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """That of the points, and what the step ended with."""
-        return super().memory(), self._past
+        return super().snapshot(), self._past
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave (not collective)."""
         points, self._past = cast("tuple[object, Past]", memory)
-        super().recall(points)
+        super().restore(points)
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """With rows of springs: obstacle, rank, share of the surface, identity, stretch, stiffness; and sums of forces
         on each rank, on rank 0 (collective). Ranks that share a point have a spring there each."""
         rows = [
@@ -228,13 +228,13 @@ class ExplicitObstacles(Obstacles):
         ]  # fmt: skip
         gathered = gather(self.comm, (np.concatenate(rows), np.array(self._past.pushed)))
         if gathered is None:
-            return super().saved()
+            return super().to_checkpoint()
         springs, pushed = zip(*gathered, strict=True)
-        return super().saved() | {"springs": np.concatenate(springs), "pushed": np.array(pushed)}
+        return super().to_checkpoint() | {"springs": np.concatenate(springs), "pushed": np.array(pushed)}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        super().restore(saved)
+        super().from_checkpoint(saved)
         rows, pushed = saved["springs"], saved["pushed"]
         springs = [self._springs_of(rows[rows[:, 0] == number, 1:]) for number in range(len(self.obstacles))]
         if len(pushed) == self.comm.size:

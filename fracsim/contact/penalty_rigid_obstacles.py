@@ -98,11 +98,11 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
         self.free = {number: Drift(each) for number, each in enumerate(obstacles) if isinstance(each, FreeObstacle)}
         super().__init__(domain, u, obstacles, law, mass, most)
 
-    def frequency(self) -> float:
+    def frequency_bound(self) -> float:
         """With what the lightest obstacle adds on the springs that are near it: squares of a body and an obstacle on
         one spring add up, obstacles know nothing of each other (collective)."""
         self.touching()
-        return super().frequency() + max(self._fastest_of(*each) for each in self.free.items())
+        return super().frequency_bound() + max(self._fastest_of(*each) for each in self.free.items())
 
     def _fastest_of(self, number: int, each: Drift) -> float:
         placed = self._course.placed[number]
@@ -122,24 +122,24 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
             return self.free[number].under(self._from, placed)
         return super()._way_under(number, placed)
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
-        super().arrive()
+        super().accept_step()
         for number, each in self.free.items():
             placed, found = self._course.placed[number], self.touching()[number]
             worked = each.arrive(placed, total(self.comm, on_obstacle(found, self.x, placed.pose)))
             self._worked[number] = 0.0 if self.comm.rank else -worked
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """With the work of gravity on free obstacles (on rank 0)."""
-        work, lost = super().driven()
+        work, lost = super().step_work()
         return work + (0.0 if self.comm.rank else sum(each.weighed for each in self.free.values())), lost
 
     # --- its past ---
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        super().restore(saved)
+        super().from_checkpoint(saved)
         for number, each in self.free.items():
             self._course.put_at_start(number, each.look())
-        self.displaced()
+        self.update_displacement()

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..mechanics.term import Level
+from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.entity_numbering import Skeleton
@@ -175,26 +175,26 @@ class ExplicitSelfContact(SelfContact):
         assert self._skeleton is not None and self._mass is not None
         return Pushes(self._skeleton, pattern, self.law, u, self._surface, cut, mass=self._mass, most=self._most)
 
-    def stiffen(self) -> float:
+    def stiffen_contact(self) -> float:
         """A penalty knows no gap that is all but closed."""
         return 0.0
 
     # --- where nothing is near, nothing is gathered until nodes have gone far enough to change that ---
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """As of SelfContact."""
         idle, self._lost = self._is_idle(), 0.0 if level.dt else self._lost
         if idle:
             self._level, self._moved, self._idle = level, True, None
         else:
-            super().begin(level)
+            super().begin_step(level)
         if self._friction and self._surface is not None:
             start = self._start if level.dt and not idle else None
             self._rubbing = Sticking(self._surface.pairs, self._friction, start)
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """What touches has to be found anew."""
-        super().displaced()
+        super().update_displacement()
         self._idle = None
 
     def _is_idle(self) -> bool:
@@ -230,30 +230,30 @@ class ExplicitSelfContact(SelfContact):
 
     # --- what it adds to the balance ---
 
-    def struck(self) -> Values | None:  # type: ignore[override]
+    def contact_forces(self) -> Values | None:  # type: ignore[override]
         """(owned dofs,) forces at the end of the step, N; None: nothing is near (collective)."""
         if self._is_idle():
             return None
-        forces = super().struck()
+        forces = super().contact_forces()
         self._look()
         return forces
 
-    def scale(self) -> Values | None:  # type: ignore[override]
+    def reference_forces(self) -> Values | None:  # type: ignore[override]
         """(owned dofs,) the same as they enter r, N (collective)."""
-        return None if self._is_idle() else super().scale()
+        return None if self._is_idle() else super().reference_forces()
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """Energy of the penalty, and of the springs of friction, at the current u, on rank 0, J (collective)."""
         if self._is_idle():
             return 0.0
-        energy, x = super().stored(), self._places()
+        energy, x = super().stored_energy(), self._places()
         return energy if self._rubbing is None or x is None else energy + self._rubbing.energy(x)
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """What friction takes, on rank 0, J."""
         return 0.0, self._lost
 
-    def frequency(self) -> float:
+    def frequency_bound(self) -> float:
         """What contact adds at most, were all points in touch that are near, 1/s^2 (collective)."""
         if self._is_idle():
             return 0.0
@@ -265,7 +265,7 @@ class ExplicitSelfContact(SelfContact):
 
         return from_root(self.comm, found)
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """The step is over: what is pushed is known from here on (collective)."""
         if self._is_idle():
             return
@@ -280,15 +280,15 @@ class ExplicitSelfContact(SelfContact):
 
         on_root(self.comm, noted)
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """With what is pushed."""
         pushed = self._surface and (self._surface.pairs.by, self._surface.pairs.held, self._surface.pairs.slip)
-        return super().memory(), pushed, (self._since, self._room, self._age)
+        return super().snapshot(), pushed, (self._since, self._room, self._age)
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
         surface, pushed, idle = cast("tuple[object, tuple[Ints, Values, Values] | None, _Idle]", memory)
-        super().recall(surface)
+        super().restore(surface)
         if self._surface is not None and pushed is not None and pushed[1] is not self._surface.pairs.held:
             self._surface.pairs.hold(*pushed)
         self._since, self._room, age = idle
@@ -296,17 +296,17 @@ class ExplicitSelfContact(SelfContact):
             self._since = None
         self._idle = None
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """With the facets that push points, and the springs of friction."""
         if self._surface is None:
-            return super().saved() | {"by": np.empty((0, 0)), "held": np.empty(0), "slip": np.empty((0, 0))}
+            return super().to_checkpoint() | {"by": np.empty((0, 0)), "held": np.empty(0), "slip": np.empty((0, 0))}
         pairs = self._surface.pairs
-        return super().saved() | {"by": pairs.by.astype(float), "held": pairs.held, "slip": pairs.slip}
+        return super().to_checkpoint() | {"by": pairs.by.astype(float), "held": pairs.held, "slip": pairs.slip}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         self._since = self._idle = None
-        super().restore(saved)
+        super().from_checkpoint(saved)
         if self._surface is not None and "by" in saved:
             slip = saved.get("slip", np.zeros(saved["by"].shape))
             self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"], slip)

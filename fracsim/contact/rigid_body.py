@@ -39,7 +39,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..forms.schemes import Scheme
-from ..mechanics.contact_time_weights import given
+from ..mechanics.contact_time_weights import acceleration_change
 from ..mesh.parallel import total
 from .node_contact import Grip, Jointly, Touch
 from .obstacle import Flight, FreeObstacle
@@ -438,7 +438,7 @@ class RigidStep:
         struck = self.share * self.factor * _over(self.M, self.body.ways.T @ force) / self.c_a
         reached = self.z_a + _over(self.M, self.share * weight + self.before) / self.c_a + struck
         _, rate, change = self.scheme.finish(self.dt, reached, np.zeros(len(z)), *self._motion)
-        carried = change - given(self.scheme, self.dt, struck)
+        carried = change - acceleration_change(self.scheme, self.dt, struck)
         return Flight(pose, self.M @ rate, self.M @ carried, self._turned(pose, z))
 
     def _turned(self, pose: Pose, z: Values) -> Values:

@@ -58,23 +58,23 @@ class Flights(Obstacles):
         for number, each in self.free.items():
             self._course.put_at_start(number, each.look())
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """That of the points, and how obstacles move."""
-        return super().memory(), self.flights()
+        return super().snapshot(), self.flights()
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave (not collective)."""
         points, flights = cast("tuple[object, dict[int, Flight]]", memory)
-        super().recall(points)
+        super().restore(points)
         self.fly(flights)
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """With rows of how obstacles move (collective)."""
-        return super().saved() | {"flights": rows_of(each.flight for each in self.free.values())}
+        return super().to_checkpoint() | {"flights": rows_of(each.flight for each in self.free.values())}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        super().restore(saved)
+        super().from_checkpoint(saved)
         for k, each in enumerate(self.free.values()):
             each.flight = each.flight.like(saved["flights"][k])
 
@@ -85,16 +85,16 @@ class Flights(Obstacles):
             here[number] = Placed(here[number].shape, each.flight.pose)
         return here
 
-    def kinetic(self) -> float:
+    def kinetic_energy(self) -> float:
         """Energy of motion of the free obstacles, on rank 0, J."""
         if self.comm.rank:
             return 0.0
         return float(sum(each.body.told(each.flight)[-1] for each in self.free.values()))
 
-    def readings(self) -> dict[str, Callable[[], Values]]:
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
         """With position_NAME_x, velocity_NAME_x of the centre of mass, m and m/s, turn_NAME_z, spin_NAME_z in rad and
         rad/s, and kinetic_NAME in J of each that is free."""
-        return super().readings() | columns_of(self.free.values(), self.comm)
+        return super().summed_columns() | columns_of(self.free.values(), self.comm)
 
 
 def columns_of(free: Iterable[Flying], comm: MPI.Intracomm) -> dict[str, Callable[[], Values]]:

@@ -48,7 +48,7 @@ class FreeObstacles(Flights):
         free: the free ones by their number.
     """
 
-    beside = True
+    leaves_tangent_incomplete = True
     free: dict[int, FreePose]
 
     def __init__(
@@ -74,15 +74,17 @@ class FreeObstacles(Flights):
         super()._start_of_step()
         level, self._settled_at = self._level, None
         for number, each in self.free.items():
-            step = RigidStep(each.body, each.flight, self._scheme, level.dt, level.c_a, level.share, level.blow.factor)
+            step = RigidStep(
+                each.body, each.flight, self._scheme, level.dt, level.c_a, level.fraction, level.contact_weights.factor
+            )
             self._course.ways[number] = each.begin(step, self._grips[number])
-            each.stops.begin(each.flight.pose, self._course.at_start, along=level.blow.along)
+            each.stops.begin(each.flight.pose, self._course.at_start, along=level.contact_weights.time_averaged)
         if self._mutual is not None:
-            self._mutual.begin(along=level.blow.along)
+            self._mutual.begin(along=level.contact_weights.time_averaged)
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
-        super().arrive()
+        super().accept_step()
         found, others = self.touching(), {} if self._mutual is None else self._mutual.forces()
         for number, each in self.free.items():
             each.arrive(found[number], self._around(number), others.get(number, 0.0))
@@ -166,21 +168,21 @@ class FreeObstacles(Flights):
         if self.comm.rank == 0 and level.dt:
             for each in self.free.values():
                 _, stopped = each.stops.energies(each.placed.pose, self._course.placed)
-                energy += each.step.own(each.z) + level.weight * level.share * stopped
+                energy += each.step.own(each.z) + level.contact_weight * level.fraction * stopped
             if self._mutual is not None:
-                energy += level.weight * level.share * self._mutual.energies()[1]
+                energy += level.contact_weight * level.fraction * self._mutual.energies()[1]
         return energy
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """That of all obstacles, with the barriers between them on rank 0, J (collective)."""
-        energy = super().stored()
+        energy = super().stored_energy()
         if self.comm.rank == 0:
             placed = self._course.placed
             energy += sum(each.stops.energies(each.placed.pose, placed)[0] for each in self.free.values())
             energy += 0.0 if self._mutual is None else self._mutual.energies()[0]
         return energy
 
-    def low_rank(self) -> list[tuple[Values, Values]]:
+    def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """Phi_xz and Phi_zz^-1 of each obstacle that is touched and under way (collective)."""
         if not self._is_under_way() or not (touches := self.touching()) or self._waits:
             return []
@@ -216,9 +218,9 @@ class FreeObstacles(Flights):
             return super()._pressed(number)
         return self.free[number].pressed(self.touching()[number], self.x)
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """With the work of gravity, and of other obstacles' motion, on free ones (collective)."""
-        work, lost = super().driven()
+        work, lost = super().step_work()
         if self.comm.rank == 0:
             for number, each in self.free.items():
                 ends = self._course.at_start[number].pose, each.placed.pose
@@ -242,17 +244,17 @@ class FreeObstacles(Flights):
             ways[number] = each.taken_along(found[number], self._around(number), moved, exact=self._exact)
         return ways
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess that has passed through nothing on its way from the start: free obstacles stop,
         or the body with them, before they meet (collective)."""
-        u, level = super().reachable(u), self._level
+        u, level = super().feasible_guess(u), self._level
         self._set_off()
         for each in self.free.values():
             each.forget_way()
         if not level.dt:
             return u
-        x = self.skin.places(level.u)
-        moved = self.skin.places(level.at_end(u)) - x
+        x = self.skin.places(level.u_n)
+        moved = self.skin.places(level.displacement_at_end(u)) - x
         share, taken = 1.0, {}
         for number, each in self.free.items():
             taken[number], free = self._first_guess(each, self._around_at(number, x), moved)
@@ -262,7 +264,7 @@ class FreeObstacles(Flights):
         for number, z in taken.items():
             self.free[number].put(share * z)
         self._place()
-        return u if share == 1 else np.asarray(level.u + share * (u - level.u))
+        return u if share == 1 else np.asarray(level.u_n + share * (u - level.u_n))
 
     def _first_guess(self, each: FreePose, around: Around, moved: Values) -> tuple[Values, float]:
         """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
@@ -278,21 +280,21 @@ class FreeObstacles(Flights):
             first = min(first, share) if first else share
         return ways[0], first
 
-    def clear(self, u: Values) -> bool:
+    def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u, those between obstacles as well (collective)."""
         placed = self._course.placed
         apart = all(each.stops.are_open(each.placed.pose, placed) for each in self.free.values())
-        return super().clear(u) and apart and (self._mutual is None or self._mutual.are_open())
+        return super().is_feasible(u) and apart and (self._mutual is None or self._mutual.are_open())
 
-    def left(self) -> float:
+    def remaining_motion(self) -> float:
         """And that of free ones which are held back (collective)."""
         if self._begins:
             self.touching()
-        return max(super().left(), self._waits)
+        return max(super().remaining_motion(), self._waits)
 
-    def go_on(self) -> None:
+    def continue_motion(self) -> None:
         """Free obstacles as well (collective)."""
-        super().go_on()
+        super().continue_motion()
         if self._waits:
             self.touching()
             self._walk()
@@ -306,13 +308,13 @@ class FreeObstacles(Flights):
         self._course.go_on(x, self._course.known(self._facets), self.skin.safe, min(shares))
         self._touches = self._settled_at = None
 
-    def hold_back(self) -> None:
+    def restrict_motion(self) -> None:
         """All stay where the step began (collective)."""
         for each in self.free.values():
             each.stay()
         self._place()
         self._set_off()
-        super().hold_back()
+        super().restrict_motion()
 
 
 def _same(x: Values, before: Values | None) -> bool:

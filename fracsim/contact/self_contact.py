@@ -17,9 +17,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.extra_couplings import Coupling
-from ..mechanics.low_rank_springs import Stiff
-from ..mechanics.term import Cuts, Level, Term
+from ..mechanics.extra_couplings import CouplingBuilder
+from ..mechanics.low_rank_springs import StiffCoupling
+from ..mechanics.term import Cuts, Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import Gather, from_root, on_root, total
 from ..mesh.split_surface.entity_numbering import Skeleton
@@ -41,7 +41,7 @@ class SelfContact(Term):
     """A body that cannot pass through itself."""
 
     name = "contact"
-    keeps_apart = beside = True
+    separates_surface = leaves_tangent_incomplete = True
     exact_at_end: ClassVar[bool] = True  # tangents where Newton's method is at its end
     _attempts = 0  # of the step
     _cuts: Cuts | None = None
@@ -50,7 +50,7 @@ class SelfContact(Term):
         """InputError where the surface at rest cuts itself (collective)."""
         self.law, self._domain, self._u = law, domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
-        self._coupling = Coupling(domain)
+        self._coupling = CouplingBuilder(domain)
         self._wall = STIFF * domain.mean_edge ** (domain.dim - 2)  # m^(d-2), times a stiffness in Pa
         mesh = _refined(domain) if self._is_refined(law) else domain.source
         self._skeleton = None if mesh is None else Skeleton(mesh)
@@ -102,7 +102,7 @@ class SelfContact(Term):
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
         return self._gather(np.asarray(u).reshape(-1, self._domain.dim))
 
-    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
         assert self._surface is not None
         own = self._surface.at
@@ -110,7 +110,7 @@ class SelfContact(Term):
             return self._surface.laid(at)
         return own.drawn_in(np.minimum(own.share, at.share))
 
-    def cut_by(self, cuts: Cuts) -> None:
+    def set_cuts(self, cuts: Cuts) -> None:
         """Walls between pieces are where edges are cut."""
         if self.law.pieces:
             self._cuts = cuts
@@ -121,35 +121,35 @@ class SelfContact(Term):
         self._rebuild()
         self._rubbing, self._moved = None, True
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """What is drawn in, and left out, on rank 0."""
         return (self._surface and self._surface.memory(),)
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave (not collective)."""
         assert isinstance(memory, tuple)
         if self._surface is not None:
             self._surface.recall(memory[0])
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """Shares of arms, numbers of elements that are left out, steps to the next look for room, and stiffness."""
         share, out, pause = (np.empty(0), np.empty(0), (0, 0)) if self._surface is None else self._surface.memory()
         return {"share": share, "left_out": np.asarray(out, float), "pause": np.array(pause, float),
                 "stiffness": np.array([self.law.stiffness])}  # fmt: skip
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         self._stiffen_to(float(saved["stiffness"][0]))
         if self._surface is not None:
             pause, waits = (int(each) for each in saved.get("pause", (1, 1)))
             self._surface.recall((saved["share"], saved["left_out"].astype(np.int64), (pause, waits)))
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """A step begins: friction is that of its start."""
         self._level, self._moved, self._rubbing, self._attempts = level, True, None, 0
         if not level.dt:
             return
-        nodal, creep = self._gathered(level.u), max(self.law.creep, self.law.of_speed * self._speed(level.v))
+        nodal, creep = self._gathered(level.u_n), max(self.law.creep, self.law.of_speed * self._speed(level.v_n))
         if self._surface is not None and nodal is not None:
             self._surface.make_room(nodal)
             self._start = self._surface.at(nodal)
@@ -162,14 +162,14 @@ class SelfContact(Term):
         squares, count = total(self.comm, np.array([v @ v, len(v) / self._domain.dim]))
         return float(np.sqrt(squares / count))
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """What touches has to be found anew."""
         self._moved = True
 
     def _places(self) -> Values | None:
         """(n, d) at the end of the step that belongs to the current u, on rank 0 (collective)."""
         if self._moved:
-            self._x, self._moved = self._placed(self._level.at_end(self._u.x.array[: self._owned])), False
+            self._x, self._moved = self._placed(self._level.displacement_at_end(self._u.x.array[: self._owned])), False
             self._struck = self._stored = None
         return self._x
 
@@ -193,18 +193,18 @@ class SelfContact(Term):
 
         return np.asarray(self._gather.scatter(on_root(self.comm, found))).reshape(-1)
 
-    def struck(self) -> Values:
+    def contact_forces(self) -> Values:
         """(owned dofs,) forces at the end of the step, N (collective)."""
         x = self._places()
         if self._struck is None:  # r and its scale ask for the same
             self._struck = self._handed_down(x)
         return self._struck
 
-    def scale(self) -> Values:
+    def reference_forces(self) -> Values:
         """(owned dofs,) the same as they enter r, N (collective)."""
-        return np.asarray(self._level.weight * self.struck())
+        return np.asarray(self._level.contact_weight * self.contact_forces())
 
-    def coupling(self) -> PETSc.Mat | Stiff | None:
+    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
         """Minus the derivative of the forces, where anything is in touch; Stiff where it is little (collective)."""
         x = self._places()
 
@@ -215,7 +215,7 @@ class SelfContact(Term):
             H = self._surface.pairs.hessian(x, exact=exact)
             if self._rubbing is not None:
                 H = (H + self._rubbing.hessian(x, exact=exact)).tocsr()
-            return self._surface.stiffness(self._level.blow.factor * H, self._wall * self.law.stiffness)
+            return self._surface.stiffness(self._level.contact_weights.factor * H, self._wall * self.law.stiffness)
 
         K, stiff = on_root(self.comm, found) or (None, None)
         if not self.comm.bcast(K is not None and K.nnz):
@@ -227,7 +227,7 @@ class SelfContact(Term):
         if (stiffness := self.comm.bcast(stiff and stiff[1])) is None:
             return matrix
         directions = self._gather.scatter(stiff and stiff[0])
-        return Stiff(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
+        return StiffCoupling(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def least_gap(self) -> float:
         """Between elements on which the barrier acts at the current u, m; infinite where none do (collective)."""
@@ -239,14 +239,14 @@ class SelfContact(Term):
 
         return from_root(self.comm, found)
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """Energy of the barrier at the current u, on rank 0, J (collective)."""
         x = self._places()
         if self._stored is None:  # asked for in turn by whether it acts, the line search, and the book of energies
             self._stored = 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
         return self._stored
 
-    def stiffen(self) -> float:
+    def stiffen_contact(self) -> float:
         """A barrier that is all but closed where the step ends is stiffer from here on (laws)."""
         x = self._places()
 
@@ -268,42 +268,42 @@ class SelfContact(Term):
         if self._surface is not None:
             self._surface.stiffen(stiffness)
 
-    def drag(self) -> Values | None:
+    def damping_forces(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""
         return -self._handed_down(self._places(), normal=False) if self.law.friction else None
 
     def potential(self) -> float:
         """Barrier and friction at the end of the step as they enter that of r, on rank 0, J (collective)."""
-        x, energy = self._places(), self.stored()
+        x, energy = self._places(), self.stored_energy()
         if self._rubbing is not None and x is not None:
             energy += self._rubbing.energy(x)
-        return self._level.weight * self._level.share * energy
+        return self._level.contact_weight * self._level.fraction * energy
 
     # --- how far Newton's method may go ---
 
-    def longest_step(self, change: Values) -> float:
+    def max_step_fraction(self, change: Values) -> float:
         """Share of a change of u on the way of which nothing meets (collective)."""
-        x, way = self._places(), self._gathered(np.divide(change, self._level.share))
+        x, way = self._places(), self._gathered(np.divide(change, self._level.fraction))
         return from_root(self.comm, lambda: self._free(x, way))
 
     def _free(self, x: Values | None, way: Values | None) -> float:
         assert self._surface is not None and x is not None and way is not None
         return self._surface.pairs.longest_step(x, x + self._surface.at.weights @ way)
 
-    def set_out(self) -> None:
+    def begin_solve(self) -> None:
         """Newton's method sets out on the step: after it has failed it is exact later."""
         self._tangent_at, self._attempts = None, self._attempts + 1
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u as far on the way from the start as nothing meets (collective)."""
         level = self._level
         if not level.dt:
             return u
-        x, way = self._start, self._gathered(self._level.at_end(u) - level.u)
+        x, way = self._start, self._gathered(self._level.displacement_at_end(u) - level.u_n)
         share = from_root(self.comm, lambda: self._free(x, way))
-        return u if share == 1 else np.asarray(level.u + share * (u - level.u))
+        return u if share == 1 else np.asarray(level.u_n + share * (u - level.u_n))
 
-    def forget(self) -> None:
+    def clear_search(self) -> None:
         """Forget which pairs were near (not collective)."""
         self._moved = True
         if self._surface is not None:

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.c_library import Float64, Int32, Uint8, address, at, library
+from ..mesh.c_library import Float64, Int32, Uint8, at, load_library, struct_pointer
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
@@ -95,7 +95,7 @@ class Simplices:
     def __init__(self, nodes: npt.NDArray[np.int32], rest: Values, moved: Values | None = None) -> None:
         """(cells, d + 1) `nodes` at `rest` (nodes, d), m, and by how much these have `moved` from there."""
         self.dim, self._count = rest.shape[1], len(nodes)
-        self._kept = address(nodes), address(rest), None if moved is None else address(moved)
+        self._kept = struct_pointer(nodes), struct_pointer(rest), None if moved is None else struct_pointer(moved)
         self._all = byref(_Given(len(nodes), *self._kept))
 
     @classmethod
@@ -141,9 +141,9 @@ def _rows(values: Values) -> tuple[c_int64, Any]:
 def _damage(of: Damage) -> Any:
     """Damage as C has it: its arrays live as long as they do in Python."""
     arrays: tuple[npt.NDArray[Any], ...] = of.cell_edges, of.integrity, of.pattern, of.damaged, of.split
-    return byref(_Damage(*map(address, arrays)))
+    return byref(_Damage(*map(struct_pointer, arrays)))
 
 
 @cache
 def _code() -> CDLL:
-    return library(SOURCE, as_arrays=True)
+    return load_library(SOURCE, separate_rounding=True)

@@ -24,9 +24,9 @@ class Undamaged:
     def __init__(self, stress: Stress, *, often: bool = False) -> None:
         """`often`: it is asked for in every step (collective)."""
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
-        tensor = symmetric_components(cauchy_stress(energy, F, stress.R))
-        both = ufl.as_vector([*tensor, energy.psi(F, stress.R)])  # one kernel: F is worked out once
-        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, often=often)
+        tensor = symmetric_components(cauchy_stress(energy, F, stress.rotation_field))
+        both = ufl.as_vector([*tensor, energy.psi(F, stress.rotation_field)])  # one kernel: F is worked out once
+        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, every_step=often)
         self.not_finite = 0
 
     def __call__(self) -> tuple[Values, Values]:
@@ -39,7 +39,7 @@ class Undamaged:
 
     def at_points(self, cells: npt.NDArray[np.integer]) -> tuple[Values, Values]:
         """(m, 3 or 6) and (m,) at the points of cells, those of each one after the other."""
-        values = self._evaluate.at_points(cells.astype(np.int32)).reshape(-1, self._evaluate.width)
+        values = self._evaluate.evaluate_at_points(cells.astype(np.int32)).reshape(-1, self._evaluate.width)
         _zero_where_none(values)
         return values[:, :-1], values[:, -1]
 

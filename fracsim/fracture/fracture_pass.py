@@ -118,7 +118,7 @@ class Breaking:
         broken, weakened = self._broken(stress, psi) if self._due else (0, 0)
         if broken and self.degradation.idle:
             broken += self.graph.break_idle()
-        before = [each.x.array.copy() for each in self.stress.fields] if broken else []
+        before = [each.x.array.copy() for each in self.stress.damage_fields] if broken else []
         lost = self.degradation(weakened > 0, stress, psi)
         if weakened or lost.loss or self._restless:
             self.changed()
@@ -160,7 +160,7 @@ class Breaking:
     def memory(self) -> Damage:
         """Copies of the damage of now, on this rank; the same object until something changes."""
         if self._memory is None:
-            fields = [each.x.array.copy() for each in self.stress.fields]
+            fields = [each.x.array.copy() for each in self.stress.damage_fields]
             self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
         return self._memory
 
@@ -170,7 +170,7 @@ class Breaking:
         if memory is self._memory:
             return False
         self.graph.set_integrity(memory.integrity)
-        self.stress.exchange(memory.fields)
+        self.stress.exchange_damage(memory.fields)
         self.criterion.recall(memory.criterion)
         self._memory = memory
         return True

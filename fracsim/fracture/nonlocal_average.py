@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.c_library import Float64, Int32, address, at, library
+from ..mesh.c_library import Float64, Int32, at, load_library, struct_pointer
 from ..mesh.domain import Domain
 from ..mesh.halo import Halo
 from ..mesh.parallel import largest
@@ -102,7 +102,7 @@ class _Given(Structure):
 
 @cache
 def _code() -> CDLL:
-    return library(SOURCE, as_arrays=True)
+    return load_library(SOURCE, separate_rounding=True)
 
 
 class _Rows:
@@ -116,7 +116,7 @@ class _Rows:
         """`weights`: (n, near)."""
         self.cells, self.full = cells, np.asarray(weights.sum(axis=1))[:, 0]
         self._kept = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
-        self._given = _Given(*map(address, self._kept))
+        self._given = _Given(*map(struct_pointer, self._kept))
         self._all = np.arange(len(cells))
 
     def reaching(self, may: Flags, pull: Values, weight: Values, bound: float, values: Values) -> tuple[Ints, Values]:

@@ -15,19 +15,19 @@ from dolfinx import la
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mesh.c_library import FASTER, at, built_together
+from ..mesh.c_library import FAST_FLAGS, at, compile_on_all_ranks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-    from .tie_matrix import Tied
+    from .tie_matrix import TieMatrix
 
 Ints = npt.NDArray[np.int64]
 
 SOURCE = Path(__file__).with_suffix(".c")
 
 
-class Products:
+class BlockMatrix:
     """Those with a square matrix, owned rows of which are complete.
 
     Attributes:
@@ -37,7 +37,7 @@ class Products:
     def __init__(self, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: what `compiled` gives for the size of its blocks."""
         self.matrix, self._code = matrix, code
-        self.beside: list[Tied] = []
+        self.ties: list[TieMatrix] = []
         columns = matrix.index_map(1)
         self._rows = matrix.index_map(0).size_local
         self._everywhere = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
@@ -45,10 +45,10 @@ class Products:
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
         self._multiply_blocks(x, y)
-        if self.beside:
+        if self.ties:
             to, by_nodes = (each.reshape(-1, self.matrix.block_size[0]) for each in (y.array_w, x.array_r))
-            for each in self.beside:
-                to[each.nodes] += each.product(by_nodes[each.nodes])
+            for each in self.ties:
+                to[each.nodes] += each.multiply(by_nodes[each.nodes])
 
     def _multiply_blocks(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         if (everywhere := self._everywhere) is None:
@@ -64,7 +64,7 @@ class Products:
         arrays = matrix.indptr, matrix.indices, matrix.data, x.array_r, y.array_w
         self._code.multiply(c_int64(self._rows), *map(at, arrays))
 
-    def rows(self, nodes: Ints) -> csr_matrix:
+    def owned_rows(self, nodes: Ints) -> csr_matrix:
         """(d n, dofs of all ranks) those of owned nodes (n,), with what is beside them (collective)."""
         from scipy.sparse import csr_matrix
 
@@ -78,8 +78,8 @@ class Products:
         values = K.data.reshape(-1, d, d)[block]
         at = tuple(np.broadcast_to(each, values.shape).reshape(-1) for each in (row, column))
         result = csr_matrix((values.reshape(-1), at), shape=(d * len(nodes), d * columns.size_global))
-        for each in self.beside:
-            result = result + each.rows(nodes, columns)
+        for each in self.ties:
+            result = result + each.owned_rows(nodes, columns)
         return result
 
     def destroy(self) -> None:
@@ -88,6 +88,6 @@ class Products:
             self._everywhere.destroy()
 
 
-def compiled(comm: MPI.Comm, size: int) -> CDLL | None:
+def compile_block_product(comm: MPI.Comm, size: int) -> CDLL | None:
     """What `Products` takes for blocks of size x size numbers; None without a compiler (collective)."""
-    return built_together(comm, "products", SOURCE.read_text(), [*FASTER, f"-DD={size}"])
+    return compile_on_all_ranks(comm, "products", SOURCE.read_text(), [*FAST_FLAGS, f"-DD={size}"])

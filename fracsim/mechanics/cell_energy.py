@@ -18,7 +18,7 @@ from .stress import Stress
 Values = npt.NDArray[np.float64]
 
 
-class OfCells(NamedTuple):
+class CellEnergyDerivatives(NamedTuple):
     """What k cells of c corners say at the current u.
 
     Attributes:
@@ -37,7 +37,7 @@ class CellEnergy:
         """Compiles (collective)."""
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
-        psi = stress.remaining_stiffness_of_energy * stress.energy.psi(F, stress.R)
+        psi = stress.energy_factor * stress.energy.psi(F, stress.rotation_field)
         P = ufl.diff(psi, F)
         A, each = ufl.diff(P, F), [(i, j) for i in range(d) for j in range(d)]
         parts = [psi, *(P[i] for i in each), *(A[i + j] for i in each for j in each)]
@@ -47,12 +47,12 @@ class CellEnergy:
         inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
         self._gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
 
-    def __call__(self, cells: npt.NDArray[np.int32]) -> OfCells:
+    def __call__(self, cells: npt.NDArray[np.int32]) -> CellEnergyDerivatives:
         """Of owned cells at the current u (not collective)."""
         d, g = self._d, self._gradients[cells]
-        values = self._parts.at_points(cells) * self._volumes[cells, None]
+        values = self._parts.evaluate_at_points(cells) * self._volumes[cells, None]
         P, A = values[:, 1 : 1 + d * d].reshape(-1, d, d), values[:, 1 + d * d :].reshape((-1, d, d, d, d))
-        return OfCells(values[:, 0], g @ P.transpose(0, 2, 1), _stiffness(g, A))
+        return CellEnergyDerivatives(values[:, 0], g @ P.transpose(0, 2, 1), _stiffness(g, A))
 
 
 def _stiffness(g: Values, A: Values) -> Values:

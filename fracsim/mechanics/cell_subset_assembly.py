@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.c_library import Float64, Int32, address, at, library
+from ..mesh.c_library import Float64, Int32, at, load_library, struct_pointer
 from ..mesh.dolfinx_compat import constants_in, form_fields, kernel_of, nodes_of_cells
 from .jit import CellForm
 
@@ -40,23 +40,25 @@ class _Form(Structure):
     )
 
 
-class FewCells:
+class CellSubsetAssembler:
     """A form with one integral, over cells."""
 
     def __init__(self, form: CellForm) -> None:
         self._form, self._fields = form, form_fields(form)
         nodes, geometry, size = nodes_of_cells(form), form.mesh.geometry, form.function_spaces[0].dofmap.index_map_bs
-        self._constants = constants_in(form.whole)
-        self._kept = [address(each) for each in (nodes, geometry.dofmap, geometry.x, self._constants)]
+        self._constants = constants_in(form.all_cells_form)
+        self._kept = [struct_pointer(each) for each in (nodes, geometry.dofmap, geometry.x, self._constants)]
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
         sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
         self._given = _Form(kernel_of(form), *sizes, *self._kept)
         self._now = self._given_fields({})
 
-    def add(self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values] | None = None) -> None:
+    def add_cells(
+        self, cells: npt.NDArray[np.int64], values: Values, instead: Mapping[int, Values] | None = None
+    ) -> None:
         """Add the part of cells, rising, to the `values` of dofs, ghosts included; `instead`: numbers of fields in
         place of those that begin at an address."""
-        self._constants[:] = constants_in(self._form.whole)
+        self._constants[:] = constants_in(self._form.all_cells_form)
         fields = self._given_fields(instead) if instead else self._now
         _code().add(byref(self._given), byref(fields), c_int64(len(cells)), at(cells), at(values))
 
@@ -64,11 +66,11 @@ class FewCells:
         """Fields as C has them, with other numbers in place of those that begin at an address."""
         arrays = [instead.get(field.values.ctypes.data, field.values) for field in self._fields]
         return (_Field * (len(arrays) + 1))(
-            *(_Field(field.dofs.shape[1], field.size, address(field.dofs), address(array))
+            *(_Field(field.dofs.shape[1], field.size, struct_pointer(field.dofs), struct_pointer(array))
               for field, array in zip(self._fields, arrays, strict=True))
         )  # fmt: skip
 
 
 @cache
 def _code() -> Any:
-    return library(SOURCE)
+    return load_library(SOURCE)

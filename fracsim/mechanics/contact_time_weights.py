@@ -46,7 +46,7 @@ from ..forms.schemes import Scheme
 
 
 @dataclass(frozen=True)
-class Blow:
+class ContactTimeWeights:
     """Of a scheme.
 
     Attributes:
@@ -55,11 +55,11 @@ class Blow:
     """
 
     factor: float = 1.0
-    end: float = 0.5
-    along: bool = False
+    end_work_share: float = 0.5
+    time_averaged: bool = False
 
     @classmethod
-    def of(cls, scheme: Scheme) -> Blow:
+    def for_scheme(cls, scheme: Scheme) -> ContactTimeWeights:
         """Steps without inertia, and explicit ones, know no blows."""
         if not (scheme.inertia and scheme.implicit):
             return cls()
@@ -67,11 +67,11 @@ class Blow:
         return cls(c_a / c_v, 1.0, scheme.carries_acceleration)
 
 
-NONE = Blow()
+UNWEIGHTED = ContactTimeWeights()
 
 
-def given(scheme: Scheme, dt: float, moved: Any) -> Any:
+def acceleration_change(scheme: Scheme, dt: float, displacement_change: Any) -> Any:
     """The acceleration at the end of a step of dt s that comes with a change `moved` of its unknown: what blows give is
     not carried on."""
-    still = 0.0 * moved
-    return scheme.finish(dt, moved, still, still, still)[2]
+    still = 0.0 * displacement_change
+    return scheme.finish(dt, displacement_change, still, still, still)[2]

@@ -12,11 +12,11 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..forms.balance import viscous_work
-from .inertia import Mass
-from .jit import CellForm, cells_measure
-from .matrix_assembly import Assembler
+from .inertia import MassMatrix
+from .jit import CellForm, cell_measure
+from .matrix_assembly import VectorAssembler
 from .stress import Stress
-from .term import Level, Term
+from .term import Term, TimeLevel
 
 Values = npt.NDArray[np.float64]
 
@@ -27,12 +27,12 @@ class Drag(Term):
     name = "drag"
     linear = True
 
-    def __init__(self, u: fem.Function, mass: Mass, a: float) -> None:
+    def __init__(self, u: fem.Function, mass: MassMatrix, a: float) -> None:
         self.a = a
         self._u, self._mass = u, mass
-        self._level: Level | None = None
+        self._level: TimeLevel | None = None
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Take up the scheme's velocity v = c_v (u - u_v) of the level."""
         self._level = level
 
@@ -51,13 +51,13 @@ class Drag(Term):
     def potential(self) -> float:
         """a c_v (u - u_v) . M (u - u_v) / 2, J."""
         rate = self.acceleration()
-        return float(rate @ self._mass.times(rate)) / (2 * self.mass_factor) if self.mass_factor else 0.0
+        return float(rate @ self._mass.multiply(rate)) / (2 * self.mass_factor) if self.mass_factor else 0.0
 
-    def drag(self) -> Values:
+    def damping_forces(self) -> Values:
         """(owned dofs,) a M v, N."""
         assert self._level is not None
         level, u = self._level, self._u.x.array[: len(self._level.u_v)]
-        return self.a * self._mass.times(level.c_v * (u - level.u_v))
+        return self.a * self._mass.multiply(level.c_v * (u - level.u_v))
 
 
 class Viscosity(Term):
@@ -65,36 +65,36 @@ class Viscosity(Term):
 
     name = "viscosity"
 
-    def __init__(self, assembler: Assembler, u: fem.Function, stress: Stress, b: float) -> None:
+    def __init__(self, assembler: VectorAssembler, u: fem.Function, stress: Stress, b: float) -> None:
         domain = assembler.domain
         self.b = b
         self._assembler, self._u, self._stress, self.linear = assembler, u, stress, stress.linear
         self._u_n, self._u_v = fem.Function(domain.space), fem.Function(domain.space)
         self._c_v = fem.Constant(domain.mesh, np.float64(0.0))
-        self._form = CellForm(self.work(ufl.TestFunction(domain.space), cells_measure(domain)))
+        self._form = CellForm(self.virtual_work(ufl.TestFunction(domain.space), cell_measure(domain)))
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """The start of the step and its velocity: coefficients of the form."""
-        for field, values in ((self._u_n, level.u), (self._u_v, level.u_v)):
+        for field, values in ((self._u_n, level.u_n), (self._u_v, level.u_v)):
             field.x.array[: len(values)] = values
             field.x.scatter_forward()
         self._c_v.value = level.c_v
 
-    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def virtual_work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the viscous stress, N m."""
         stress, rate = self._stress, self._c_v * (self._u - self._u_v)
-        chi = stress.remaining_stiffness
+        chi = stress.degradation_factor
         return viscous_work(stress.material.energy, rate, self._u_n, w, dx, b=self.b, chi=chi)
 
-    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
-        return ufl.derivative(self.work(w, dx), self._u, v)
+        return ufl.derivative(self.virtual_work(w, dx), self._u, v)
 
-    def drag(self) -> Values:
+    def damping_forces(self) -> Values:
         """(owned dofs,) forces of the viscosity, N (collective)."""
         return self._assembler(self._form)
 
     def damage_changed(self) -> None:
         """Cells without stress have no viscosity either."""
-        if (dead := self._stress.stressless) is not None:
-            self._form.leave_out(dead)
+        if (dead := self._stress.dead_cells) is not None:
+            self._form.exclude_cells(dead)

@@ -12,7 +12,7 @@ from ..mesh.domain import Domain
 Ints = npt.NDArray[np.int64]
 
 
-class Coupling:
+class CouplingBuilder:
     """Makes the matrix of a term; the last one is kept, and gone once there is another."""
 
     def __init__(self, domain: Domain) -> None:

@@ -23,17 +23,17 @@ from ufl.core.expr import Expr
 from ..mesh.dolfinx_compat import assemble_matrix
 from ..mesh.domain import Domain
 from .jit import compile_form
-from .matrix_assembly import Assembler
-from .term import Level, Term
+from .matrix_assembly import VectorAssembler
+from .term import Term, TimeLevel
 
 if TYPE_CHECKING:
-    from .matrix_assembly import Assembly
+    from .matrix_assembly import TangentAssembler
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-class InBlocks(NamedTuple):
+class MassBlocks(NamedTuple):
     """What inertia adds to blocks of a tangent, multiples of 1 but for prescribed dofs.
 
     Attributes:
@@ -44,13 +44,13 @@ class InBlocks(NamedTuple):
     values: Values
 
 
-class Mass(Protocol):
+class MassMatrix(Protocol):
     """What the balance needs of a mass matrix; values are those of the owned dofs."""
 
     lumped: Values  # kg, of each dof
-    diagonal: bool  # whether it is the lumped one; the other also couples the nodes of dead cells
+    is_diagonal: bool  # whether it is the lumped one; the other also couples the nodes of dead cells
 
-    def times(self, values: Values) -> Values:
+    def multiply(self, values: Values) -> Values:
         """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
 
     def solve(self, force: Values, free: npt.NDArray[np.bool_]) -> Values:
@@ -60,7 +60,7 @@ class Mass(Protocol):
         """tangent += factor M, leaving rows and columns of prescribed dofs decoupled; `more_entries`: whether the
         tangent may have entries where M has none."""
 
-    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+    def block_values(self, tangent: TangentAssembler, factor: float) -> MassBlocks:
         """factor M, to be added to the blocks of a tangent, which is assembled after this (collective)."""
 
     def destroy(self) -> None:
@@ -73,11 +73,11 @@ class Inertia(Term):
     name = "inertia"
     linear = True
 
-    def __init__(self, u: fem.Function, mass: Mass) -> None:
+    def __init__(self, u: fem.Function, mass: MassMatrix) -> None:
         self._u, self._mass = u, mass
-        self._level: Level | None = None
+        self._level: TimeLevel | None = None
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Take up the scheme's acceleration a = c_a (u - u_a) of the level."""
         self._level = level
 
@@ -96,9 +96,9 @@ class Inertia(Term):
     def potential(self) -> float:
         """c_a (u - u_a) . M (u - u_a) / 2, J."""
         a = self.acceleration()
-        return 0.0 if a is None else float(a @ self._mass.times(a)) / (2 * self.mass_factor)
+        return 0.0 if a is None else float(a @ self._mass.multiply(a)) / (2 * self.mass_factor)
 
-    def scale(self) -> Values | None:
+    def reference_forces(self) -> Values | None:
         """(owned dofs,) M c_a (u - u_a), M lumped, N."""
         assert self._level is not None
         u_a, factor = self._level.u_a, self.mass_factor
@@ -108,14 +108,14 @@ class Inertia(Term):
 class LumpedMass:
     """M as a diagonal: int rho w at the vertices."""
 
-    diagonal = True
+    is_diagonal = True
 
-    def __init__(self, assembler: Assembler, density: Expr) -> None:
+    def __init__(self, assembler: VectorAssembler, density: Expr) -> None:
         """`density`: kg/m^3, a UFL coefficient."""
         self.lumped = lumped_mass(assembler, density)
-        self._diagonal = assembler.vector()
+        self._diagonal = assembler.create_vector()
 
-    def times(self, values: Values) -> Values:
+    def multiply(self, values: Values) -> Values:
         """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
         return self.lumped * values
 
@@ -128,9 +128,9 @@ class LumpedMass:
         self._diagonal.array_w[:] = factor * self.lumped
         tangent.setDiagonal(self._diagonal, PETSc.InsertMode.ADD)
 
-    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+    def block_values(self, tangent: TangentAssembler, factor: float) -> MassBlocks:
         """On the diagonal."""
-        return InBlocks(tangent.on_diagonal, factor * self.lumped.reshape(len(tangent.on_diagonal), -1))
+        return MassBlocks(tangent.diagonal_blocks, factor * self.lumped.reshape(len(tangent.diagonal_blocks), -1))
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back, where there are any."""
@@ -140,9 +140,9 @@ class LumpedMass:
 class ConsistentMass:
     """M = int rho u . w as a matrix."""
 
-    diagonal = False
+    is_diagonal = False
 
-    def __init__(self, assembler: Assembler, density: Expr, bcs: list[fem.DirichletBC]) -> None:
+    def __init__(self, assembler: VectorAssembler, density: Expr, bcs: list[fem.DirichletBC]) -> None:
         """`density`: kg/m^3, a UFL coefficient; `bcs`: on the dofs that the balance prescribes."""
         self.lumped, domain = lumped_mass(assembler, density), assembler.domain
         self._bcs = bcs
@@ -151,9 +151,9 @@ class ConsistentMass:
         self._form = compile_form(density * ufl.inner(u, w) * ufl.dx(domain=domain.mesh))
         self._whole = assemble_matrix(self._form)
         self._free = assemble_matrix(self._form, bcs, diagonal=0.0)
-        self._x, self._y = assembler.vector(), assembler.vector()
+        self._x, self._y = assembler.create_vector(), assembler.create_vector()
 
-    def times(self, values: Values) -> Values:
+    def multiply(self, values: Values) -> Values:
         """(owned dofs,) M a of (owned dofs,) a in m/s^2, N."""
         self._x.array_w[:] = values
         self._whole.mult(self._x, self._y)
@@ -181,11 +181,11 @@ class ConsistentMass:
         same = structure.SUBSET_NONZERO_PATTERN if more_entries else structure.SAME_NONZERO_PATTERN
         tangent.axpy(factor, self._free, same)
 
-    def in_blocks(self, tangent: Assembly, factor: float) -> InBlocks:
+    def block_values(self, tangent: TangentAssembler, factor: float) -> MassBlocks:
         """In all of them, which stay the same: cells that die keep their mass."""
         if self._multiples is None:
-            self._multiples = tangent.diagonals_of(self._form, self._bcs)
-        return InBlocks(slice(None), factor * self._multiples)
+            self._multiples = tangent.assemble_block_diagonals(self._form, self._bcs)
+        return MassBlocks(slice(None), factor * self._multiples)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back, where there are any."""
@@ -193,7 +193,7 @@ class ConsistentMass:
             kept.destroy()
 
 
-def lumped_mass(assembler: Assembler, density: Expr) -> Values:
+def lumped_mass(assembler: VectorAssembler, density: Expr) -> Values:
     """(owned dofs,) share of each node in the mass of its cells, for each component, kg."""
     domain = assembler.domain
     if domain.order == 2:
@@ -204,15 +204,15 @@ def lumped_mass(assembler: Assembler, density: Expr) -> Values:
 
 
 # shares of corners and of middles of edges in the mass of a cell with quadratic displacement, by dimension
-SHARES = {2: (1 / 19, 16 / 57), 3: (1 / 36, 4 / 27)}
+HRZ_FRACTIONS = {2: (1 / 19, 16 / 57), 3: (1 / 36, 4 / 27)}
 
 
-def share_of_corner(domain: Domain) -> float:
+def corner_mass_fraction(domain: Domain) -> float:
     """Of the lumped mass of a cell."""
-    return SHARES[domain.dim][0] if domain.order == 2 else 1 / (domain.dim + 1)
+    return HRZ_FRACTIONS[domain.dim][0] if domain.order == 2 else 1 / (domain.dim + 1)
 
 
-def _shared_by_diagonal(assembler: Assembler, density: Expr) -> Values:
+def _shared_by_diagonal(assembler: VectorAssembler, density: Expr) -> Values:
     """The same with quadratic displacement: in proportion to the diagonal of the consistent mass of a cell (Hinton,
     Rock and Zienkiewicz 1976).
 
@@ -226,10 +226,10 @@ def _shared_by_diagonal(assembler: Assembler, density: Expr) -> Values:
     mass = compile_form(density * ufl.TestFunction(domain.cell_scalar) * ufl.dx(domain=domain.mesh))
     volumes.x.array[:] = 0.0
     fem.assemble_vector(volumes.x.array, mass)
-    of_cells, (corner, middle) = volumes.x.array[: domain.cell_count, None], SHARES[domain.dim]
+    of_cells, (corner, middle) = volumes.x.array[: domain.cell_count, None], HRZ_FRACTIONS[domain.dim]
     result = fem.Function(domain.space)
     nodes = result.x.array.reshape(-1, domain.dim)
     np.add.at(nodes, domain.cell_nodes, (corner * of_cells)[:, :, None])
     np.add.at(nodes, domain.cell_middles, (middle * of_cells)[:, :, None])
     result.x.scatter_reverse(la.InsertMode.add)
-    return np.asarray(result.x.array[: assembler.owned])
+    return np.asarray(result.x.array[: assembler.owned_dof_count])

@@ -29,7 +29,7 @@ from ..mesh.library_cache import library_folder, no_room, not_for_others
 from ..mesh.parallel import raise_together
 
 if TYPE_CHECKING:
-    from .simd_kernels import ExpressionLanes
+    from .simd_kernels import SimdExpression
 
 keep_kernels()
 
@@ -49,7 +49,7 @@ MANY = 10_000  # dofs from which on it pays to compile a form once more, for 1 t
 MANY_CELLS = 5_000  # from which on it does for what is asked in every step: half a second, and a third of the time
 
 
-class OfLarge[Lanes]:
+class SimdKernelCache[Lanes]:
     """What takes several cells of a form at a time (mechanics.simd_kernels), made where it is first asked for."""
 
     def __init__(self, make: Callable[[fem.Form], Lanes | None]) -> None:
@@ -71,7 +71,7 @@ def _is_large(form: fem.Form) -> bool:
 
 def compile_form(form: ufl.Form) -> fem.Form:
     """Compile a UFL form (collective)."""
-    return compile_together(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
+    return compile_collectively(form.ufl_domain().ufl_cargo().comm, lambda: fem.form(form, jit_options=jit_options()))
 
 
 class CellForm(fem.Form):
@@ -104,12 +104,12 @@ class CellForm(fem.Form):
         self._bound = bound
 
     @property
-    def whole(self) -> Any:
+    def all_cells_form(self) -> Any:
         """C++ form over all cells of the measure, as it was compiled: to ask it for anything binds nothing anew."""
         return self._whole
 
     @property
-    def left(self) -> npt.NDArray[np.int64] | None:
+    def remaining_cells(self) -> npt.NDArray[np.int64] | None:
         """The cells that it is integrated over, once any have been left out; None before, and where it has other
         integrals."""
         if self._left is None and self._out is not None and (cells := self._cells) is not None:
@@ -121,7 +121,7 @@ class CellForm(fem.Form):
         """Those of the measure; None of a form with other integrals."""
         return only_cells(self._whole)
 
-    def leave_out(self, dead: npt.NDArray[np.bool_]) -> None:
+    def exclude_cells(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
         self._dead = self._out = dead
         self._left = None
@@ -130,13 +130,13 @@ class CellForm(fem.Form):
         return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])
 
 
-def cells_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:
+def cell_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:
     """Measure of the given owned cells; None: of all of them."""
     every = np.arange(domain.cell_count, dtype=np.int32) if cells is None else cells
     return ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, every)])(1)
 
 
-def compile_together[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
+def compile_collectively[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
     """Compile; where an earlier process was killed while it compiled the same kernel, clear that away and do it again.
 
     FFCx takes what such a process left for a compilation that is still under way. A failure on one rank is raised on
@@ -181,7 +181,7 @@ def _clear_abandoned() -> bool:
     return bool(abandoned)
 
 
-def labelled_anew(expression: Expr) -> Expr:
+def renumber_labels(expression: Expr) -> Expr:
     """An expression whose labels (of ufl.variable) are numbered from 0, in the order in which they are met: they do not
     tell how many there have been before it.
 
@@ -212,7 +212,7 @@ class CellExpression:
 
     def __init__(
         self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int, points: npt.NDArray[np.float64] | None = None,
-        *, often: bool = False,
+        *, every_step: bool = False,
     ) -> None:  # fmt: skip
         """`points`: (count, d) of the reference cell; None: by the fields that the expression is made of. `often`: it
         is asked for in every step, so that compiling it once more may pay (collective)."""
@@ -220,28 +220,30 @@ class CellExpression:
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
         points = _points_of(mesh, expression) if points is None else points
-        self.count = len(points)
-        self._compiled = compile_together(
+        self.points_per_cell = len(points)
+        self._compiled = compile_collectively(
             comm,
-            lambda: fem.Expression(labelled_anew(expression), points, comm=comm, jit_options=jit_options()),
+            lambda: fem.Expression(renumber_labels(expression), points, comm=comm, jit_options=jit_options()),
         )
         self._all = np.arange(cells, dtype=np.int32)
-        pays = often and self.count == 1 and comm.allreduce(cells) >= MANY_CELLS
+        pays = every_step and self.points_per_cell == 1 and comm.allreduce(cells) >= MANY_CELLS
         self._lanes = self._in_lanes() if pays else None
         self._values: npt.NDArray[np.float64] | None = None
 
     def __call__(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
         """(cells, width) values on all owned cells (an array that the next such call overwrites) or on those given."""
-        values = self.at_points(cells)
-        return values if self.count == 1 else values.reshape(-1, self.count, self.width).mean(axis=1)
+        values = self.evaluate_at_points(cells)
+        return (
+            values if self.points_per_cell == 1 else values.reshape(-1, self.points_per_cell, self.width).mean(axis=1)
+        )
 
-    def at_points(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
+    def evaluate_at_points(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
         """(cells, count width) the same at each of the points."""
         if cells is None:
             if self._values is None:
-                self._values = np.empty((len(self._all), self.count * self.width))
+                self._values = np.empty((len(self._all), self.points_per_cell * self.width))
             return self._into(self._values, self._all)
-        return self._into(np.empty((len(cells), self.count * self.width)), cells)
+        return self._into(np.empty((len(cells), self.points_per_cell * self.width)), cells)
 
     def _into(self, values: npt.NDArray[np.float64], cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
         if self._lanes is None:
@@ -249,17 +251,17 @@ class CellExpression:
         self._lanes(cells, values)
         return values
 
-    def _in_lanes(self) -> ExpressionLanes | None:
-        from .simd_kernels import ExpressionLanes
+    def _in_lanes(self) -> SimdExpression | None:
+        from .simd_kernels import SimdExpression
 
         source = source_of(self._compiled, self.mesh, jit_options())
-        return ExpressionLanes.of(self._compiled, self.mesh, source)
+        return SimdExpression.for_expression(self._compiled, self.mesh, source)
 
 
-def point_expression(domain: Domain, expression: Expr, *, often: bool = False) -> CellExpression:
+def point_expression(domain: Domain, expression: Expr, *, every_step: bool = False) -> CellExpression:
     """An expression whose `at_points` are those of a `point_field`."""
     points = stress_points(domain.mesh) if domain.order == 2 else _CENTRE[domain.dim]
-    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points, often=often)
+    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points, every_step=every_step)
 
 
 def _points_of(mesh: Mesh, expression: Expr) -> npt.NDArray[np.float64]:
@@ -276,7 +278,7 @@ def stress_points(mesh: Mesh) -> npt.NDArray[np.float64]:
     return points
 
 
-def quadratic_functions(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def quadratic_shape_functions(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """(count, k) functions of the nodes of a cell with quadratic displacement at these points, and (count, k, d) their
     derivatives by the barycentric coordinates of the corners but the first."""
     element = basix.create_element(basix.ElementFamily.P, mesh.basix_cell(), 2, basix.LagrangeVariant.gll_warped)
@@ -287,7 +289,7 @@ def quadratic_functions(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArra
 STRESS_DEGREE = 2  # of the quadrature of a stress where displacement is quadratic
 
 
-def points_of_cell(domain: Domain) -> int:
+def points_per_cell(domain: Domain) -> int:
     """How many points `point_field` has in a cell."""
     return 1 if domain.order == 1 else domain.dim + 1
 

@@ -16,15 +16,15 @@ from ..mesh.dolfinx_compat import exterior_facets
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import total
 from .jit import compile_form
-from .matrix_assembly import Assembler
-from .term import Level, Term
+from .matrix_assembly import VectorAssembler
+from .term import Term, TimeLevel
 from .time_functions import TimeFunction
 
 Values = npt.NDArray[np.float64]
 OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and what acts on them
 
 
-class _Moving:
+class _TimeDependentConstants:
     """UFL constants that follow functions of time."""
 
     def __init__(self, domain: Domain) -> None:
@@ -58,7 +58,7 @@ class DeadLoads(Term):
 
     def __init__(
         self,
-        assembler: Assembler,
+        assembler: VectorAssembler,
         u: fem.Function,
         *,
         tractions: Sequence[OnFacets] = (),
@@ -67,7 +67,7 @@ class DeadLoads(Term):
     ) -> None:
         """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
         domain, d = assembler.domain, assembler.domain.dim
-        self._assembler, self._u, self._moving = assembler, u, _Moving(domain)
+        self._assembler, self._u, self._moving = assembler, u, _TimeDependentConstants(domain)
         w, dx = ufl.TestFunction(domain.space), ufl.dx(domain=domain.mesh)
         facets, of_volume = [each for each, _ in tractions], []
         if gravity is not None:
@@ -81,28 +81,28 @@ class DeadLoads(Term):
         if of_volume:
             parts.append(ufl.inner(sum(of_volume[1:], of_volume[0]), w) * dx)
         self._form = compile_form(sum(parts[1:], parts[0]))
-        self.force: Values = np.zeros(assembler.owned)
+        self.nodal_forces: Values = np.zeros(assembler.owned_dof_count)
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Take the loads of the time at which forces balance."""
         if self._moving.set_time(level.t):
-            self.force = self._assembler(self._form)
+            self.nodal_forces = self._assembler(self._form)
 
-    def add_force(self, rows: Values) -> None:
+    def add_nodal_forces(self, rows: Values) -> None:
         """r -= f, the nodal forces (owned dofs,) of all loads at the level, N."""
-        rows -= self.force
+        rows -= self.nodal_forces
 
     def potential(self) -> float:
         """-f . u, J."""
-        return -float(self.force @ self._u.x.array[: len(self.force)])
+        return -float(self.nodal_forces @ self._u.x.array[: len(self.nodal_forces)])
 
-    def applied(self) -> Values:
+    def applied_forces(self) -> Values:
         """(owned dofs,) f, N."""
-        return self.force
+        return self.nodal_forces
 
-    def scale(self) -> Values:
+    def reference_forces(self) -> Values:
         """(owned dofs,) f, N: what the residual is the balance of."""
-        return self.force
+        return self.nodal_forces
 
 
 class Pressure(Term):
@@ -110,10 +110,10 @@ class Pressure(Term):
 
     name = "pressure"
 
-    def __init__(self, assembler: Assembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
+    def __init__(self, assembler: VectorAssembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
         domain = assembler.domain
         self._assembler, self._u, self.symmetric, self.linear = assembler, u, linear, linear
-        self._moving = _Moving(domain)
+        self._moving = _TimeDependentConstants(domain)
         works = [
             (self._moving.constant(function, 1), ds)
             for (_, function), ds in zip(parts, surface_measures(domain, [each for each, _ in parts]), strict=True)
@@ -125,24 +125,24 @@ class Pressure(Term):
         linear = self.symmetric
         return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """Take the pressures of the time at which forces balance."""
         self._moving.set_time(level.t)
 
-    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def virtual_work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the pressures, N m; their facets do not depend on the cells of `dx`."""
         return self._work(w)
 
-    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v; 0 where the pressure does not follow the surface."""
         return ufl.derivative(self._work(w), self._u, v)
 
-    def applied(self) -> Values:
+    def applied_forces(self) -> Values:
         """(owned dofs,) force of the pressures on the current shape, N (collective)."""
         return -self._assembler(self._form)
 
 
-def area(domain: Domain, facets: Ints) -> float:
+def surface_area(domain: Domain, facets: Ints) -> float:
     """Of local exterior facets in the body at rest, on all ranks, m^2; in 2D their length, m (collective)."""
     if domain.is_bent:
         (ds,) = surface_measures(domain, [facets])

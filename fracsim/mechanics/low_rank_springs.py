@@ -25,7 +25,7 @@ DOFS, DIRECTIONS = 240, 64
 
 
 @dataclass(frozen=True)
-class Stiff:
+class StiffCoupling:
     """A share C of the tangent, and U diag(k) U^T in it that is stiff.
 
     Attributes:

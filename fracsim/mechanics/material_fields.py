@@ -42,12 +42,12 @@ def material_fields(
     return MaterialFields(psi, density, young, mu, lmbda)
 
 
-def by_region(domain: Domain, base: float, special: Mapping[str, float]) -> PerCell:
+def parameter_by_region(domain: Domain, base: float, region_values: Mapping[str, float]) -> PerCell:
     """A parameter as one number, or as (cells,) where regions, by name, have another value."""
-    if not special:
+    if not region_values:
         return base
     values = np.full(domain.cell_count, base)
-    for name, value in special.items():
+    for name, value in region_values.items():
         values[domain.region == domain.region_names.index(name)] = value
     return values
 

@@ -26,21 +26,21 @@ from petsc4py import PETSc
 from ..mesh.dolfinx_compat import assemble_into, block_csr, create_matrix, create_vector, expanded_csr, pattern_of
 from ..mesh.domain import Domain
 from ..mesh.parallel import total
-from .jit import CellForm, OfLarge
+from .jit import CellForm, SimdKernelCache
 
 if TYPE_CHECKING:
     from ctypes import CDLL
 
-    from .bcsr_matvec import Products
-    from .cell_subset_assembly import FewCells
-    from .inertia import InBlocks
-    from .simd_kernels import MatrixLanes, VectorLanes
+    from .bcsr_matvec import BlockMatrix
+    from .cell_subset_assembly import CellSubsetAssembler
+    from .inertia import MassBlocks
+    from .simd_kernels import SimdBilinearForm, SimdLinearForm
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
 
-class Assembly:
+class TangentAssembler:
     """A bilinear form and the matrix that it is assembled into.
 
     Attributes:
@@ -54,33 +54,33 @@ class Assembly:
 
     def __init__(self, form: CellForm) -> None:
         self.form = form
-        self.blocks: Products | None = None
-        self.is_behind = False
+        self.blocks: BlockMatrix | None = None
+        self.entries_outdated = False
         self._dead: Flags | None = None
         self._make()
 
-    def use_blocks(self, *, dead_too: bool = False) -> Products | None:
+    def switch_to_blocks(self, *, with_dead_cells: bool = False) -> BlockMatrix | None:
         """Assemble into blocks from here on; products with them, None where there is no compiler. `dead_too`: with room
         for cells that the form has left out (collective)."""
         if self.blocks is None:
-            from .bcsr_matvec import compiled
+            from .bcsr_matvec import compile_block_product
 
             size = self.matrix.getBlockSize()
-            if (code := compiled(self.form.mesh.comm, size)) is None:
+            if (code := compile_block_product(self.form.mesh.comm, size)) is None:
                 return None
             self.matrix.destroy()
-            self._make(code, dead_too)
+            self._make(code, with_dead_cells)
         return self.blocks
 
     def _make(self, by_blocks: CDLL | None = None, dead_too: bool = False) -> None:
         """Matrices with the pattern of the cells that the form is integrated over (`dead_too`: and of those left out),
         and a full diagonal; `by_blocks`: what makes products with blocks."""
-        pattern = pattern_of(self.form.whole if dead_too else self.form._cpp_object)
+        pattern = pattern_of(self.form.all_cells_form if dead_too else self.form._cpp_object)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._lanes = OfLarge(self._in_lanes)
+        self._lanes = SimdKernelCache(self._in_lanes)
         self._sum = expanded_csr(pattern) if by_blocks is None else block_csr(pattern)
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
@@ -90,13 +90,13 @@ class Assembly:
         self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
         self._by_blocks = by_blocks
         if by_blocks is not None:
-            from .bcsr_matvec import Products
+            from .bcsr_matvec import BlockMatrix
 
-            self.blocks = Products(self._sum, by_blocks)
+            self.blocks = BlockMatrix(self._sum, by_blocks)
             rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-            self.on_diagonal = np.flatnonzero(self._sum.indices[self._own] == rows)
+            self.diagonal_blocks = np.flatnonzero(self._sum.indices[self._own] == rows)
 
-    def fit(self, dead: Flags, share: float) -> bool:
+    def shrink(self, dead: Flags, share: float) -> bool:
         """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
         room for are alive, and make room for cells that are back; whether the matrix is a new one (collective).
 
@@ -111,11 +111,13 @@ class Assembly:
         self._make(self._by_blocks)
         return True
 
-    def __call__(self, bcs: list[fem.DirichletBC], more: fem.Form | None = None, mass: InBlocks | None = None) -> None:
+    def __call__(
+        self, bcs: list[fem.DirichletBC], extra_form: fem.Form | None = None, mass: MassBlocks | None = None
+    ) -> None:
         """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's.
         `mass` is added to blocks, which `bring` makes the matrix of (collective)."""
         self._sum.data[:] = 0.0
-        for form in (self.form, more) if more is not None else (self.form,):
+        for form in (self.form, extra_form) if extra_form is not None else (self.form,):
             self._add(form, bcs)
         self._sum.scatter_reverse()
         if self.blocks is None:
@@ -124,9 +126,9 @@ class Assembly:
             return
         if mass is not None:
             self._diagonals[mass.blocks] += mass.values
-        self.is_behind = True
+        self.entries_outdated = True
 
-    def diagonals_of(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
+    def assemble_block_diagonals(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
         """(blocks of owned rows, d) what a form of the same pattern adds to the diagonal of each; nothing in rows and
         columns of prescribed dofs. It is summed in the tangent's place, which has to be assembled after it
         (collective)."""
@@ -146,22 +148,22 @@ class Assembly:
         if (lanes := self._lanes(form)) is None:
             fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         else:
-            lanes.add(self._sum, bcs)
+            lanes.add_to(self._sum, bcs)
 
-    def _in_lanes(self, form: fem.Form) -> MatrixLanes | None:
-        from .simd_kernels import MatrixLanes
+    def _in_lanes(self, form: fem.Form) -> SimdBilinearForm | None:
+        from .simd_kernels import SimdBilinearForm
 
-        return MatrixLanes.of(form, self._sum)
+        return SimdBilinearForm.for_form(form, self._sum)
 
-    def bring(self) -> bool:
+    def update_entries(self) -> bool:
         """Bring the matrix to where the blocks are, if there are any that it is behind of; whether there were
         (collective)."""
-        if was_behind := self.is_behind:
+        if was_behind := self.entries_outdated:
             d = self.matrix.getBlockSize()
             values = self._sum.data[: d * d * self._own.stop]
             self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
             self.matrix.assemble()
-            self.is_behind = False
+            self.entries_outdated = False
         return was_behind
 
     def destroy(self) -> None:
@@ -169,10 +171,10 @@ class Assembly:
         self.matrix.destroy()
         if self.blocks is not None:
             self.blocks.destroy()
-            self.blocks, self.is_behind = None, False
+            self.blocks, self.entries_outdated = None, False
 
 
-class Assembler:
+class VectorAssembler:
     """Assembles linear forms over a domain's displacement space, with one vector that is kept.
 
     Attributes:
@@ -181,31 +183,31 @@ class Assembler:
 
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
-        self.owned = domain.node_count * domain.dim
-        self._kept = self.vector()
-        self._lanes = OfLarge(_in_lanes)
-        self._few: dict[CellForm, FewCells] = {}
+        self.owned_dof_count = domain.node_count * domain.dim
+        self._kept = self.create_vector()
+        self._lanes = SimdKernelCache(_in_lanes)
+        self._few: dict[CellForm, CellSubsetAssembler] = {}
 
-    def vector(self) -> PETSc.Vec:
+    def create_vector(self) -> PETSc.Vec:
         """A new vector over the dofs, ghosts included."""
         return create_vector(self.domain.space)
 
     def __call__(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled form (collective)."""
-        return self.into(self._kept, form).array_r.copy()
+        return self.assemble_into(self._kept, form).array_r.copy()
 
-    def added(self, add: Callable[[Values], None]) -> Values:
+    def sum_contributions(self, add: Callable[[Values], None]) -> Values:
         """(owned dofs,) sums of what `add` adds to the dofs of each rank, ghosts included (collective)."""
         with self._kept.localForm() as local:
             local.set(0.0)
             add(local.array_w)
-        return self.summed(self._kept).array_r.copy()
+        return self.sum_over_ranks(self._kept).array_r.copy()
 
-    def into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+    def assemble_into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
         """Assemble into b, which loses what it held (collective)."""
-        return self.summed(self.into_unsummed(b, form))
+        return self.sum_over_ranks(self.assemble_local_part(b, form))
 
-    def into_unsummed(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+    def assemble_local_part(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
         """This rank's part alone into b; returns b (collective the first time)."""
         with b.localForm() as local:
             local.set(0.0)
@@ -217,18 +219,18 @@ class Assembler:
     def _added_to(self, values: Values, form: fem.Form) -> bool:
         """Add this rank's part to the values of dofs, ghosts included, where DOLFINx need not do it."""
         if (lanes := self._lanes(form)) is not None:
-            lanes.add(values)
-        elif isinstance(form, CellForm) and (left := form.left) is not None:
+            lanes.add_to(values)
+        elif isinstance(form, CellForm) and (left := form.remaining_cells) is not None:
             if form not in self._few:
-                from .cell_subset_assembly import FewCells
+                from .cell_subset_assembly import CellSubsetAssembler
 
-                self._few[form] = FewCells(form)
-            self._few[form].add(left, values)
+                self._few[form] = CellSubsetAssembler(form)
+            self._few[form].add_cells(left, values)
         else:
             return False
         return True
 
-    def summed(self, b: PETSc.Vec) -> PETSc.Vec:
+    def sum_over_ranks(self, b: PETSc.Vec) -> PETSc.Vec:
         """b with the parts that other ranks have assembled for its owned dofs (collective)."""
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return b
@@ -238,7 +240,7 @@ class Assembler:
         self._kept.destroy()
 
 
-def _in_lanes(form: fem.Form) -> VectorLanes | None:
-    from .simd_kernels import VectorLanes
+def _in_lanes(form: fem.Form) -> SimdLinearForm | None:
+    from .simd_kernels import SimdLinearForm
 
-    return VectorLanes.of(form)
+    return SimdLinearForm.for_form(form)

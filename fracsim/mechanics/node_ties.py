@@ -30,21 +30,23 @@ from ..mesh.node_cells import CellsAround
 from ..mesh.parallel import allgather, total
 from ..mesh.simplices import is_split, local_edges
 from ..meshes.components import components
-from .extra_couplings import Coupling
+from .extra_couplings import CouplingBuilder
 from .term import Term
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
     from scipy.sparse import csr_matrix
 
-    from .tie_matrix import Tied
+    from .tie_matrix import TieMatrix
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Pattern = npt.NDArray[np.uint8]
-HOLD = 0.1  # of what a cell of the mean size has: far above the weight of a node, no burden for explicit steps
-FAR = 30.0  # sum |lambda| of a cell that is too flat to say where a node is
+TIE_STIFFNESS_FACTOR = (
+    0.1  # of what a cell of the mean size has: far above the weight of a node, no burden for explicit steps
+)
+MAX_WEIGHT_SUM = 30.0  # sum |lambda| of a cell that is too flat to say where a node is
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,15 @@ class Ties:
     weights: Values
 
     @classmethod
-    def none(cls, dim: int) -> Ties:
+    def empty(cls, dim: int) -> Ties:
         """No node is tied."""
         return cls(np.empty((0, dim + 2), np.int64), np.empty(0, np.int64), np.empty((0, dim + 2)))
 
-    def some(self, which: npt.NDArray[np.bool_]) -> Ties:
+    def select(self, which: npt.NDArray[np.bool_]) -> Ties:
         """Those flagged (n,)."""
         return Ties(self.nodes[which], self.cell[which], self.weights[which])
 
-    def with_(self, other: Ties) -> Ties:
+    def merge(self, other: Ties) -> Ties:
         """Both, by their nodes."""
         every = (np.concatenate([getattr(each, name) for each in (self, other)]) for name in Ties.__annotations__)
         both = Ties(*every)
@@ -77,7 +79,7 @@ class Ties:
         return Ties(both.nodes[order], both.cell[order], both.weights[order])
 
 
-class Tethers(Term):
+class NodeTies(Term):
     """Nodes without a whole cell, tied to where they hang."""
 
     name = "tethers"
@@ -87,20 +89,20 @@ class Tethers(Term):
         """`young`: Pa; `mass`: (owned dofs,) lumped, kg; `held`: (nodes,) whose motion is prescribed, ghosts too: they
         are not tied."""
         self._domain, self._u, self._mass, self._held = domain, u, mass, held
-        self.stiffness = HOLD * young * domain.mean_edge ** (domain.dim - 2)
+        self.stiffness = TIE_STIFFNESS_FACTOR * young * domain.mean_edge ** (domain.dim - 2)
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
-        self._coupling, self._around = Coupling(domain), CellsAround(domain)
+        self._coupling, self._around = CouplingBuilder(domain), CellsAround(domain)
         self._lost = 0.0
         input_of = domain.node_input[: domain.node_count]
         self._order = np.argsort(input_of)
         self._sorted = input_of[self._order]
-        self._be(Ties.none(domain.dim))
+        self._be(Ties.empty(domain.dim))
 
     def _be(self, ties: Ties) -> None:
         """Tie these, and no others (not collective)."""
         self.ties = ties
         self._matrix: PETSc.Mat | None = None
-        self._beside: Tied | None = None
+        self._beside: TieMatrix | None = None
         self._fastest: float | None = None
         self._numbers, place = np.unique(ties.nodes, return_inverse=True)
         self._place: Ints = place.reshape(ties.nodes.shape)
@@ -124,9 +126,9 @@ class Tethers(Term):
         links, nodes = (np.unique(np.concatenate(allgather(domain.comm, each)), axis=0) for each in (links, own))
         stays = np.isin(self.ties.nodes[:, 0], nodes) & self._is_whole(self.ties.cell)
         self._lost += self._stored(~stays)
-        kept = self.ties.some(stays)
+        kept = self.ties.select(stays)
         new = nodes[~np.isin(nodes, kept.nodes[:, 0])]
-        self._be(kept.with_(self._tied(new, *self._hanging(links, nodes), without)))
+        self._be(kept.merge(self._tied(new, *self._hanging(links, nodes), without)))
 
     def _links(self, pattern: Pattern, without: Flags) -> tuple[Ints, Ints]:
         """(n, 2) input nodes of the intact edges of this rank that have an end `without` (nodes,) a whole cell, and
@@ -161,7 +163,7 @@ class Tethers(Term):
         order = np.lexsort((cell[column], size, row))
         _, first = np.unique(row[order], return_index=True)
         best = order[first]
-        best = best[size[best] < FAR]
+        best = best[size[best] < MAX_WEIGHT_SUM]
         nodes = np.concatenate([new[row[best], None], corners[column[best]]], axis=1)
         return Ties(nodes, cell[column[best]], np.concatenate([np.ones((len(best), 1)), -weights[best]], axis=1))
 
@@ -188,7 +190,7 @@ class Tethers(Term):
         x = self._sum(self._numbers, self._here, self._local)
         return np.asarray(np.einsum("nk,nkd->nd", self.ties.weights, x[self._place]))
 
-    def add_force(self, rows: Values) -> None:
+    def add_nodal_forces(self, rows: Values) -> None:
         """r += k d on the node, - lambda k d on the corners."""
         if not len(self.ties.cell):
             return
@@ -205,18 +207,18 @@ class Tethers(Term):
         W = csr_matrix((self.ties.weights.reshape(-1), (rows, self._place.reshape(-1))), shape=shape)
         return csr_matrix(self.stiffness * (W.T @ W))
 
-    def tied(self, free: Flags) -> Tied | None:
+    def tie_matrix(self, free: Flags) -> TieMatrix | None:
         """k w w^T, made once for the ties of now."""
         if not len(self.ties.cell):
             return None
         if self._beside is None:
-            from .tie_matrix import Tied
+            from .tie_matrix import TieMatrix
 
             may_move = free.reshape(-1, self._domain.dim)[self._local].astype(float)
-            self._beside = Tied(self._domain.comm, self._nodal(), self._here, self._local, may_move)
+            self._beside = TieMatrix(self._domain.comm, self._nodal(), self._here, self._local, may_move)
         return self._beside
 
-    def coupling(self) -> PETSc.Mat | None:
+    def coupling_matrix(self) -> PETSc.Mat | None:
         """k w w^T, made once for the ties of now (collective)."""
         if not len(self.ties.cell):
             return None
@@ -242,7 +244,7 @@ class Tethers(Term):
         energy = self.stiffness / 2 * float(squares.sum() if which is None else squares[which].sum())
         return energy if self._domain.comm.rank == 0 else 0.0
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """k |d|^2 / 2 at the current u, on rank 0, J (collective)."""
         return self._stored()
 
@@ -250,12 +252,12 @@ class Tethers(Term):
         """The same (collective)."""
         return self._stored()
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """No work, and what ties that came off had stored."""
         lost, self._lost = self._lost, 0.0
         return 0.0, lost
 
-    def frequency(self) -> float:
+    def frequency_bound(self) -> float:
         """Gershgorin's bound of M^-1 K: max over nodes of k / m times the sum over its ties of |w| sum |w|, 1/s^2
         (collective)."""
         if self._fastest is None:
@@ -269,11 +271,11 @@ class Tethers(Term):
 
     # --- what it remembers ---
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """The ties, and the patterns of broken edges that they belong to."""
         return self.ties, self._pattern
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Those of then, if edges are broken as then: a step that is solved once more may have more of them."""
         ties, pattern = cast("tuple[Ties, Pattern]", memory)
         same = ties is self.ties or np.array_equal(pattern, self._pattern)
@@ -282,12 +284,12 @@ class Tethers(Term):
             if ties is not self.ties:
                 self._be(ties)
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """The ties by numbers of the input mesh."""
         ties = self.ties
         return {"nodes": ties.nodes.astype(float), "cell": ties.cell.astype(float), "weights": ties.weights}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
         shape = (-1, self._domain.dim + 2)
         nodes, weights = saved["nodes"].reshape(shape).astype(np.int64), saved["weights"].reshape(shape)

@@ -28,9 +28,9 @@ from dolfinx import fem
 
 from ..forms.plasticity import ImplicitFlow, Plastic
 from ..mesh.domain import Domain
-from .jit import point_field, points_of_cell
+from .jit import point_field, points_per_cell
 from .material_fields import MaterialFields, PerCell
-from .tensor_functions import times
+from .tensor_functions import multiply_unimodular
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
@@ -47,14 +47,14 @@ class FlowPrediction(Protocol):
     def form(self) -> ImplicitFlow | None:
         """Virtual work and tangent; None where the energy of F_e says it all."""
 
-    def begin(self, dt: float, fraction: float) -> None:
+    def begin_step(self, dt: float, fraction: float) -> None:
         """A step of dt is to be solved whose flow makes `fraction` of the return; zeros: it is done."""
 
-    def flowed(self, points: Points, power: Values, dt: float) -> None:
+    def record_flow(self, points: Points, power: Values, dt: float) -> None:
         """`points` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
 
 
-class Implicit:
+class ImplicitPlasticFlow:
     """beta follows from the unknown displacement."""
 
     def __init__(self, domain: Domain, energy: Plastic, frobenius: bool) -> None:
@@ -62,20 +62,20 @@ class Implicit:
         self._share = fem.Constant(domain.mesh, np.float64(0.0))
         self.form = ImplicitFlow(energy, self._resistance, self._softness, self._share, frobenius)
 
-    def begin(self, dt: float, fraction: float) -> None:
+    def begin_step(self, dt: float, fraction: float) -> None:
         """The share of the return is all that changes with the step."""
         self._share.value = fraction
 
-    def refresh(self, resistance: Values, softness: Values) -> None:
+    def update_flow_stress(self, resistance: Values, softness: Values) -> None:
         """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the points as they are now."""
         self._resistance.x.array[: len(resistance)] = resistance
         self._softness.x.array[: len(softness)] = softness
 
-    def flowed(self, points: Points, power: Values, dt: float) -> None:
+    def record_flow(self, points: Points, power: Values, dt: float) -> None:
         """Nothing to remember."""
 
 
-class Extrapolated:
+class ExtrapolatedPlasticFlow:
     """F_p^-1 (I + dt D) stands in for F_p^-1 while a step is solved, D = (exp(-beta e) - I) / dt of the last step.
 
     The tangent is that of an elastic body. Steps of another size go on at the same rate.
@@ -90,7 +90,7 @@ class Extrapolated:
         self._rate: Values = np.empty((6, 0))
         self._held: Values | None = None  # (9, n) F_p^-1 of the points, while another stands in for it
 
-    def begin(self, dt: float, fraction: float) -> None:
+    def begin_step(self, dt: float, fraction: float) -> None:
         """Put the stand-in in its place, or F_p^-1 itself back."""
         if self._held is not None and not dt:
             self._inverse[self._points], self._held = self._held.T, None
@@ -99,21 +99,21 @@ class Extrapolated:
         if self._held is None:
             self._held = np.ascontiguousarray(self._inverse[self._points].T)
         longest = MOST / np.maximum(np.sqrt(WEIGHTS @ self._rate**2), MOST / dt)
-        self._inverse[self._points] = times(self._held, UNIT + longest * self._rate).T
+        self._inverse[self._points] = multiply_unimodular(self._held, UNIT + longest * self._rate).T
 
-    def flowed(self, points: Points, power: Values, dt: float) -> None:
+    def record_flow(self, points: Points, power: Values, dt: float) -> None:
         """Remember D of the step, by which the next one is predicted to flow."""
         self._points, self._rate = points, (power - UNIT) / dt
 
     @property
-    def memory(self) -> Values:
+    def rates(self) -> Values:
         """(points, 6) D, 1/s."""
         rows = np.zeros((len(self._inverse), 6))
         rows[self._points] = self._rate.T
         return rows
 
-    @memory.setter
-    def memory(self, rows: Values) -> None:
+    @rates.setter
+    def rates(self, rows: Values) -> None:
         self._points = np.flatnonzero(rows.any(axis=1)).astype(np.int32)
         self._rate = np.ascontiguousarray(rows[self._points].T)
 
@@ -136,7 +136,7 @@ class YieldLaw:
     update: Literal["extrapolated", "implicit", "staggered"] = "extrapolated"
 
 
-class Plasticity:
+class PlasticHistory:
     """What the cells remember of their flow.
 
     Attributes:
@@ -152,75 +152,79 @@ class Plasticity:
         """`implicit`: whether u is what a step is solved for; explicit schemes know it beforehand."""
         self.rate, self.hardening, self.frobenius = law.flow_rate, law.hardening, law.frobenius
         self.dt, self.fraction = 0.0, 0.0
-        self.points = points_of_cell(domain)
+        self.points_per_cell = points_per_cell(domain)
         self._yield, self._modulus = self._of_points(law.yield_stress), self._of_points(3 * material.mu)
-        self.volumes = np.repeat(domain.volumes / self.points, self.points) if self.points > 1 else domain.volumes
-        self.strain = np.zeros(self.points * domain.cell_count)
+        self.volumes = (
+            np.repeat(domain.volumes / self.points_per_cell, self.points_per_cell)
+            if self.points_per_cell > 1
+            else domain.volumes
+        )
+        self.accumulated_strain = np.zeros(self.points_per_cell * domain.cell_count)
         self.inverse = point_field(domain, (3, 3), "inverse plastic part")
-        self.rows: Values = self.inverse.x.array.reshape(-1, 9)[: len(self.strain)]
+        self.inverse_rows: Values = self.inverse.x.array.reshape(-1, 9)[: len(self.accumulated_strain)]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
         # where u is known before the stress is asked for nothing need be extrapolated
         known = law.update == "extrapolated" and not implicit
         self.prediction = self._prediction(domain, "implicit" if known else law.update)
-        self.refresh()
+        self.update_flow_stress()
         self._memory: Values | None = None
 
     def _of_points(self, value: PerCell) -> PerCell:
-        return np.repeat(value, self.points) if isinstance(value, np.ndarray) else value
+        return np.repeat(value, self.points_per_cell) if isinstance(value, np.ndarray) else value
 
-    def of_cells(self, values: Values) -> Values:
+    def cell_means(self, values: Values) -> Values:
         """(cells,) means of (points,) values."""
-        return values if self.points == 1 else values.reshape(-1, self.points).mean(axis=1)
+        return values if self.points_per_cell == 1 else values.reshape(-1, self.points_per_cell).mean(axis=1)
 
     def _prediction(self, domain: Domain, update: str) -> FlowPrediction | None:
         if update == "implicit":
-            return Implicit(domain, self.energy, self.frobenius)
-        return Extrapolated(self.rows) if update == "extrapolated" else None
+            return ImplicitPlasticFlow(domain, self.energy, self.frobenius)
+        return ExtrapolatedPlasticFlow(self.inverse_rows) if update == "extrapolated" else None
 
-    def resistance(self, strain: Values, points: Points | slice = slice(None)) -> Values:
+    def flow_stress(self, strain: Values, points: Points | slice = slice(None)) -> Values:
         """Y = yield_stress + K alpha of points with the given alpha, Pa; never below a small share of yield_stress."""
         start = self._yield[points] if isinstance(self._yield, np.ndarray) else self._yield
         return np.maximum(start + self.hardening * strain, WEAKEST * start)
 
-    def refresh(self) -> None:
+    def update_flow_stress(self) -> None:
         """What flow within a step has to know of `strain`."""
-        if not isinstance(self.prediction, Implicit):
+        if not isinstance(self.prediction, ImplicitPlasticFlow):
             return
-        Y = self.resistance(self.strain)
+        Y = self.flow_stress(self.accumulated_strain)
         soft = (self.hardening < 0) & (WEAKEST * self._yield >= Y)  # as soft as it gets
-        self.prediction.refresh(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
+        self.prediction.update_flow_stress(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
 
-    def changed(self) -> None:
+    def discard_snapshot(self) -> None:
         """Cells flowed: what `memory` gave is of the past."""
         self._memory = None
 
-    def memory(self) -> Values:
+    def snapshot(self) -> Values:
         """(points, 10) F_p^-1 and alpha; with six of the last flow between them where it matters."""
         if self._memory is None:
-            self.begin(0.0)  # a step that failed may have left another in its place
-            last = [self.prediction.memory] if isinstance(self.prediction, Extrapolated) else []
-            self._memory = np.column_stack([self.rows, *last, self.strain])
+            self.begin_step(0.0)  # a step that failed may have left another in its place
+            last = [self.prediction.rates] if isinstance(self.prediction, ExtrapolatedPlasticFlow) else []
+            self._memory = np.column_stack([self.inverse_rows, *last, self.accumulated_strain])
         return self._memory
 
-    def recall(self, memory: Values) -> bool:
+    def restore(self, memory: Values) -> bool:
         """Be as `memory` says, whichever the update was; whether that is anything else than now."""
-        self.begin(0.0)
+        self.begin_step(0.0)
         if memory is self._memory:
             return False
-        self.rows[:] = memory[:, :9]
-        self.strain[:] = memory[:, -1]
-        if isinstance(self.prediction, Extrapolated) and memory.shape[1] > 10:
-            self.prediction.memory = memory[:, 9:-1]
-        self.refresh()
+        self.inverse_rows[:] = memory[:, :9]
+        self.accumulated_strain[:] = memory[:, -1]
+        if isinstance(self.prediction, ExtrapolatedPlasticFlow) and memory.shape[1] > 10:
+            self.prediction.rates = memory[:, 9:-1]
+        self.update_flow_stress()
         self._memory = memory
         return True
 
-    def begin(self, dt: float) -> None:
+    def begin_step(self, dt: float) -> None:
         """A step of dt is to be solved; with 0: it is done."""
         self.dt, self.fraction = dt, -math.expm1(-self.rate * dt) if dt else 0.0
         if self.prediction is not None:
-            self.prediction.begin(dt, self.fraction)
+            self.prediction.begin_step(dt, self.fraction)
 
 
 def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
@@ -235,5 +239,5 @@ def plastic_material(
 ) -> MaterialFields:
     """The material with an energy of the elastic part of F, and with what its cells remember; `implicit`: of the
     scheme."""
-    plastic = Plasticity(domain, law, material, implicit=implicit)
+    plastic = PlasticHistory(domain, law, material, implicit=implicit)
     return replace(material, energy=plastic.energy, plastic=plastic)

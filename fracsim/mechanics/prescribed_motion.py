@@ -46,9 +46,9 @@ class PrescribedMotion:
         self.dofs: Ints = np.flatnonzero(flat >= 0).astype(np.int32)
         self._row = flat[self.dofs]
         owned = domain.node_count * size
-        self.owned: Ints = self.dofs[: int(np.searchsorted(self.dofs, owned))]
-        self.free: Flags = np.ones(owned, bool)
-        self.free[self.owned] = False
+        self.owned_dofs: Ints = self.dofs[: int(np.searchsorted(self.dofs, owned))]
+        self.free_dofs: Flags = np.ones(owned, bool)
+        self.free_dofs[self.owned_dofs] = False
         self._values = fem.Function(domain.space)
         self.bcs = [self._condition()] if domain.comm.allreduce(len(self.dofs)) else []
 
@@ -57,18 +57,18 @@ class PrescribedMotion:
         pair: list[Ints] = [self.dofs, self.dofs]
         return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type]
 
-    def at(self, t: float) -> Values:
+    def displacements_at(self, t: float) -> Values:
         """(dofs,) displacement of each of `dofs` at time t (s), m."""
         if not self._functions:
             return np.empty(0)
         return np.concatenate([function(t) for function in self._functions])[self._row]
 
-    def set(self, values: Values) -> None:
+    def set_values(self, values: Values) -> None:
         """Prescribe (dofs,) displacements, m: what `bcs` and `values` have from here on."""
         self._values.x.array[self.dofs] = values
 
     @property
-    def held(self) -> Flags:
+    def prescribed_nodes(self) -> Flags:
         """(nodes,) which have a component whose motion is prescribed, ghosts included."""
         held = np.zeros(len(self._domain.nodes), bool)
         held[self.dofs // self._domain.dim] = True
@@ -77,21 +77,21 @@ class PrescribedMotion:
     @property
     def values(self) -> Values:
         """(owned,) what each of `owned` shall be at, m."""
-        result: Values = self._values.x.array[self.owned]
+        result: Values = self._values.x.array[self.owned_dofs]
         return result
 
-    def largest_gap(self, u: Values) -> float:
+    def max_deviation(self, u: Values) -> float:
         """Farthest that one of `owned` in u (owned dofs,) is from its value, in mean edge lengths (collective)."""
         if not self.bcs:
             return 0.0
-        gap = np.max(np.abs(u[self.owned] - self.values), initial=0.0)
+        gap = np.max(np.abs(u[self.owned_dofs] - self.values), initial=0.0)
         return float(self._domain.comm.allreduce(gap, op=MPI.MAX)) / self._domain.mean_edge
 
 
 def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
     """InputError where a body of the mesh keeps a rigid motion that no prescribed component stops (collective)."""
     held = np.zeros(domain.node_count * domain.dim, bool)
-    held[motion.owned] = True
+    held[motion.owned_dofs] = True
     flags = domain.gather_nodes(held.reshape(-1, domain.dim))
     on_root(domain.comm, lambda: _check(domain.source, flags))
 

@@ -22,8 +22,8 @@ import ufl
 
 from ..forms.balance import points_of_stress
 from ..forms.kinematics import deformation_gradient
-from ..mesh.c_library import FASTER, at, built
-from .jit import CellForm, cells_measure, point_expression, point_field
+from ..mesh.c_library import FAST_FLAGS, at, compile_library
+from .jit import CellForm, cell_measure, point_expression, point_field
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ LANES = 4
 BLOCK = 1024  # cells at a time: their moduli stay in the cache
 
 
-class Positive:
+class PsdProjection:
     """C of a `Stress`.
 
     Attributes:
@@ -44,29 +44,29 @@ class Positive:
         """Compiles (collective)."""
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
-        P = stress.remaining_stiffness_of_energy * ufl.diff(stress.energy.psi(F, stress.R), F)
-        self._moduli = point_expression(domain, ufl.diff(P, F), often=True)
+        P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
+        self._moduli = point_expression(domain, ufl.diff(P, F), every_step=True)
         self._field = point_field(domain, (d * d, d * d), "what makes moduli positive")
         self._size, self._cells = d * d, domain.cell_count
         self._filled = np.zeros(len(self._field.x.array) // d**4, np.uint8)
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         each = [(i, j) for i in range(d) for j in range(d)]
         row, column = (ufl.as_vector([ufl.grad(field)[i, j] for i, j in each]) for field in (w, v))
-        form = ufl.dot(row, self._field * column) * cells_measure(domain)(metadata=points_of_stress(w))
+        form = ufl.dot(row, self._field * column) * cell_measure(domain)(metadata=points_of_stress(w))
         self.form = CellForm(form)
 
     def update(self, small: float) -> None:
         """Bring C to the current u; moduli stay as they are without an eigenvalue below - `small` of their mean:
         whatever is pressed has such (not collective)."""
-        points, n = self._moduli.count, self._size
+        points, n = self._moduli.points_per_cell, self._size
         C = self._field.x.array.reshape(-1, n, n)
         for first in range(0, self._cells, BLOCK):
             cells = np.arange(first, min(first + BLOCK, self._cells), dtype=np.int32)
             of = slice(points * first, points * (first + len(cells)))
-            made_positive(self._moduli.at_points(cells).reshape(-1, n, n), small, C[of], self._filled[of])
+            psd_correction(self._moduli.evaluate_at_points(cells).reshape(-1, n, n), small, C[of], self._filled[of])
 
 
-def made_positive(A: Values, small: float, C: Values, filled: npt.NDArray[np.uint8]) -> None:
+def psd_correction(A: Values, small: float, C: Values, filled: npt.NDArray[np.uint8]) -> None:
     """Make C what makes symmetric matrices A (k, n, n) positive, where one has an eigenvalue below - small of their
     mean, and zero where none has; `filled`: (k,) which of C are not zero. (A tenth to a third of the time of LAPACK, a
     matrix a call.)
@@ -76,4 +76,4 @@ def made_positive(A: Values, small: float, C: Values, filled: npt.NDArray[np.uin
 
 @cache
 def _code(size: int) -> CDLL:
-    return built("positive", SOURCE.read_text(), [*FASTER, f"-DN={size}", f"-DLANES={LANES}"])
+    return compile_library("positive", SOURCE.read_text(), [*FAST_FLAGS, f"-DN={size}", f"-DLANES={LANES}"])

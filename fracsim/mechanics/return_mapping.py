@@ -26,9 +26,9 @@ import numpy.typing as npt
 
 from ..forms.plasticity import Trial
 from .jit import point_expression
-from .plasticity import Plasticity
+from .plasticity import PlasticHistory
 from .stress import Stress
-from .tensor_functions import deviatoric_power, eigenvalues, times
+from .tensor_functions import deviatoric_power, eigenvalues, multiply_unimodular
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
@@ -51,22 +51,22 @@ class ReturnMapping:
     def __init__(self, stress: Stress) -> None:
         plastic, domain = stress.material.plastic, stress.domain
         assert plastic is not None
-        self.plastic: Plasticity = plastic
+        self.plastic: PlasticHistory = plastic
         self._stress, self._flowed = stress, True
-        trial = Trial(plastic.energy, stress.u, stress.R)
+        trial = Trial(plastic.energy, stress.u, stress.rotation_field)
         asked = trial.state(), trial.measures()
-        self._state, self._measures = (point_expression(domain, each, often=True) for each in asked)
+        self._state, self._measures = (point_expression(domain, each, every_step=True) for each in asked)
 
     def begin(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""
-        self.plastic.begin(dt)
+        self.plastic.begin_step(dt)
 
     def __call__(self) -> float:
         """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
         plastic, dt = self.plastic, self.plastic.dt
         self._put_back()
-        state = self._state.at_points().reshape(-1, self._state.width)
-        measure, Y = self.measured(state), plastic.resistance(plastic.strain)
+        state = self._state.evaluate_at_points().reshape(-1, self._state.width)
+        measure, Y = self.measured(state), plastic.flow_stress(plastic.accumulated_strain)
         points = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
         power, lost, psi = np.empty((6, len(points))), 0.0, state[:, 2]
         if plastic.fraction > 0:
@@ -78,39 +78,39 @@ class ReturnMapping:
                 psi[where] = block.after[:, 2]
         self.stored = float(plastic.volumes @ psi)
         if plastic.prediction is not None and dt:
-            plastic.prediction.flowed(points, power, dt)
-        plastic.begin(0.0)
+            plastic.prediction.record_flow(points, power, dt)
+        plastic.begin_step(0.0)
         if len(points) and plastic.hardening:
-            plastic.refresh()
+            plastic.update_flow_stress()
         if len(points) or self._flowed:
-            plastic.changed()
+            plastic.discard_snapshot()
         self._flowed = len(points) > 0
         return lost
 
     def memory(self) -> Values:
         """(points, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
-        return self.plastic.memory()
+        return self.plastic.snapshot()
 
     def recall(self, memory: object) -> bool:
         """The cells remember no more than that."""
         assert isinstance(memory, np.ndarray)
-        return self.plastic.recall(memory)
+        return self.plastic.restore(memory)
 
     def _put_back(self) -> None:
         """F_p of the step's start, in place of what it was solved with."""
         if self.plastic.prediction is None:
             return
-        self.plastic.prediction.begin(0.0, 0.0)
+        self.plastic.prediction.begin_step(0.0, 0.0)
         if self.plastic.prediction.form is None:
-            self._stress.displaced()  # its rotation was that of another F_e
+            self._stress.update_displacement()  # its rotation was that of another F_e
 
     def measures(self, points: Points) -> Values:
         """(n, 3) measures of some points at their present F_p."""
-        count = self.plastic.points
+        count = self.plastic.points_per_cell
         if count == 1:
             return self._measures(points)
         cells, place = np.unique(points // count, return_inverse=True)
-        return self._measures.at_points(cells.astype(np.int32)).reshape(-1, count, 3)[place, points % count]
+        return self._measures.evaluate_at_points(cells.astype(np.int32)).reshape(-1, count, 3)[place, points % count]
 
     def measured(self, stress: Values) -> Values:
         """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
@@ -121,12 +121,14 @@ class ReturnMapping:
         """Energy that a block of points lost, J; takes up their plastic strain."""
         plastic, points = self.plastic, block.points
         flowed = block.beta * block.size
-        plastic.strain[points] = block.alpha + flowed
-        gain = plastic.resistance(plastic.strain[points], points) - plastic.resistance(block.alpha, points)
+        plastic.accumulated_strain[points] = block.alpha + flowed
+        gain = plastic.flow_stress(plastic.accumulated_strain[points], points) - plastic.flow_stress(
+            block.alpha, points
+        )
         # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
-        chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points]
+        chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points_per_cell]
         return float(np.sum(chi * plastic.volumes[points] * (psi_trial - psi - over / 2 * flowed)))
 
 
@@ -141,13 +143,16 @@ class _Return:
     def __init__(self, flow: ReturnMapping, points: Points, state: Values, measure: Values) -> None:
         self._flow, self.points, self._measure = flow, points, measure
         plastic = flow.plastic
-        self.alpha, self._start = plastic.strain[points], np.ascontiguousarray(plastic.rows[points].T)
+        self.alpha, self._start = (
+            plastic.accumulated_strain[points],
+            np.ascontiguousarray(plastic.inverse_rows[points].T),
+        )
         self.trial, self._C = state[:, :3], np.ascontiguousarray(state[:, 3:].T)
         self._values = eigenvalues(self._C)
         logs = np.log(self._values)
         self._logs = logs - logs.mean(axis=0)
         self.size = np.sqrt(np.sum(self._logs**2, axis=0) / 6)  # e is half the deviator of log C
-        self._excess = measure - plastic.resistance(self.alpha, points)
+        self._excess = measure - plastic.flow_stress(self.alpha, points)
         self.after, self._power = self.trial.copy(), np.empty_like(self._C)
 
     @cached_property
@@ -185,7 +190,7 @@ class _Return:
         plastic, points = self._flow.plastic, self.points[live]
         self._return(live)
         self.after[live] = stress = self._flow.measures(points)
-        Y = plastic.resistance(self.alpha[live] + self.beta[live] * self.size[live], points)
+        Y = plastic.flow_stress(self.alpha[live] + self.beta[live] * self.size[live], points)
         return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
 
     def _settle(self, points: Chosen, before: Values) -> None:
@@ -201,7 +206,7 @@ class _Return:
         """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
         C, values, logs = (each[:, points] for each in (self._C, self._values, self._logs))
         power = deviatoric_power(C, values, logs, -self.beta[points] / 2)
-        self._flow.plastic.rows[self.points[points]] = times(self._start[:, points], power).T
+        self._flow.plastic.inverse_rows[self.points[points]] = multiply_unimodular(self._start[:, points], power).T
         self._power[:, points] = power
 
 

@@ -24,5 +24,5 @@ class RotationField:
 
     def update(self) -> None:
         """Bring R (d x d) to the current displacement; ghosts need none, for cells are not ghosted."""
-        F = self._gradient.at_points().reshape(-1, self._d, self._d)
+        F = self._gradient.evaluate_at_points().reshape(-1, self._d, self._d)
         self.field.x.array[:] = polar_rotation(F).reshape(-1)

@@ -22,7 +22,7 @@ from dolfinx import fem, la
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
-from ..mesh.c_library import Float64, Int32, address, at, built_together
+from ..mesh.c_library import Float64, Int32, at, compile_on_all_ranks, struct_pointer
 from ..mesh.dolfinx_compat import (
     FormField,
     cells_of,
@@ -74,19 +74,19 @@ class _Fields:
     """
 
     def __init__(self, fields: Sequence[FormField]) -> None:
-        self._kept = [(address(field.dofs), address(field.values)) for field in fields]
+        self._kept = [(struct_pointer(field.dofs), struct_pointer(field.values)) for field in fields]
         self._here = (_Field * (len(fields) + 1))(*(_Field(*each) for each in self._kept))
         self.width = sum(field.dofs.shape[1] * field.size for field in fields)
         self.place = cast(self._here, c_void_p)
 
 
-class Lanes:
+class SimdKernel:
     """A form of cells, whose kernel takes several at a time."""
 
     @classmethod
-    def of(cls, form: fem.Form, *more: Any) -> Self | None:
+    def for_form(cls, form: fem.Form, *more: Any) -> Self | None:
         """Those of a form, where that can be done; `more`: what the class takes beside it (collective)."""
-        code = compiled(form)
+        code = compile_simd_form(form)
         return None if code is None else cls(form, code, *more)
 
     def __init__(self, form: fem.Form, code: CDLL) -> None:
@@ -99,29 +99,29 @@ class Lanes:
         """What a function of C returns."""
         cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
-        form = _Form(len(cells), self._fields.width, len(c), *map(address, arrays), self._fields.place)
+        form = _Form(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.place)
         return int(function(byref(form), *map(at, given)) or 0)
 
 
-class ScalarLanes(Lanes):
+class SimdFunctional(SimdKernel):
     """A functional of cells."""
 
-    def sum(self) -> float:
+    def integrate(self) -> float:
         """Of this rank's cells."""
         values = np.empty(len(cells_of(self._form)))
         self._call(self._code.fill, values)
         return float(values.sum())
 
 
-class VectorLanes(Lanes):
+class SimdLinearForm(SimdKernel):
     """A linear form of cells."""
 
-    def add(self, values: Values) -> None:
+    def add_to(self, values: Values) -> None:
         """Add this rank's part to the values of dofs, ghosts included."""
         self._call(self._code.add, values)
 
 
-class MatrixLanes(Lanes):
+class SimdBilinearForm(SimdKernel):
     """A bilinear form of cells, and where what it adds is in a matrix of blocks, or of single entries."""
 
     def __init__(self, form: fem.Form, code: CDLL, matrix: la.MatrixCSR) -> None:
@@ -138,7 +138,7 @@ class MatrixLanes(Lanes):
             c_int64(len(self._nodes)), at(self._nodes), c_int64(apart), at(starts), at(matrix.indices), at(self._places)
         )
 
-    def add(self, matrix: la.MatrixCSR, bcs: list[fem.DirichletBC]) -> None:
+    def add_to(self, matrix: la.MatrixCSR, bcs: list[fem.DirichletBC]) -> None:
         """Add this rank's part as DOLFINx does: rows and columns of prescribed dofs become the identity's."""
         self._held[:] = 0
         for bc in bcs:
@@ -149,13 +149,13 @@ class MatrixLanes(Lanes):
         identity_rows(matrix, self._form, bcs)
 
 
-class ExpressionLanes:
+class SimdExpression:
     """An expression, at a point of each cell."""
 
     @classmethod
-    def of(cls, expression: fem.Expression, mesh: Mesh, source: Path) -> Self | None:
+    def for_expression(cls, expression: fem.Expression, mesh: Mesh, source: Path) -> Self | None:
         """That of FFCx's kernel in `source`, where it can be done (collective)."""
-        kernel = in_lanes(source.read_text())
+        kernel = vectorise_kernel(source.read_text())
         if kernel is None:
             return None
         sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
@@ -170,9 +170,16 @@ class ExpressionLanes:
     def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
         """Fill values (cells, components) with those of cells."""
         c = constants_of(self._expression)
-        of_mesh = address(self._geometry.dofmap), address(self._geometry.x)
+        of_mesh = struct_pointer(self._geometry.dofmap), struct_pointer(self._geometry.x)
         form = _Form(
-            len(cells), self._fields.width, len(c), address(cells), None, *of_mesh, address(c), self._fields.place
+            len(cells),
+            self._fields.width,
+            len(c),
+            struct_pointer(cells),
+            None,
+            *of_mesh,
+            struct_pointer(c),
+            self._fields.place,
         )
         self._code.fill(byref(form), at(values))
 
@@ -180,7 +187,7 @@ class ExpressionLanes:
 # --- compiling ------------------------------------------------------------------------------------------------------
 
 
-def compiled(form: fem.Form) -> CDLL | None:
+def compile_simd_form(form: fem.Form) -> CDLL | None:
     """What `Lanes` takes of a form; None where there is no such thing (collective)."""
     if integrals(form) != [fem.IntegralType.cell]:
         return None
@@ -193,7 +200,7 @@ def compiled(form: fem.Form) -> CDLL | None:
         return None
     sizes = {"RANK": form.rank, "D": bs, "NODES": nodes, "CORNERS": corners}
     source = Path(str(form.module.__file__))  # type: ignore[union-attr]
-    kernel = in_lanes(source.with_name(source.name.split(".")[0] + ".c").read_text())
+    kernel = vectorise_kernel(source.with_name(source.name.split(".")[0] + ".c").read_text())
     if kernel is None:
         return None
     return _built(form.mesh.comm, kernel, sizes, fields)
@@ -207,10 +214,10 @@ def _built(
     functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
     text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
     defined = [f"-D{name}={value}" for name, value in sizes.items()] + [f"-DFIELDS={''.join(takes)}"]
-    return built_together(comm, "lanes", text, [*_FLAGS, *more, *defined])
+    return compile_on_all_ranks(comm, "lanes", text, [*_FLAGS, *more, *defined])
 
 
-def in_lanes(source: str) -> str | None:
+def vectorise_kernel(source: str) -> str | None:
     """The body of the only kernel in FFCx's C, for numbers with lanes; None where it does what those cannot."""
     _, *kernels = source.split("\nvoid tabulate_tensor_")
     end = re.search(r"\n(ufcx_integral|bool enabled_|static double points_)", kernels[0]) if len(kernels) == 1 else None

@@ -24,16 +24,16 @@ from ..forms.balance import elastic_energy, internal_work
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.simplices import local_edges
-from .cell_subset_assembly import FewCells
-from .jit import CellForm, OfLarge, cells_measure, compile_form
+from .cell_subset_assembly import CellSubsetAssembler
+from .jit import CellForm, SimdKernelCache, cell_measure, compile_form
 from .material_fields import MaterialFields
-from .matrix_assembly import Assembler
+from .matrix_assembly import VectorAssembler
 from .rotation import RotationField
-from .term import Form, Level, Term
+from .term import Form, Term, TimeLevel
 
 if TYPE_CHECKING:
     from ..forms.plasticity import ImplicitFlow
-    from .simd_kernels import ScalarLanes
+    from .simd_kernels import SimdFunctional
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -44,7 +44,7 @@ RESIDUAL_STIFFNESS = 1e-8
 
 
 @dataclass(frozen=True)
-class Weakening:
+class DegradationModel:
     """How broken edges weaken the energy of their cells (docs/theory.md#degraded-energy).
 
     Attributes:
@@ -53,7 +53,7 @@ class Weakening:
     """
 
     approach: str = "chi"
-    closes: bool = False
+    cracks_close: bool = False
 
 
 class Stress(Term):
@@ -72,10 +72,10 @@ class Stress(Term):
 
     def __init__(
         self,
-        assembler: Assembler,
+        assembler: VectorAssembler,
         u: fem.Function,
         material: MaterialFields,
-        weakening: Weakening | None = None,
+        degradation: DegradationModel | None = None,
         *,
         floor: float = 0.0,
     ) -> None:
@@ -84,24 +84,24 @@ class Stress(Term):
         self._assembler, self.u, self.material, self._floor = assembler, u, material, floor
         self.chi: fem.Function | None = None
         self.integrity: fem.Function | None = None
-        self.closes = weakening is not None and weakening.closes
-        self.energy: Energy = material.energy if weakening is None else self._weakened(weakening)
+        self.cracks_close = degradation is not None and degradation.cracks_close
+        self.energy: Energy = material.energy if degradation is None else self._weakened(degradation)
         self.rotation = RotationField(domain, self._elastic_part()) if material.energy.needs_rotation else None
         self.symmetric = material.plastic is None or not material.plastic.frobenius
-        self.linear = self.energy.linear and not self.closes and material.plastic is None
-        whole = cells_measure(domain)
+        self.linear = self.energy.linear and not self.cracks_close and material.plastic is None
+        whole = cell_measure(domain)
         self._energy_form = compile_form(self._stored_energy(whole))
-        self._sums = OfLarge(_sums_in_lanes)
-        self._alone = CellForm(self.work(ufl.TestFunction(domain.space), whole))
+        self._sums = SimdKernelCache(_sums_in_lanes)
+        self._alone = CellForm(self.virtual_work(ufl.TestFunction(domain.space), whole))
 
     # --- the energy and its fields ---
 
-    def _weakened(self, weakening: Weakening) -> Energy:
+    def _weakened(self, weakening: DegradationModel) -> Energy:
         """The energy with the fields of damage that the approach needs."""
         whole: Energy = self.material.energy
         if weakening.approach == "chi":
             self.chi = self._whole_cells("chi", 1)
-            if not weakening.closes:
+            if not weakening.cracks_close:
                 return self.material.energy
         edges: list[list[int]] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
         self.integrity = self._whole_cells("integrity", len(edges))
@@ -109,7 +109,7 @@ class Stress(Term):
             from ..forms.damage import EdgeProjected, Strained
 
             whole = EdgeProjected(cast(Strained, whole), self.integrity, edges, self._floor)
-        if not weakening.closes:
+        if not weakening.cracks_close:
             return whole
         from ..forms.crack_closure import Closing, bends_of
 
@@ -132,14 +132,14 @@ class Stress(Term):
         return field
 
     @property
-    def fields(self) -> list[fem.Function]:
+    def damage_fields(self) -> list[fem.Function]:
         """chi and integrity, as far as there are any."""
         return [field for field in (self.chi, self.integrity) if field is not None]
 
-    def exchange(self, values: Sequence[Values]) -> list[Values]:
+    def exchange_damage(self, values: Sequence[Values]) -> list[Values]:
         """Put other values into `fields`; returns copies of those that were there."""
-        found = [field.x.array.copy() for field in self.fields]
-        for field, value in zip(self.fields, values, strict=True):
+        found = [field.x.array.copy() for field in self.damage_fields]
+        for field, value in zip(self.damage_fields, values, strict=True):
             field.x.array[:] = value
         return found
 
@@ -152,26 +152,26 @@ class Stress(Term):
         return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
 
     @property
-    def multiplier(self) -> fem.Function | None:
+    def energy_multiplier(self) -> fem.Function | None:
         """chi where it multiplies `energy`; None where it is part of it, or does not exist."""
         return self.chi if self.energy is self.material.energy else None
 
     @property
-    def stressless(self) -> Flags | None:
+    def dead_cells(self) -> Flags | None:
         """(owned cells,) flags of those without any stress, for ever; None where a broken cell keeps some of it."""
-        if self.multiplier is None or self._floor:
+        if self.energy_multiplier is None or self._floor:
             return None
-        return np.asarray(self.multiplier.x.array[: self.domain.cell_count] == 0)
+        return np.asarray(self.energy_multiplier.x.array[: self.domain.cell_count] == 0)
 
     @property
-    def remaining_stiffness(self) -> Expr | float:
+    def degradation_factor(self) -> Expr | float:
         """chi, 1 where there is none; in a quasi-static study with a floor, so that the tangent stays regular."""
         return self._floored(self.chi)
 
     @property
-    def remaining_stiffness_of_energy(self) -> Expr | float:
+    def energy_factor(self) -> Expr | float:
         """What multiplies `energy`: 1 where chi is part of it."""
-        return self._floored(self.multiplier)
+        return self._floored(self.energy_multiplier)
 
     def _floored(self, chi: Expr | None) -> Expr | float:
         if chi is None:
@@ -179,22 +179,22 @@ class Stress(Term):
         return self._floor + (1 - self._floor) * chi if self._floor else chi
 
     @property
-    def R(self) -> fem.Function | None:
+    def rotation_field(self) -> fem.Function | None:
         """The field of `rotation`."""
         return self.rotation.field if self.rotation is not None else None
 
     # --- as a term of the balance ---
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """What flow takes off the stress of a step that is to be solved."""
         plastic = self.material.plastic
         if plastic is None or not level.dt:
             return
-        plastic.begin(level.share * level.dt)
+        plastic.begin_step(level.fraction * level.dt)
         if plastic.prediction is not None and plastic.prediction.form is None:
-            self.displaced()  # the rotation is that of F_e, in which another F_p stands now
+            self.update_displacement()  # the rotation is that of F_e, in which another F_p stands now
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """u has moved."""
         if self.rotation is not None:
             self.rotation.update()
@@ -206,84 +206,88 @@ class Stress(Term):
         return plastic.prediction.form if plastic is not None and plastic.prediction is not None else None
 
     def _stored_energy(self, dx: ufl.Measure) -> ufl.Form:
-        return elastic_energy(self.energy, self.u, dx, chi=self.remaining_stiffness_of_energy, rotation=self.R)
+        return elastic_energy(self.energy, self.u, dx, chi=self.energy_factor, rotation=self.rotation_field)
 
-    def work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def virtual_work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, as flow within the step leaves it."""
         flow = self._flow_form
         if flow is None:
-            return self._work_of(self.energy, self.remaining_stiffness_of_energy, w, dx)
-        return flow.work(self.u, w, dx, chi=self.remaining_stiffness, rotation=self.R) + self._springs(w, dx)
+            return self._work_of(self.energy, self.energy_factor, w, dx)
+        return flow.work(self.u, w, dx, chi=self.degradation_factor, rotation=self.rotation_field) + self._springs(
+            w, dx
+        )
 
-    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
+    def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
         flow = self._flow_form
         if flow is None:
-            return ufl.derivative(self.work(w, dx), self.u, v)
-        tangent = flow.tangent(self.u, v, w, dx, chi=self.remaining_stiffness, rotation=self.R)
+            return ufl.derivative(self.virtual_work(w, dx), self.u, v)
+        tangent = flow.tangent(self.u, v, w, dx, chi=self.degradation_factor, rotation=self.rotation_field)
         springs = self._springs(w, dx)
         return tangent + (ufl.derivative(springs, self.u, v) if springs else 0)
 
     def _springs(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work of closing cracks in a body that flows."""
-        if not self.closes:
+        if not self.cracks_close:
             return 0
         alone: Energy = replace(self.energy, chi=0)  # type: ignore[type-var]
         return self._work_of(alone, 1.0, w, dx)
 
     def _work_of(self, energy: Energy, chi: Expr | float, w: Expr, dx: ufl.Measure) -> ufl.Form:
-        if self.closes and self.domain.order == 2:  # what presses on an edge is no stress of the points where psi is
-            return ufl.derivative(elastic_energy(energy, self.u, dx, chi=chi, rotation=self.R), self.u, w)
-        return internal_work(energy, self.u, w, dx, chi=chi, rotation=self.R)
+        if (
+            self.cracks_close and self.domain.order == 2
+        ):  # what presses on an edge is no stress of the points where psi is
+            return ufl.derivative(elastic_energy(energy, self.u, dx, chi=chi, rotation=self.rotation_field), self.u, w)
+        return internal_work(energy, self.u, w, dx, chi=chi, rotation=self.rotation_field)
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """int psi dX at the current u, this rank's share, J (collective the first time)."""
         lanes = self._sums(self._energy_form)
-        return float(fem.assemble_scalar(self._energy_form)) if lanes is None else lanes.sum()
+        return float(fem.assemble_scalar(self._energy_form)) if lanes is None else lanes.integrate()
 
     def potential(self) -> float | None:
         """int psi dX at the current u, J; None where the tangent is not symmetric, or steps are solved with their own
         flow."""
-        return self.stored() if self.symmetric and self._flow_form is None else None
+        return self.stored_energy() if self.symmetric and self._flow_form is None else None
 
-    def force(self) -> Values:
+    def assemble_forces(self) -> Values:
         """(owned dofs,) forces of the stress alone at the current u, N."""
         return self._assembler(self._alone)
 
-    def force_lost(self, before: Sequence[Values]) -> Values:
+    def assemble_released_forces(self, before: Sequence[Values]) -> Values:
         """(owned dofs,) forces at the current u, N, that went with what `fields` lost since they were `before`: over
         the cells alone that lost any (collective)."""
         lower = np.zeros(self.domain.cell_count, bool)
-        for field, was in zip(self.fields, before, strict=True):
+        for field, was in zip(self.damage_fields, before, strict=True):
             for differs in (field.x.array != was).reshape(-1, field.function_space.dofmap.bs).T:  # rows are short
                 lower |= differs[: len(lower)]
         cells = np.flatnonzero(lower)
-        then = {field.x.array.ctypes.data: was for field, was in zip(self.fields, before, strict=True)}
+        then = {field.x.array.ctypes.data: was for field, was in zip(self.damage_fields, before, strict=True)}
 
         def add(sums: Values) -> None:
-            self._few.add(cells, sums)
+            self._few.add_cells(cells, sums)
             np.negative(sums, out=sums)
-            self._few.add(cells, sums, then)
+            self._few.add_cells(cells, sums, then)
 
-        return self._assembler.added(add)
+        return self._assembler.sum_contributions(add)
 
     @cached_property
-    def _few(self) -> FewCells:
-        return FewCells(self._alone)
+    def _few(self) -> CellSubsetAssembler:
+        return CellSubsetAssembler(self._alone)
 
     def damage_changed(self) -> None:
         """Cells without stress are not integrated from here on: they would add zeros for ever."""
-        if (dead := self.stressless) is not None:
-            self._alone.leave_out(dead)
+        if (dead := self.dead_cells) is not None:
+            self._alone.exclude_cells(dead)
 
-    def corners(self, cells: npt.NDArray[np.integer]) -> Values:
+    def cell_corners(self, cells: npt.NDArray[np.integer]) -> Values:
         """(n, d + 1, d) corners of cells in the configuration that the energy's stress belongs to, m."""
         nodes, d = self.domain.cell_nodes[cells], self.domain.dim
         corners = self.domain.nodes.take(nodes, axis=0)  # a third of the time of an index
         return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d).take(nodes, axis=0)
 
 
-def _sums_in_lanes(form: fem.Form) -> ScalarLanes | None:
-    from .simd_kernels import ScalarLanes
+def _sums_in_lanes(form: fem.Form) -> SimdFunctional | None:
+    from .simd_kernels import SimdFunctional
 
-    return ScalarLanes.of(form)
+    return SimdFunctional.for_form(form)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SurfaceData:
     """Where it is at a time: points (n, d), m; triangles (k, 3); in 2D segments (m, 2) around them."""
 
     points: npt.NDArray[np.float64]

@@ -64,7 +64,7 @@ def _slope(gap: Values, log_ratio: Values, end: Values, rate: Values) -> Values:
     return np.divide(end * np.expm1(log_ratio), gap, out=end * rate, where=gap > 0)
 
 
-def times(A: Values, S: Values) -> Values:
+def multiply_unimodular(A: Values, S: Values) -> Values:
     """(9, n) products A S of (9, n) row-wise and symmetric (6, n) tensors, scaled to determinant 1 where it is known to
     a digit."""
     x, y, z, xy, xz, yz = S

@@ -19,13 +19,13 @@ import ufl
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from .contact_time_weights import NONE, Blow
-from .low_rank_springs import Stiff
-from .surface_data import Drawn
+from .contact_time_weights import UNWEIGHTED, ContactTimeWeights
+from .low_rank_springs import StiffCoupling
+from .surface_data import SurfaceData
 
 if TYPE_CHECKING:
     from ..mesh.split_surface.surface_map import Places
-    from .tie_matrix import Tied
+    from .tie_matrix import TieMatrix
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -36,7 +36,7 @@ type Cuts = Callable[[], tuple[npt.NDArray[np.int64], Values] | None]  # (collec
 
 
 @dataclass(frozen=True)
-class Level:
+class TimeLevel:
     """Where in time forces balance, and the affine rates of the scheme there (forms.schemes).
 
     Attributes:
@@ -48,23 +48,23 @@ class Level:
 
     t: float
     dt: float
-    u: Values
-    v: Values
+    u_n: Values
+    v_n: Values
     c_a: float
     c_v: float
     u_a: Values
     u_v: Values
-    share: float = 1.0
-    blow: Blow = NONE
+    fraction: float = 1.0
+    contact_weights: ContactTimeWeights = UNWEIGHTED
 
     @property
-    def weight(self) -> float:
+    def contact_weight(self) -> float:
         """Of forces of contact at the end of the step in r."""
-        return self.blow.factor * self.share
+        return self.contact_weights.factor * self.fraction
 
-    def at_end(self, u: Values) -> Values:
+    def displacement_at_end(self, u: Values) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to u at the level, m."""
-        return u if self.share == 1 else np.asarray(self.u + (u - self.u) / self.share)
+        return u if self.fraction == 1 else np.asarray(self.u_n + (u - self.u_n) / self.fraction)
 
 
 class Term:
@@ -76,20 +76,22 @@ class Term:
     name: ClassVar[str] = ""
     symmetric: bool = True  # whether its share of the tangent is
     linear: bool = False  # whether that share depends on damage and on the rates of the scheme alone, not on u and t
-    keeps_apart: ClassVar[bool] = False  # whether it has a say in where the points of the split surface are: `apart`
-    visible: ClassVar[bool] = False  # whether it is `drawn`
+    separates_surface: ClassVar[bool] = (
+        False  # whether it has a say in where the points of the split surface are: `apart`
+    )
+    has_output_surfaces: ClassVar[bool] = False  # whether it is `drawn`
 
-    def begin(self, level: Level) -> None:
+    def begin_step(self, level: TimeLevel) -> None:
         """A step (or a look at a state) begins. Collective."""
 
-    def displaced(self) -> None:
+    def update_displacement(self) -> None:
         """u has moved. Collective."""
 
-    def work(self, w: Expr, dx: ufl.Measure) -> Form:
+    def virtual_work(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work in N m over the cells of `dx`, a form linear in the test function w. Asked once, at set-up."""
         return 0
 
-    def tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> Form:
+    def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> Form:
         """Derivative of `work` in the direction v, as far as Newton's method shall know it."""
         return 0
 
@@ -102,10 +104,10 @@ class Term:
         """Derivative of `acceleration` with respect to u, 1/s^2: a factor of M in the tangent."""
         return 0.0
 
-    def add_force(self, rows: Values) -> None:
+    def add_nodal_forces(self, forces: Values) -> None:
         """Add nodal forces at the current u to r, (owned dofs,) in N."""
 
-    def struck(self) -> Values | None:
+    def contact_forces(self) -> Values | None:
         """(owned dofs,) forces of contact at the end of the step that belongs to the current u, N (collective).
 
         r has them with the weight of a blow, and the acceleration that a scheme carries on is without them
@@ -116,7 +118,7 @@ class Term:
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the derivative of `add_force` to the assembled tangent, within the pattern of its cells."""
 
-    def coupling(self) -> PETSc.Mat | Stiff | None:
+    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
         """The rest of that derivative, a matrix of any pattern over the dofs; None: there is none (collective).
 
         The tangent takes its entries; the preconditioner is made anew where they are at other places than before. What
@@ -124,67 +126,69 @@ class Term:
         """
         return None
 
-    def tied(self, free: Flags) -> Tied | None:
+    def tie_matrix(self, free: Flags) -> TieMatrix | None:
         """The same as `coupling` for tangents in blocks, which stay without its entries; None: there is none. `free`:
         (owned dofs,) that nothing prescribes. Terms that have no such way keep the tangent in single entries."""
         return None
 
-    beside: ClassVar[bool] = False  # whether the tangent may lack a share of its own: `low_rank`, or a Stiff
+    leaves_tangent_incomplete: ClassVar[bool] = (
+        False  # whether the tangent may lack a share of its own: `low_rank`, or a Stiff
+    )
 
-    def low_rank(self) -> list[tuple[Values, Values]]:
+    def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """What the tangent loses with unknowns that the term has eliminated: U C U^T of U (owned dofs, k) and C (k, k),
         summed over ranks (collective)."""
         return []
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """Energy that it stores at the current u, this rank's share, J."""
         return 0.0
 
-    def applied(self) -> Values | None:
+    def applied_forces(self) -> Values | None:
         """(owned dofs,) force on the body from outside at the current u, N: what does external work."""
         return None
 
-    def drag(self) -> Values | None:
+    def damping_forces(self) -> Values | None:
         """(owned dofs,) force at the current u whose work is lost, N."""
         return None
 
-    def scale(self) -> Values | None:
+    def reference_forces(self) -> Values | None:
         """(owned dofs,) forces that r is the balance of, for its convergence test, N."""
         return None
 
-    def frequency(self) -> float:
+    def frequency_bound(self) -> float:
         """By how much it adds to the square of the highest frequency of the body at most, on all ranks, 1/s^2: what
         explicit steps are cut to."""
         return 0.0
 
-    def set_out(self) -> None:
+    def begin_solve(self) -> None:
         """Newton's method sets out on the step, once more where it has failed before."""
 
-    def longest_step(self, change: Values) -> float:
+    def max_step_fraction(self, change: Values) -> float:
         """Largest share (0, 1] of a change of u (owned dofs,) that Newton's method may take, on this rank."""
         return 1.0
 
     @property
-    def limits_steps(self) -> bool:
+    def limits_newton_steps(self) -> bool:
         """Whether it has a say in how long a step of Newton's method is."""
-        return type(self).longest_step is not Term.longest_step
+        return type(self).max_step_fraction is not Term.max_step_fraction
 
-    def reachable(self, u: Values) -> Values:
+    def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess of u, m, changed to one that Newton's method may start from (collective)."""
         return u
 
-    def clear(self, u: Values) -> bool:
+    def is_feasible(self, u: Values) -> bool:
         """Whether Newton's method may start from u (owned dofs,), m (collective)."""
         return True
 
-    def hold_back(self) -> None:
+    def restrict_motion(self) -> None:
         """Act for now only as far as the body at the step's start allows (collective)."""
 
-    def left(self) -> float:
+    def remaining_motion(self) -> float:
         """The share of its way that is left where it is held back, on all ranks alike; 0: it is not."""
         return 0.0
 
-    def go_on(self) -> None:
+    def continue_motion(self) -> None:
         """Where it is held back, act as far as the body where it is now allows (collective)."""
 
     def potential(self) -> float | None:
@@ -192,67 +196,67 @@ class Term:
         none. Where all terms have one their sum is what Newton's line search goes down."""
         return None
 
-    def readings(self) -> dict[str, Callable[[], Values]]:
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
         """Columns of history.csv, each with a function that gives this rank's share, (1,)."""
         return {}
 
-    def least(self) -> dict[str, Callable[[], float]]:
+    def minimum_columns(self) -> dict[str, Callable[[], float]]:
         """Columns of history.csv, each with a function of which the least over ranks counts (collective)."""
         return {}
 
-    def works(self) -> dict[str, Callable[[], float]]:
+    def work_columns(self) -> dict[str, Callable[[], float]]:
         """Columns of history.csv that are summed over steps, each with a function that gives this rank's share of the
         last step, J."""
         return {}
 
-    def driven(self) -> tuple[float, float]:
+    def step_work(self) -> tuple[float, float]:
         """Work from outside in the step that has ended which `applied` does not show, and what of it is lost, this
         rank's share, J; asked once a step (collective)."""
         return 0.0, 0.0
 
-    def stiffen(self) -> float:
+    def stiffen_contact(self) -> float:
         """Act stiffer from here on, where the end of the step shows that contact is too soft for what presses on it;
         what energy it stores for that at the same u, this rank's share, J (collective)."""
         return 0.0
 
-    def apart(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
         """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
         it keeps apart is apart; `at`: where it is without, `elements` (m, d) the points of its segments or triangles.
         Asked of rank 0, for what is drawn (not collective)."""
         return at
 
-    def drawn(self, t: float) -> dict[str, Drawn]:
+    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
         """Surfaces beside the body's at the time t of the state, s, by name; the same on all ranks (not collective)."""
         return {}
 
-    def kinetic(self) -> float:
+    def kinetic_energy(self) -> float:
         """Energy of motion of what it moves beside the body, this rank's share, J."""
         return 0.0
 
-    def arrive(self) -> None:
+    def accept_step(self) -> None:
         """A solution of the step is found: be what it ends with, until a past is recalled (collective)."""
 
-    def cut_by(self, cuts: Cuts) -> None:
+    def set_cuts(self, cuts: Cuts) -> None:
         """Broken edges are cut where `cuts` says, which is asked after they broke; else in the middle."""
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Edges have broken: patterns (cells,) of those of each cell (collective)."""
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """What it is between two steps beside u, never to be written to again; None: it has no past."""
         return None
 
-    def recall(self, memory: object) -> None:
+    def restore(self, memory: object) -> None:
         """Be again what `memory` gave, with the damage of then (collective)."""
 
-    def saved(self) -> dict[str, Values]:
+    def to_checkpoint(self) -> dict[str, Values]:
         """The same for a checkpoint: arrays that do not know of ranks, whole on rank 0 (collective)."""
         return {}
 
-    def restore(self, saved: dict[str, Values]) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave on rank 0, with u and the damage of then; the same arrays on all ranks."""
 
-    def forget(self) -> None:
+    def clear_search(self) -> None:
         """Forget where it has looked, and what a search starts from: what a checkpoint does not hold (collective)."""
 
     def destroy(self) -> None:

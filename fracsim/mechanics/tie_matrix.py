@@ -17,7 +17,7 @@ Values = npt.NDArray[np.float64]
 Reals = npt.NDArray[np.floating[Any]]
 
 
-class Tied:
+class TieMatrix:
     """K of nodes that all ranks know, the same along each axis.
 
     Attributes:
@@ -27,30 +27,30 @@ class Tied:
     def __init__(self, comm: MPI.Comm, K: csr_matrix, here: Ints, nodes: Ints, free: Values) -> None:
         """`K`: (n, n) N/m; `here`: (m,) which of the n are this rank's `nodes`; `free`: (m, d) 1, and 0 of prescribed
         dofs."""
-        self.K, self.nodes, self.here, self._comm, self._free = K, nodes, here, comm, free
+        self.K, self.nodes, self.indices, self._comm, self._free = K, nodes, here, comm, free
 
     @property
     def diagonal(self) -> Values:
         """(m, d) of K at the nodes of this rank."""
-        return np.asarray(self.K.diagonal()[self.here][:, None] * self._free)
+        return np.asarray(self.K.diagonal()[self.indices][:, None] * self._free)
 
-    def product(self, x: Reals) -> Values:
+    def multiply(self, x: Reals) -> Values:
         """(m, d) K x at the nodes of this rank, of x there (collective)."""
         every = np.zeros((self.K.shape[0], x.shape[1]))
-        every[self.here] = x * self._free
-        return np.asarray((self.K @ total(self._comm, every))[self.here] * self._free)
+        every[self.indices] = x * self._free
+        return np.asarray((self.K @ total(self._comm, every))[self.indices] * self._free)
 
-    def rows(self, nodes: Ints, every: IndexMap) -> csr_matrix:
+    def owned_rows(self, nodes: Ints, every: IndexMap) -> csr_matrix:
         """(d n, dofs of all ranks) those of owned nodes (n,); `every`: the nodes of the body (collective)."""
         d = self._free.shape[1]
         names = every.local_to_global(self.nodes.astype(np.int32))
         told = np.zeros((self.K.shape[0], d + 1))
-        told[self.here] = np.concatenate([names[:, None], self._free], axis=1)
+        told[self.indices] = np.concatenate([names[:, None], self._free], axis=1)
         told = total(self._comm, told)
         place = np.full(every.size_local, -1)
         place[nodes] = np.arange(len(nodes))
         row_of = np.full(len(told), -1)
-        row_of[self.here] = place[self.nodes]
+        row_of[self.indices] = place[self.nodes]
         K, axes = self.K.tocoo(), np.arange(d)
         inside = row_of[K.row] >= 0
         row, column = row_of[K.row[inside]], told[K.col[inside], 0].astype(np.int64)

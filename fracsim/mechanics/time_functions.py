@@ -13,7 +13,7 @@ TimeFunction = Callable[[float], Values]
 
 
 @dataclass(frozen=True)
-class Tabulated:
+class TabulatedFunction:
     """Values (n, k) at times (n,) in s that increase: linear in between, constant outside."""
 
     times: Values
@@ -33,6 +33,6 @@ class Tabulated:
         return np.asarray(np.diff(knots) @ (rates[1:] + rates[:-1]) / 2)
 
 
-def constant(values: Sequence[float] | Values) -> Tabulated:
+def constant_function(values: Sequence[float] | Values) -> TabulatedFunction:
     """The same k values at all times."""
-    return Tabulated(np.zeros(1), np.array([values], float))
+    return TabulatedFunction(np.zeros(1), np.array([values], float))

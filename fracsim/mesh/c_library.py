@@ -26,20 +26,22 @@ from ..errors import CannotWrite, FracsimError, InputError
 from .library_cache import alone, is_whole, library_folder, no_room, not_for_others, note, put_seal
 
 # roots set no errno, and what is done to three numbers alike is done at once: 0.65 of the time, within IEEE's rules
-FASTER = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
+FAST_FLAGS = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
 # a product is rounded before it is added to, as it is in arrays
-AS_ARRAYS = ["-ffp-contract=off"]
+SEPARATE_ROUNDING_FLAGS = ["-ffp-contract=off"]
 # that a compiler may not have: Clang
-NOT_EVERYWHERE = ["-fvect-cost-model=unlimited"]
+GCC_FLAGS = ["-fvect-cost-model=unlimited"]
 
 
 @cache
-def library(source: Path, *, as_arrays: bool = False) -> ctypes.CDLL:
+def load_library(source: Path, *, separate_rounding: bool = False) -> ctypes.CDLL:
     """The functions of a C file; `as_arrays`: sums of products come to the last digit to what arrays make of them."""
-    return built(source.stem, source.read_text(), FASTER + (AS_ARRAYS if as_arrays else []))
+    return compile_library(
+        source.stem, source.read_text(), FAST_FLAGS + (SEPARATE_ROUNDING_FLAGS if separate_rounding else [])
+    )
 
 
-def built(name: str, text: str, more: list[str]) -> ctypes.CDLL:
+def compile_library(name: str, text: str, more: list[str]) -> ctypes.CDLL:
     """The functions of C, with the flags of FFCx's kernels and `more`, and the types of their arguments. InputError
     where no compiler takes it.
 
@@ -56,7 +58,7 @@ def built(name: str, text: str, more: list[str]) -> ctypes.CDLL:
                 if file.exists():
                     note(f"the library {file} was damaged; it is compiled once more")
                 _compile(command, name, text, file)
-    return declared(_loaded(command, name, text, file), text)
+    return declare_signatures(_loaded(command, name, text, file), text)
 
 
 def _compile(command: list[str], name: str, text: str, file: Path) -> None:
@@ -67,7 +69,7 @@ def _compile(command: list[str], name: str, text: str, file: Path) -> None:
         try:
             _run([*command, str(source), "-o", str(fresh), "-lm"])
         except InputError:
-            plain = [each for each in command if each not in NOT_EVERYWHERE]
+            plain = [each for each in command if each not in GCC_FLAGS]
             if plain == command:
                 raise
             _run([*plain, str(source), "-o", str(fresh), "-lm"])
@@ -93,7 +95,7 @@ def _loaded(command: list[str], name: str, text: str, file: Path) -> ctypes.CDLL
 _told: list[str] = []  # functions that were not there
 
 
-def built_together(comm: MPI.Comm, name: str, text: str, more: list[str]) -> ctypes.CDLL | None:
+def compile_on_all_ranks(comm: MPI.Comm, name: str, text: str, more: list[str]) -> ctypes.CDLL | None:
     """The same on all ranks; None where there is no compiler that takes it on one of them, which is told once: FFCx's
     kernels may be there from before, and others do the same without it, later (collective)."""
     made = _tried(comm, name, text, more)
@@ -109,7 +111,7 @@ def built_together(comm: MPI.Comm, name: str, text: str, more: list[str]) -> cty
 @mpi_jit_decorator  # type: ignore[misc]
 def _tried(name: str, text: str, more: list[str]) -> ctypes.CDLL | Exception:
     try:
-        return built(name, text, more)
+        return compile_library(name, text, more)
     except (FracsimError, OSError) as error:
         return error
 
@@ -144,7 +146,7 @@ Float64, Float32, Int64, Int32, Uint8 = (POINTER(each) for each in (c_double, c_
 _FUNCTION = re.compile(r"^(\w+ \*?)(\w+)\(([^(){};]*)\)\s*\{", re.MULTILINE)
 
 
-def declared(code: ctypes.CDLL, text: str) -> ctypes.CDLL:
+def declare_signatures(code: ctypes.CDLL, text: str) -> ctypes.CDLL:
     """A library whose functions take what their C says: pointers to numbers of one kind are made by `at`."""
     for result, name, arguments in _FUNCTION.findall(text):
         if hasattr(code, name):  # what the preprocessor has left
@@ -163,7 +165,7 @@ def _type_of(declaration: str) -> Any:
     return POINTER(number) if "*" in words else number
 
 
-def prepared(code: ctypes.CDLL, name: str, *first: Any) -> Any:
+def unchecked_function(code: ctypes.CDLL, name: str, *first: Any) -> Any:
     """A function of a library that checks no argument, 0.5 us a call less: for levels of few nodes, with arguments that
     were made before. Those that every call begins with are checked here."""
     checked, unchecked = getattr(code, name), code[name]
@@ -179,10 +181,10 @@ def at(values: npt.NDArray[Any]) -> Any:
         # a tenth of the time of ctypes.data_as
         return ctypes.byref(_OF_ARRAY[values.dtype].from_buffer(values))
     except (TypeError, ValueError, KeyError):  # what may not be written to, has no entries, or cannot be handed over
-        return address(values)
+        return struct_pointer(values)
 
 
-def address(values: npt.NDArray[Any]) -> Any:
+def struct_pointer(values: npt.NDArray[Any]) -> Any:
     """The same for a structure to hold, the fields of which are Float64, Int32, ..."""
     if values.dtype not in _OF_ARRAY or not values.flags.c_contiguous:
         raise ValueError(

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from .c_library import Int32, Int64, Uint8, address, at, library
+from .c_library import Int32, Int64, Uint8, at, load_library, struct_pointer
 from .domain import Domain
 from .edge_graph import EdgeGraph
 from .fragments import Pieces, find_pieces, followed
@@ -50,7 +50,7 @@ class _Room(Structure):
         self.open = np.empty(nodes, bool)
         self._place = np.full(nodes, -1)
         arrays = self.reached, self._place, self.parts, self._clusters, self.open, self.of_parts
-        super().__init__(*map(address, arrays))
+        super().__init__(*map(struct_pointer, arrays))
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Parting:
         self._room = _Room(len(self._shared))
         edges = graph.edges_at
         self._kept = graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared
-        self._given = _Given(*map(address, self._kept))
-        self._code = library(SOURCE).reached
+        self._given = _Given(*map(struct_pointer, self._kept))
+        self._code = load_library(SOURCE).reached
         self._look_everywhere()
 
     def look(self) -> Pieces:

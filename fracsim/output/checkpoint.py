@@ -63,7 +63,7 @@ def write_checkpoint(
     Raises CannotWrite, and NotConverged where the state is not finite: the old one stays.
     """
     d, stress, comm = domain.dim, balance.stress, domain.comm
-    terms = balance.saved()
+    terms = balance.to_checkpoint()
     nodal = {name: getattr(state, name) for name in (*_NODAL, *_SOMETIMES)}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
     clock |= {"elastic": float(total(comm, state.elastic)[0]), "dt_before": 0.0}
@@ -76,7 +76,7 @@ def write_checkpoint(
     if stress.chi is not None:
         cells["chi"] = stress.chi.x.array[: domain.cell_count]
     if (plastic := stress.material.plastic) is not None:
-        cells["plastic"] = _by_cells(plastic.memory(), plastic.points)
+        cells["plastic"] = _by_cells(plastic.snapshot(), plastic.points_per_cell)
     edges = {} if record is None else {"integrity": record.graph.integrity}
     here = terms if comm.rank == 0 else {}
     if name := _first_not_finite(comm, [nodal | cells | edges, clock, here]):
@@ -127,7 +127,7 @@ def read_checkpoint(
     `state`: that of the study at its start. InputError where there is no checkpoint that fits.
     """
     comm, stress = domain.comm, balance.stress
-    plastic, terms = stress.material.plastic, balance.saved()
+    plastic, terms = stress.material.plastic, balance.to_checkpoint()
     wanted = {f"{_TERMS}{name}": np.shape(values)[1:] for name, values in terms.items()}
     nodes = int(domain.space.dofmap.index_map.size_global)
     cell_count = int(domain.mesh.topology.index_map(domain.dim).size_global)
@@ -139,7 +139,7 @@ def read_checkpoint(
     if stress.chi is not None:
         wanted["chi"] = (cell_count,)
     if plastic is not None:
-        wanted["plastic"] = _by_cells(plastic.memory(), plastic.points).shape[1:]
+        wanted["plastic"] = _by_cells(plastic.snapshot(), plastic.points_per_cell).shape[1:]
     if record is not None:
         wanted |= dict.fromkeys(_EDGES, ())
     if surfaces is not None:
@@ -169,7 +169,7 @@ def read_checkpoint(
         stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
         rows = scattered(domain.gather_cells, "plastic")
-        plastic.recall(rows.reshape(-1, rows.shape[-1]))
+        plastic.restore(rows.reshape(-1, rows.shape[-1]))
     read: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
     read["elastic"] = 0.0 if comm.rank else clock["elastic"]
     read["before"] = None if before is None else (before, clock["dt_before"])

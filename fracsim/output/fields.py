@@ -55,7 +55,7 @@ class Frames:
             return self._domain.region.astype(np.int32)
         if name == "plastic_strain":
             plastic = self._stress.material.plastic
-            strain: Values = plastic.of_cells(plastic.strain)
+            strain: Values = plastic.cell_means(plastic.accumulated_strain)
             return strain
         if name == "damage":
             return self._broken_share()
@@ -79,7 +79,7 @@ class Frames:
                 self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
             )
         values = self._compiled[name]()
-        if (chi := self._stress.multiplier) is not None and name != "strain":
+        if (chi := self._stress.energy_multiplier) is not None and name != "strain":
             values *= chi.x.array[: self._domain.cell_count, None]
         if self._fracture is not None and name == "strain":
             values[self._fracture.graph.split] = 0.0  # nodes of several pieces have no strain in common
@@ -87,7 +87,7 @@ class Frames:
 
 
 def _kinematics(stress: Stress) -> tuple[Energy, Expr, Expr | None]:
-    return stress.energy, deformation_gradient(stress.u), stress.R
+    return stress.energy, deformation_gradient(stress.u), stress.rotation_field
 
 
 def _tensor(stress: Stress) -> Expr:

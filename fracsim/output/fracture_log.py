@@ -102,7 +102,7 @@ class Breaks:
 
         assert self.record is not None
         domain, ends = self._domain, self.record.graph.edge_nodes
-        force = domain.with_ghosts(self._stress.force()).reshape(-1, domain.dim)
+        force = domain.with_ghosts(self._stress.assemble_forces()).reshape(-1, domain.dim)
         swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
         return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 

@@ -89,5 +89,6 @@ def _surface(
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
         folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at, smooth=smooth,
-        apart=[term.apart for term in terms if term.keeps_apart], beside=[term for term in terms if term.visible],
+        apart=[term.separate_surface for term in terms if term.separates_surface],
+        beside=[term for term in terms if term.has_output_surfaces],
     )  # fmt: skip

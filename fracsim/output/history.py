@@ -63,9 +63,9 @@ class Probes:
         works: dict[str, Figure] = {}
         least: dict[str, Figure] = {}
         for term in balance.terms:
-            readings |= term.readings()
-            works |= term.works()
-            least |= term.least()
+            readings |= term.summed_columns()
+            works |= term.work_columns()
+            least |= term.minimum_columns()
         first = {f"{HEADS[probe.quantity]}_{probe.name}": self._reading(probe) for probe in probes}
         pulled = [probe for probe in probes if probe.quantity == "reaction"]
         moved = {f"motion_{probe.name}": self._mean_displacement(probe) for probe in pulled}

@@ -129,9 +129,9 @@ def end_with(launcher: int, *, parent: int) -> None:
 @cache
 def _code() -> CDLL | None:
     """What signals do at once; None where there is no compiler: then a second signal waits for Python, too."""
-    from ..mesh.c_library import library
+    from ..mesh.c_library import load_library
 
     try:
-        return library(_SOURCE)
+        return load_library(_SOURCE)
     except (FracsimError, OSError):
         return None

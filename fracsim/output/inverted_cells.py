@@ -43,7 +43,7 @@ class InvertedCells:
         domain = self._domain
         cells = np.arange(domain.cell_count) if self._graph is None else np.flatnonzero(~self._graph.damaged)
         rest = domain.nodes[domain.cell_nodes[cells]]
-        J = _spanned(self._stress.corners(cells)) / _spanned(rest)
+        J = _spanned(self._stress.cell_corners(cells)) / _spanned(rest)
         self.least = min(self.least, domain.comm.allreduce(float(J.min(initial=np.inf)), op=MPI.MIN))
         turned = int(total(domain.comm, np.count_nonzero(J <= FLAT))[0])
         if turned and not self.count:

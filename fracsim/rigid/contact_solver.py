@@ -49,7 +49,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from ..mesh.c_library import Float64, Int64, address, at, library
+from ..mesh.c_library import Float64, Int64, at, load_library, struct_pointer
 from .bodies import Bodies, orientation
 from .contact_law import later
 from .contact_points import Contacts
@@ -263,32 +263,32 @@ class Crowd:
     def gained(self, impulses: Values) -> Values:
         """(n, 6) velocities and spins that impulses (k, 3) give."""
         level: Values = np.empty((len(self.mass) + 1, 6))
-        library(SOURCE).gained(self._given, at(np.ascontiguousarray(impulses)), at(level))
+        load_library(SOURCE).gained(self._given, at(np.ascontiguousarray(impulses)), at(level))
         return level[:-1]
 
     def bound(self) -> Values:
         """(k,) D."""
         d: Values = np.empty(len(self.contacts))
-        if library(SOURCE).bound(self._given, at(d)):
+        if load_library(SOURCE).bound(self._given, at(d)):
             raise MemoryError(f"no room for {len(d)} contacts")
         return d
 
     @cached_property
     def _given(self) -> Any:
         """For C; the arrays are this crowd's, and stay as long as it."""
-        arrays = map(address, (self.contacts, self.things, self.mass, self.inertia))
+        arrays = map(struct_pointer, (self.contacts, self.things, self.mass, self.inertia))
         return ctypes.byref(_Crowd(len(self.contacts), len(self.mass), *arrays))
 
 
 def _loops() -> ctypes.CDLL:
     """The functions of projected_gradient.c, one of which tells where something is."""
-    return library(SOURCE)
+    return load_library(SOURCE)
 
 
 def projected(p: Values, mu: Values) -> Values:
     """(k, 3) the nearest of each cone |p_t| <= mu p_n."""
     near = np.array(p, order="C")
-    library(SOURCE).projected(c_int64(len(mu)), at(near), at(mu))
+    load_library(SOURCE).projected(c_int64(len(mu)), at(near), at(mu))
     return near
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.c_library import at, library
+from ..mesh.c_library import at, load_library
 from ..mesh.split_surface.closed_surface import Split
 from ..mesh.split_surface.entity_numbering import Skeleton
 from ..meshes.topology import facets_of
@@ -162,7 +162,7 @@ class Cores:
         grid = [self._boxes, self._first, self._of, self._faces, self._crack, self._ends]
         how = c_double(self._side), c_double(least), c_double(REACH * self._edge), c_int64(MOST)
         kept, out = [stands.last, stands.near, stands.where], [found, node, depth, normal]
-        library(SOURCE).within(
+        load_library(SOURCE).within(
             c_int64(count), at(chosen), at(stands.pairs), *map(at, mine), *map(at, grid), *how, *map(at, kept + out)
         )
         row, rank = np.nonzero(np.arange(MOST) < found[:, None])

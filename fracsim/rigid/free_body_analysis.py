@@ -41,8 +41,8 @@ from petsc4py import PETSc
 from ..errors import NotConverged
 from ..forms.energies import cauchy_stress
 from ..forms.kinematics import deformation_gradient, symmetric_components
-from ..mechanics.jit import CellExpression, CellForm, cells_measure
-from ..mechanics.matrix_assembly import Assembly
+from ..mechanics.jit import CellExpression, CellForm, cell_measure
+from ..mechanics.matrix_assembly import TangentAssembler
 from ..mechanics.stress import Stress
 from ..solvers.petsc_options import Options, OptionSet, refusing
 from ..solvers.preconditioner import MULTIGRID
@@ -92,7 +92,7 @@ class Stiffness:
         domain = stress.domain
         self.stress, self.density, self._space = stress, density, domain.space
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
-        self._form = CellForm(stress.tangent(v, w, cells_measure(domain)))
+        self._form = CellForm(stress.tangent_form(v, w, cell_measure(domain)))
         sigma = cauchy_stress(stress.energy, deformation_gradient(stress.u))
         self._tensor = CellExpression(domain.comm, domain.mesh, symmetric_components(sigma), domain.cell_count)
         self._whole: FreeBody | None = None
@@ -127,8 +127,8 @@ class Stiffness:
         """Over the dofs of some nodes (n,): those of all cells with a share (cells,) above 0."""
         assert self.stress.chi is not None
         self.stress.chi.x.array[:] = share
-        self._form.leave_out(share == 0)
-        whole = Assembly(self._form)
+        self._form.exclude_cells(share == 0)
+        whole = TangentAssembler(self._form)
         whole([])
         d = self.stress.domain.dim
         rows = PETSc.IS().createBlock(d, nodes.astype(PETSc.IntType), comm=PETSc.COMM_SELF)

@@ -58,7 +58,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
         joining = _joining(study, balance, graph, criterion.strength)
         breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
     if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
-        balance.cut_by(lambda: graph.gather_broken(cut[:, None]))
+        balance.set_cuts(lambda: graph.gather_broken(cut[:, None]))
     if opened is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()
@@ -87,7 +87,7 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
         criterion_type = RunningTips
     tips = criterion_type(stress, graph, strength, toughness, opened)
     pace = tips.pace() if moves and not given else None
-    kind = ClosingSplitting if stress.closes else Splitting
+    kind = ClosingSplitting if stress.cracks_close else Splitting
     splitting = kind(stress, graph, tips.release_rate() if moves else None)
     criterion: CrackTips | JoinedTips = tips
     if (joining := _joining(study, balance, graph, strength)) is not None:
@@ -148,7 +148,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strengt
         return None
     from ..fracture.node_retention import Joining
 
-    return Joining(balance.stress, graph, strength, balance.motion.held, cracks=table.energy is not None)
+    return Joining(balance.stress, graph, strength, balance.motion.prescribed_nodes, cracks=table.energy is not None)
 
 
 def average_of(study: Study, domain: Domain) -> Average | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..mechanics.material_fields import MaterialFields, PerCell, by_region, material_fields
+from ..mechanics.material_fields import MaterialFields, PerCell, material_fields, parameter_by_region
 from ..mesh.domain import Domain
 from ..mesh.selectors import check_regions
 from ..study import Study
@@ -46,4 +46,4 @@ def per_cell(study: Study, domain: Domain, table: Any, key: str, special_key: st
     special = {
         name: getattr(region, special_key) for name, region in regions if getattr(region, special_key) is not None
     }
-    return by_region(domain, float(getattr(table, key)), special)
+    return parameter_by_region(domain, float(getattr(table, key)), special)

@@ -13,8 +13,8 @@ from mpi4py import MPI
 
 from ..contact.obstacle import Obstacle
 from ..errors import InputError
-from ..mechanics.matrix_assembly import Assembler
-from ..mechanics.stress import Stress, Weakening
+from ..mechanics.matrix_assembly import VectorAssembler
+from ..mechanics.stress import DegradationModel, Stress
 from ..mesh.domain import distribute
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.input_topology import MeshTopology
@@ -129,7 +129,7 @@ def _operator(study: Study, mesh: MeshData) -> Operator:
     """Of all cells of a mesh."""
     domain, density = distribute(MPI.COMM_SELF, mesh), float(study.material.density)
     elastic = material_of(study.model_copy(update={"plasticity": None}), domain)
-    stress = Stress(Assembler(domain), fem.Function(domain.space), elastic, Weakening("chi"))
+    stress = Stress(VectorAssembler(domain), fem.Function(domain.space), elastic, DegradationModel("chi"))
     if mesh.shell is None:
         return Stiffness(stress, np.full(domain.cell_count, density))
     from ..rigid.shell_analysis import ShellStiffness

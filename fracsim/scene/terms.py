@@ -12,12 +12,12 @@ from ufl.core.expr import Expr
 
 from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
-from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, Mass
-from ..mechanics.loads import DeadLoads, OnFacets, Pressure, area
+from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, MassMatrix
+from ..mechanics.loads import DeadLoads, OnFacets, Pressure, surface_area
 from ..mechanics.material_fields import MaterialFields, coefficient
-from ..mechanics.matrix_assembly import Assembler
+from ..mechanics.matrix_assembly import VectorAssembler
 from ..mechanics.prescribed_motion import PrescribedMotion
-from ..mechanics.stress import RESIDUAL_STIFFNESS, Stress, Weakening
+from ..mechanics.stress import RESIDUAL_STIFFNESS, DegradationModel, Stress
 from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Domain
@@ -36,11 +36,11 @@ class Parts:
 
     study: Study
     scheme: Scheme
-    assembler: Assembler
+    assembler: VectorAssembler
     u: fem.Function
     density: Expr
     stress: Stress
-    mass: Mass
+    mass: MassMatrix
     motion: PrescribedMotion
     conditions: list[BoundaryCondition]
 
@@ -80,7 +80,7 @@ def _dead_loads(parts: Parts) -> Term | None:
 
 def _spread(parts: Parts) -> list[OnFacets]:
     """Forces as tractions on the area of their facets (collective)."""
-    return [(facets, _shared(force, area(parts.domain, facets))) for facets, force in parts.on_facets("force")]
+    return [(facets, _shared(force, surface_area(parts.domain, facets))) for facets, force in parts.on_facets("force")]
 
 
 def _shared(force: TimeFunction, area: float) -> TimeFunction:
@@ -119,11 +119,11 @@ def _tethers(parts: Parts) -> Term | None:
     fracture = parts.study.fracture
     if fracture is None or fracture.crumbs or fracture.approach != "chi" or parts.domain.order > 1:
         return None
-    from ..mechanics.node_ties import Tethers
+    from ..mechanics.node_ties import NodeTies
 
     domain = parts.domain
     young = domain.comm.allreduce(float(np.max(parts.stress.material.young, initial=0.0)), op=MPI.MAX)
-    return Tethers(domain, parts.u, young, parts.mass.lumped, parts.motion.held)
+    return NodeTies(domain, parts.u, young, parts.mass.lumped, parts.motion.prescribed_nodes)
 
 
 def _inertia(parts: Parts) -> Term | None:
@@ -155,7 +155,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
 
 def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
     """The balance of a body of this material (collective). InputError where a place selects nothing."""
-    assembler, u = Assembler(domain), fem.Function(domain.space, name="displacement")
+    assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
     moved = [each for each in entries if each.prescribes_motion]
     nodes = [domain.nodes_of(each.place, f"{each.key}.on") for each in moved]
@@ -163,11 +163,11 @@ def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialF
         domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
     )
     density = coefficient(domain, material.density)
-    mass: Mass = LumpedMass(assembler, density)
+    mass: MassMatrix = LumpedMass(assembler, density)
     if study.time.mass == "consistent":
         mass = ConsistentMass(assembler, density, motion.bcs)
     fracture, floor = study.fracture, 0.0 if scheme.inertia else RESIDUAL_STIFFNESS
-    weakening = None if fracture is None else Weakening(fracture.approach, fracture.unilateral)
+    weakening = None if fracture is None else DegradationModel(fracture.approach, fracture.unilateral)
     stress = Stress(assembler, u, material, weakening, floor=floor)
     parts = Parts(study, scheme, assembler, u, density, stress, mass, motion, entries)
     others = [term for make in TERMS.values() if (term := make(parts)) is not None]

@@ -50,12 +50,12 @@ class LooseParts:
         self.pc = PETSc.PC().create(balance.domain.comm)
         self.pc.setType("python")
         self.pc.setPythonContext(AppliedBy(self.apply))
-        self._rest = balance.vector.duplicate()
+        self._rest = balance.work_vector.duplicate()
 
     def follow(self, tangent: PETSc.Mat) -> bool:
         """Serve the tangent of now, and the body where it is. False: all that hangs is held (collective)."""
         balance, domain = self._balance, self._balance.domain
-        x, free = domain.nodes[self._nodes], balance.motion.free.reshape(-1, domain.dim)[self._nodes]
+        x, free = domain.nodes[self._nodes], balance.motion.free_dofs.reshape(-1, domain.dim)[self._nodes]
         if not balance.linear:
             x = x + balance.u.x.array.reshape(-1, domain.dim)[self._nodes]
         columns, values, width = _motions(domain, self._part, x, free, self._count)
@@ -78,7 +78,7 @@ class LooseParts:
         Z = csr_matrix((values[there], (row, column)), shape=(size, width))
         self._Z = Z[first + self._at]
         self._Zt = self._Z.T.tocsr()
-        ZtK = _summed(comm, self._Zt @ self._balance.stiffness.rows(self._nodes))
+        ZtK = _summed(comm, self._Zt @ self._balance.tangent.owned_rows(self._nodes))
         E = ZtK @ _summed(comm, Z)
         self._solve = splu(E.tocsc()).solve
         own = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
@@ -104,7 +104,7 @@ class LooseParts:
 
 def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
     """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part (collective)."""
-    domain, multiplier = balance.domain, balance.stress.multiplier
+    domain, multiplier = balance.domain, balance.stress.energy_multiplier
     if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
         return None
     count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
@@ -116,14 +116,14 @@ def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
 def _join_tied(balance: Balance, part: Ints) -> None:
     """Nodes without a whole cell go with that which they are tied to: the part (owned nodes,) of which is the smallest
     one around its corners (collective)."""
-    for tied in filter(None, (term.tied(balance.motion.free) for term in balance.terms)):
+    for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
         known = np.zeros(tied.K.shape[0], np.int64)
-        known[tied.here] = part[tied.nodes] + 1
+        known[tied.indices] = part[tied.nodes] + 1
         known = total(balance.domain.comm, known)
         smallest, K = known.copy(), tied.K.tocoo()
         np.maximum.at(smallest, K.row, known[K.col])
         alone = part[tied.nodes] < 0
-        part[tied.nodes[alone]] = smallest[tied.here[alone]] - 1
+        part[tied.nodes[alone]] = smallest[tied.indices[alone]] - 1
 
 
 def _motions(

@@ -45,7 +45,7 @@ class Descent:
 
     def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
         self._balance, self._snes = balance, snes
-        self._from, self._residual = balance.vector.duplicate(), balance.vector.duplicate()
+        self._from, self._residual = balance.work_vector.duplicate(), balance.work_vector.duplicate()
         self.begin()
 
     def begin(self) -> None:
@@ -66,11 +66,11 @@ class Descent:
 
     def residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r at x into b (collective)."""
-        self._balance.displace_to(x)
-        if self._residual_at == self._balance.moves:
+        self._balance.set_iterate(x)
+        if self._residual_at == self._balance.displacement_version:
             self._residual.copy(b)
         else:
-            self._balance.free_residual(x, b)
+            self._balance.assemble_free_residual(x, b)
 
     def __call__(self, x: PETSc.Vec) -> float:
         """J, at x (collective).
@@ -78,12 +78,12 @@ class Descent:
         Near the solution potentials differ by round-off alone: such a step counts as one downwards, so that it is taken
         whole. One that was cut until it made no difference is none: its direction goes up.
         """
-        self._balance.displace_to(x)
+        self._balance.set_iterate(x)
         if self._sets_out:
             self._set_out_from(x)
             return 0.0
         if self._by_norm:
-            if not self._balance.acts() and self._norm_at(x) < self._norm:
+            if not self._balance.is_in_contact() and self._norm_at(x) < self._norm:
                 return DOWN
             self._ask_for_the_start(x)
         potential, size = self._potential()
@@ -94,7 +94,7 @@ class Descent:
 
     def _set_out_from(self, x: PETSc.Vec) -> None:
         self._sets_out, self._whole = False, None
-        self._by_norm = not self._rested and not self._balance.acts()
+        self._by_norm = not self._rested and not self._balance.is_in_contact()
         if self._by_norm:
             x.copy(self._from)
             self._norm = self._snes.getFunctionNorm()
@@ -103,21 +103,21 @@ class Descent:
 
     def _potential(self) -> tuple[float, float]:
         """Potential and its size where the body is, J; mostly asked for where the line search has just been."""
-        if self._known_at != self._balance.moves:
-            self._known, self._known_at = self._balance.potential(), self._balance.moves
+        if self._known_at != self._balance.displacement_version:
+            self._known, self._known_at = self._balance.incremental_potential(), self._balance.displacement_version
         return self._known
 
     def _norm_at(self, x: PETSc.Vec) -> float:
         """|r| at x, N."""
-        self._balance.free_residual(x, self._residual)
-        self._residual_at = self._balance.moves
+        self._balance.assemble_free_residual(x, self._residual)
+        self._residual_at = self._balance.displacement_version
         return float(self._residual.norm())
 
     def _ask_for_the_start(self, x: PETSc.Vec) -> None:
         """Go by the potential after all."""
-        self._balance.displace_to(self._from)
+        self._balance.set_iterate(self._from)
         self._height, self._by_norm = self._potential()[0], False
-        self._balance.displace_to(x)
+        self._balance.set_iterate(x)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
@@ -177,7 +177,7 @@ class Downhill:
         self.descent = descent = Descent(balance, snes)
         objective, residual = weakly(descent.__call__), weakly(descent.residual)
         snes.setObjective(lambda _, x: objective(x))
-        snes.setFunction(lambda _, x, b: residual(x, b), balance.vector)
+        snes.setFunction(lambda _, x, b: residual(x, b), balance.work_vector)
         self.made_positive(None)
 
     def made_positive(self, how: Way | None) -> None:

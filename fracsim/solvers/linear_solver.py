@@ -136,13 +136,13 @@ class Linear:
     ) -> None:
         """`given`: of the study, `chosen`: with the defaults; `small`: how positive K is made at the present u
         (Stiffness.assemble). InputError where PETSc does not take an option (collective)."""
-        self.balance, self.stiffness, self.ksp, self._smallness = balance, balance.stiffness, ksp, small
+        self.balance, self.stiffness, self.ksp, self._smallness = balance, balance.tangent, ksp, small
         self.failures = 0
         self._small: float | None = None  # of the last tangent
         self._blocks: Blocks | None = None  # of the tangent
         self._products: PETSc.Mat | None = None  # a matrix of them
         self._condensed: PETSc.Mat | None = None  # of what is multiplied with, and of parts of low rank
-        self.correction = balance.vector.duplicate()
+        self.correction = balance.work_vector.duplicate()
         self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
         self._by_blocks = chosen["pc_type"] == "gamg"
         self._may_hasten = _is_own(given)
@@ -153,7 +153,7 @@ class Linear:
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
             large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
-            bring=self._bring, pattern=lambda: self.stiffness.pattern, inertia=lambda: inertia_share(balance),
+            bring=self._bring, pattern=lambda: self.stiffness.pattern_version, inertia=lambda: inertia_share(balance),
             nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
@@ -161,12 +161,12 @@ class Linear:
         self._ending = Ending(ksp.comm, int(ksp.max_it)) if self.linearly and self.iterative else None
         self.forcing = None if self._asked else _forcing(balance, chosen)
         self.factors = Factors(
-            self.preconditioner, symmetric=balance.symmetric, dofs=balance.vector.getSize(), dim=balance.domain.dim
+            self.preconditioner, symmetric=balance.symmetric, dofs=balance.work_vector.getSize(), dim=balance.domain.dim
         )
 
     def _set_up_at_rest(self) -> None:
         self._assemble()
-        self.stiffness.bring_entries()
+        self.stiffness.update_entries()
         self.ksp.setOperators(self.stiffness.matrix)
         self.ksp.setUp()
 
@@ -177,11 +177,11 @@ class Linear:
         self._use_blocks()
         self._forget_condensed()
         self.operator = self._products or self.stiffness.matrix
-        if self.stiffness.is_incomplete:
+        if self.stiffness.may_be_incomplete:
             from .low_rank import Condensed
 
             stiffness = self.stiffness
-            parts, springs = (lambda: stiffness.low_rank), (lambda: stiffness.springs)
+            parts, springs = (lambda: stiffness.low_rank_updates), (lambda: stiffness.stiff_couplings)
             self.operator = self._condensed = Condensed(self.operator, parts, springs).matrix()
         self._know_rigid_motions()
 
@@ -203,8 +203,8 @@ class Linear:
             self._blocks.forget()
             self._blocks = self._products = None
         if self._by_blocks and worth_it(self.stiffness.matrix):
-            stiffness, blocks = self.stiffness, self.stiffness.in_blocks()
-            self._blocks = Blocks(stiffness.matrix, blocks, lambda: stiffness.pattern)
+            stiffness, blocks = self.stiffness, self.stiffness.switch_to_blocks()
+            self._blocks = Blocks(stiffness.matrix, blocks, lambda: stiffness.pattern_version)
             self._products = self._blocks.matrix()
 
     def shrink(self) -> bool:
@@ -223,7 +223,7 @@ class Linear:
         if self._blocks is not None:
             self._blocks.single = None
         self._small = self._smallness()
-        self.stiffness.assemble(small=self._small, blocks_alone=True)
+        self.stiffness.assemble(psd_tolerance=self._small, blocks_only=True)
 
     def linearise(self, norm: float, little: float) -> None:
         """K at an iterate of Newton's method, and how exactly it is solved with: |r| there is `norm`, N, that of a
@@ -241,7 +241,9 @@ class Linear:
             self.ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
             return
         self._assemble_tangent()
-        self.ksp.setTolerances(rtol=forcing.rough(norm, little) if self.stiffness.couples else forcing.exact())
+        self.ksp.setTolerances(
+            rtol=forcing.rough(norm, little) if self.stiffness.has_contact_coupling else forcing.exact()
+        )
 
     def _left_by_cg(self) -> float:
         """|r| that the last solve has left of the linear system, N, which CG has at hand; 0 of other methods."""
@@ -252,7 +254,7 @@ class Linear:
         self._assemble()
         if self._blocks is not None:
             self._blocks.follow()
-        if (self.stiffness.low_rank or self.stiffness.springs) and self.ksp.getType() == "preonly":
+        if (self.stiffness.low_rank_updates or self.stiffness.stiff_couplings) and self.ksp.getType() == "preonly":
             self.ksp.setType("gmres")  # factors are of the rest
         self._know_rigid_motions()
         self.preconditioner.refresh(self.stiffness.matrix, self._products)
@@ -267,14 +269,14 @@ class Linear:
     def _hold(self) -> None:
         """Precondition with the body's springs as well, where there are any."""
         body = self.preconditioner.serving
-        springs = [each for each in self.stiffness.springs if len(each.stiffness)]
+        springs = [each for each in self.stiffness.stiff_couplings if len(each.stiffness)]
         if not springs:
             self.ksp.setPC(body)
             return
         from .low_rank import Woodbury
 
         body.setReusePreconditioner(True)
-        pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.vector), comm=self.ksp.comm)
+        pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.work_vector), comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
 
@@ -291,7 +293,7 @@ class Linear:
         return in_single(body, assembled)
 
     def _bring(self) -> None:
-        self.stiffness.bring_entries()
+        self.stiffness.update_entries()
         self._know_rigid_motions()
 
     @contextmanager
@@ -307,7 +309,7 @@ class Linear:
 
     def may_factorise(self, most: int = FACTORISED) -> bool:
         """Whether a system of no more than so many dofs may be factorised."""
-        dofs = self.balance.vector.getSize()
+        dofs = self.balance.work_vector.getSize()
         return self.iterative and dofs <= most and bool(PETSc.Sys.hasExternalPackage("mumps"))
 
     def response(self, force: Values, *, directly: bool) -> Values:
@@ -319,8 +321,8 @@ class Linear:
         """
         with_factors = [False, True] if self.may_factorise() else [False]
         for factors in with_factors[1:] if directly else with_factors:
-            self.balance.vector.array_w[:] = force
-            with self.stiffness.untouched(), self.factors.of(self.ksp) if factors else nullcontext():
+            self.balance.work_vector.array_w[:] = force
+            with self.stiffness.without_contact(), self.factors.of(self.ksp) if factors else nullcontext():
                 solved = self.solve()
             if solved:
                 return np.asarray(self.correction.array_r.copy())
@@ -329,8 +331,10 @@ class Linear:
 
     def extend(self, x: PETSc.Vec) -> int:
         """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
-        self.balance.extension_residual(x, self.balance.vector)
-        if not self.balance.vector.norm():  # nothing is free that it could go to, nor anything to set up multigrid for
+        self.balance.assemble_extension_residual(x, self.balance.work_vector)
+        if (
+            not self.balance.work_vector.norm()
+        ):  # nothing is free that it could go to, nor anything to set up multigrid for
             return 0
         if not self.solve():
             self.failures += 1
@@ -338,29 +342,31 @@ class Linear:
         return int(self.ksp.its)
 
     def solve(self) -> bool:
-        """K correction = balance.vector at the present u; whether it was solved."""
+        """K correction = balance.work_vector at the present u; whether it was solved."""
         ksp = self.ksp
         self._assemble_tangent()
         self.preconditioner.its = None
         if self.forcing is not None:
             ksp.setTolerances(rtol=self.forcing.exact())
         ksp.setOperators(self.operator, self.stiffness.matrix)
-        ksp.solve(self.balance.vector, self.correction)
+        ksp.solve(self.balance.work_vector, self.correction)
         return bool(ksp.reason > 0)
 
     def correct(self, little: float) -> tuple[float, int] | None:
-        """K correction = balance.vector, by CG down to what is `little`, N, and to what the study asks of it, or as the
-        KSP does it: |r| that is left, infinite where nothing is known, and iterations; None: it was not solved."""
+        """K correction = balance.work_vector, by CG down to what is `little`, N, and to what the study asks of it, or
+        as the KSP does it: |r| that is left, infinite where nothing is known, and iterations; None: not solved."""
         if self._ending is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve() else None
         ending, tangent, preconditioner = self._ending, self.stiffness.matrix, self.preconditioner
         if not self.balance.scheme.inertia:
             little *= AT_REST
         if self._asked:
-            little = min(little, self._asked * self.balance.vector.norm())
+            little = min(little, self._asked * self.balance.work_vector.norm())
         self._assemble_tangent()
         products = self._products or tangent
-        solved = ending.solve(products, tangent, preconditioner.serving, self.balance.vector, self.correction, little)
+        solved = ending.solve(
+            products, tangent, preconditioner.serving, self.balance.work_vector, self.correction, little
+        )
         preconditioner.its = ending.to_share(float(self.ksp.rtol))
         return (ending.left, ending.its) if solved else None
 
@@ -394,7 +400,7 @@ def _forcing(balance: Balance, chosen: Options) -> Forcing | Sparing | None:
     """How exactly Newton's method solves; None: always as exactly. (Without inertia a piece hangs by next to nothing: a
     residual that is small leaves its place open.)"""
     rtol = float(chosen["ksp_rtol"])
-    if balance.limits_steps:
+    if balance.limits_newton_steps:
         return Forcing(rtol) if balance.conservative else None
     return Sparing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from ..mechanics.low_rank_springs import Stiff
+from ..mechanics.low_rank_springs import StiffCoupling
 from ..mesh.parallel import total
 
 Values = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ class Condensed:
         self,
         tangent: PETSc.Mat,
         parts: Callable[[], list[tuple[Values, Values]]],
-        springs: Callable[[], list[Stiff]],
+        springs: Callable[[], list[StiffCoupling]],
     ) -> None:
         """`parts`: U (owned dofs, k) and C (k, k) of each, `springs`: as they are now."""
         self._tangent, self._parts, self._springs = tangent, parts, springs
@@ -56,7 +56,7 @@ class Condensed:
 class Woodbury:
     """The context of a PETSc preconditioner."""
 
-    def __init__(self, body: PETSc.PC, springs: list[Stiff], like: PETSc.Vec) -> None:
+    def __init__(self, body: PETSc.PC, springs: list[StiffCoupling], like: PETSc.Vec) -> None:
         """`body`: P, set up; `like`: a vector of its size (collective)."""
         self._body, self._comm = body, like.comm.tompi4py()
         U = np.concatenate([each.directions for each in springs], axis=1)

@@ -63,8 +63,8 @@ class Newton:
         snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
         self._made = [snes]
         snes.setOptionsPrefix(self._options.prefix)
-        snes.setFunction(lambda _, x, b: balance.free_residual(x, b), balance.vector)
-        self._x = balance.vector.duplicate()
+        snes.setFunction(lambda _, x, b: balance.assemble_free_residual(x, b), balance.work_vector)
+        self._x = balance.work_vector.duplicate()
         try:
             refusing(snes.setFromOptions)
             self.linear = Linear(balance, snes.ksp, self._options, given, chosen, lambda: self._smallness)
@@ -73,7 +73,7 @@ class Newton:
             raise
         self._take_tangent()
         snes.setConvergenceTest(weakly(self._converged))
-        if balance.limits_steps:
+        if balance.limits_newton_steps:
             snes.setLineSearchPreCheck(weakly(self._limit))
             if balance.conservative:
                 from .line_search import Downhill
@@ -122,7 +122,7 @@ class Newton:
         """Linearise into the matrix that the balance has now."""
         linear = self.linear
         for snes in self._made:
-            snes.setJacobian(weakly(self._linearise), linear.operator, self.balance.stiffness.matrix)
+            snes.setJacobian(weakly(self._linearise), linear.operator, self.balance.tangent.matrix)
 
     def _linearise(self, *_: object) -> None:
         self.linear.linearise(self.snes.getFunctionNorm(), self._last_little)
@@ -143,13 +143,13 @@ class Newton:
         self.snes, self._down = (self._first, self.first_down) if down is None else (down.snes, down)
         self._norms, self._rests = [], 0
         self.shrink()
-        self.balance.set_out()
+        self.balance.begin_solve()
         extended = 0 if guess is None else self._start_from(guess)
         if self.linear.linearly and (solved := self._solve_as_linear()) is not None:
             return replace(solved, krylov=solved.krylov + extended)
         newton, krylov, held = self._solve_in_legs()
         reason = self.snes.reason
-        self.balance.displace_to(self._x)
+        self.balance.set_iterate(self._x)
         if reason > 0 and self._single:  # Newton's method has evaluated them for its test
             self.balance.update_reactions()
         if held:
@@ -159,10 +159,10 @@ class Newton:
     def _start_from(self, guess: Values) -> int:
         """Set x to what Newton's method may start from; returns Krylov iterations."""
         self._x.array_w[:] = guess
-        extended = self.linear.extend(self._x) if self.balance.motion.largest_gap(guess) > LARGE_GAP else 0
-        if self.balance.limits_steps:
-            self._x.array_w[:] = self.balance.reachable(self._x.array_r.copy())
-            self.balance.displace_to(self._x)  # terms look there for what is held back
+        extended = self.linear.extend(self._x) if self.balance.motion.max_deviation(guess) > LARGE_GAP else 0
+        if self.balance.limits_newton_steps:
+            self._x.array_w[:] = self.balance.feasible_guess(self._x.array_r.copy())
+            self.balance.set_iterate(self._x)  # terms look there for what is held back
         return extended
 
     def _solve_in_legs(self) -> tuple[int, int, bool]:
@@ -171,7 +171,7 @@ class Newton:
         newton = krylov = 0
         left = 1.0
         for leg in range(LEGS):
-            before, left = left, self.balance.left()
+            before, left = left, self.balance.remaining_motion()
             if leg >= LEAST_LEGS and left > (LEGS - leg) * (before - left):
                 break
             self._rtol = ON_THE_WAY if left else self._own_rtol
@@ -186,7 +186,7 @@ class Newton:
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
                 return newton, krylov, False
-            self.balance.go_on()
+            self.balance.continue_motion()
         return newton, krylov, True
 
     def _solve_as_linear(self) -> SolveResult | None:
@@ -194,8 +194,8 @@ class Newton:
         balance, x, krylov, left = self.balance, self._x, 0, np.inf
         for its in range(LINEAR_SOLVES + 1):
             if not (solved := np.isfinite(left) and self._is_small(left, its)):
-                balance.free_residual(x, balance.vector)
-                solved = self._is_small(left := balance.vector.norm(), its)
+                balance.assemble_free_residual(x, balance.work_vector)
+                solved = self._is_small(left := balance.work_vector.norm(), its)
             if solved:
                 return SolveResult(True, its, krylov, "")
             if self._abandons():
@@ -204,7 +204,7 @@ class Newton:
                 break
             left, krylov = made[0], krylov + made[1]
             x.axpy(-1.0, self.linear.correction)
-            balance.displace_to(x)
+            balance.set_iterate(x)
             balance.update_reactions()
         self.linear.preconditioner.its = None
         return None
@@ -223,9 +223,9 @@ class Newton:
         if self._down is not None:
             self._down.descent.set_out()
             self._down.hold_back(y)
-        if not self.balance.limits_steps:
+        if not self.balance.limits_newton_steps:
             return
-        share = self.balance.longest_step(-y.array_r)
+        share = self.balance.max_step_fraction(-y.array_r)
         if share < 1:
             y.scale(share)
 
@@ -270,7 +270,7 @@ class Newton:
         if self._down is not None:
             self._down.descent.rested()
         x, r = snes.getSolution(), snes.getFunction()[0]
-        x.array_w[:] = self.balance.u.x.array[: self.balance.owned]
+        x.array_w[:] = self.balance.u.x.array[: self.balance.owned_dof_count]
         snes.computeFunction(x, r)
         snes.setFunctionNorm(r.norm())
         return self._is_small(snes.getFunctionNorm(), its)
@@ -289,7 +289,7 @@ class Newton:
         """Whether that is so of |r| after so many iterations (collective)."""
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
-            self._first_norm = 0.0 if self.balance.limits_steps else norm
+            self._first_norm = 0.0 if self.balance.limits_newton_steps else norm
         return norm <= self._little(self._first_norm if its else 0.0)
 
     def _little(self, first: float) -> float:

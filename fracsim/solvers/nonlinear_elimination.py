@@ -34,7 +34,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
-from ..mechanics.tangent import adds_entries
+from ..mechanics.tangent import adds_single_entries
 from ..mechanics.term import Term
 from ..mesh.parallel import allgather, total
 from .line_search import ROUND_OFF
@@ -96,10 +96,10 @@ def patches_of(balance: Balance) -> Patches | None:
     """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
     cell are constant forces, inertia and ties; None: it has not (collective)."""
     others = [term for term in balance.terms if term is not balance.stress]
-    bent = any(type(term).tangent is not Term.tangent or adds_entries(term) for term in others)
+    bent = any(type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in others)
     whole = balance.domain.order == 1 and balance.stress.rotation is None
-    lumped = balance.mass.diagonal and balance.scheme.inertia
-    fit = whole and lumped and not bent and not balance.limits_steps and balance.conservative
+    lumped = balance.mass.is_diagonal and balance.scheme.inertia
+    fit = whole and lumped and not bent and not balance.limits_newton_steps and balance.conservative
     return Patches(balance) if fit else None
 
 
@@ -111,8 +111,8 @@ class Patches:
         numbers = balance.domain.space.dofmap.index_map
         self._count = numbers.size_global
         self._names = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
-        self._free = np.ones(balance.owned)
-        self._free[balance.motion.owned] = 0.0
+        self._free = np.ones(balance.owned_dof_count)
+        self._free[balance.motion.owned_dofs] = 0.0
 
     @cached_property
     def _energy(self) -> CellEnergy:
@@ -127,8 +127,8 @@ class Patches:
             return False
         region = self._around(nodes)
         moved = _settle(region, little, self._balance.domain.mean_edge)
-        u = self._balance.u.x.array[: self._balance.owned].copy()
-        self._balance.displace(u)
+        u = self._balance.u.x.array[: self._balance.owned_dof_count].copy()
+        self._balance.set_displacement(u)
         return moved
 
     def _heavy(self) -> Ints:
@@ -151,7 +151,7 @@ class Patches:
     def _around(self, nodes: Ints) -> _Region:
         """Those of global numbers and their neighbours, with all cells of these (collective)."""
         balance, domain = self._balance, self._balance.domain
-        comm, dead = domain.comm, balance.stress.stressless
+        comm, dead = domain.comm, balance.stress.dead_cells
         alive = np.ones(domain.cell_count, bool) if dead is None else ~dead
         touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
         chosen = self._flags(np.concatenate([*allgather(comm, self._names[touched]), nodes]))
@@ -171,9 +171,9 @@ class Patches:
         """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
         balance, n = self._balance, len(names)
         K = coo_array((n, n)).tocsr()
-        for tied in filter(None, (term.tied(balance.motion.free) for term in balance.terms)):
+        for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
             numbers = np.zeros(tied.K.shape[0], np.int64)
-            numbers[tied.here] = self._names[tied.nodes]
+            numbers[tied.indices] = self._names[tied.nodes]
             at, each = _places(total(balance.domain.comm, numbers), names), tied.K.tocoo()
             inside = (at[each.row] >= 0) & (at[each.col] >= 0)
             K = K + coo_array((each.data[inside], (at[each.row][inside], at[each.col][inside])), shape=(n, n)).tocsr()

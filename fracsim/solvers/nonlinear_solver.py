@@ -146,7 +146,7 @@ class Solver:
         if choice.dear:
             return self._go_on_directly(guess)
         if self._misled(result) and self.linear.may_factorise():
-            result = self._attempt_directly(self.balance.level.u if self._sets_out_anew else guess)
+            result = self._attempt_directly(self.balance.level.u_n if self._sets_out_anew else guess)
             if result.converged:
                 choice.take(preferred=False)
         elif choice.was_dear(result, positively=self._positively):
@@ -227,11 +227,11 @@ class Solver:
         result = newton.attempt(guess)
         if newton.crawls:
             result = self._attempt_downhill(None, (EXACT,))
-        start = None if newton.goes_down and not self.balance.left() else guess  # on the way down: goes on
+        start = None if newton.goes_down and not self.balance.remaining_motion() else guess  # on the way down: goes on
         self._see_whether_astray(result)
         if self._misled(result):
             if self._sets_out_anew:
-                start = self.balance.level.u
+                start = self.balance.level.u_n
             if self.snes.ksp.reason != PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:  # which is K's own doing
                 # Smoothers of an older tangent need not be positive for this one.
                 self.linear.preconditioner.due = Due.REBUILD
@@ -254,7 +254,7 @@ class Solver:
         """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
         inside out, and without a potential (a pressure has none) there is no going down from it. Where prescribed dofs
         or contact set the pace that place is no better."""
-        return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_steps
+        return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_newton_steps
 
     def _attempt_downhill(self, guess: Values | None, ways: tuple[Way, ...]) -> SolveResult:
         """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.time_functions import Tabulated, TimeFunction, Values, constant
+from ..mechanics.time_functions import TabulatedFunction, TimeFunction, Values, constant_function
 from ..mesh.crack_planes import Crack, plane, polygon, segment
 from ..mesh.selectors import Group, InBox, OnPlane, Place
 from ..meshes.text import AXES
@@ -129,7 +129,7 @@ def _acts(load: BoundaryCondition, dim: int) -> Flags:
     """(d,) components along which a traction or a force ever acts; a pressure has none of its own."""
     if load.kind == "pressure":
         return np.zeros(dim, bool)
-    assert isinstance(load.function, Tabulated)
+    assert isinstance(load.function, TabulatedFunction)
     return np.any(load.function.rows != 0, axis=0)
 
 
@@ -138,7 +138,7 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
     function: TimeFunction
     components: Flags = np.zeros(dim, bool)
     if entry.fix is not None:
-        function, components = constant(np.zeros(dim)), _named(entry.fix, dim, key)
+        function, components = constant_function(np.zeros(dim)), _named(entry.fix, dim, key)
     else:
         function = table = time_function(value, f"{key}.{entry.kind}", 1 if entry.kind == "pressure" else dim)
         if entry.kind in MOTIONS:
@@ -146,7 +146,7 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
         if entry.kind == "velocity":
             function = table.integral
         if entry.kind == "force":
-            function = Tabulated(table.times, np.asarray(table.rows / thickness))
+            function = TabulatedFunction(table.times, np.asarray(table.rows / thickness))
     return BoundaryCondition(key, entry.kind, place, function, components)
 
 
@@ -292,18 +292,18 @@ def fibre_direction(study: Study, dim: int) -> Values | None:
     return None if fibre is None else check_size(fibre.direction, dim, "fracture.fibre.direction")
 
 
-def step_size_function(timing: TimeSettings) -> Tabulated | None:
+def step_size_function(timing: TimeSettings) -> TabulatedFunction | None:
     """The longest step, s, at a time; None where it is the same all the time."""
     return time_function(timing.step, "time.step", 1) if isinstance(timing.step, TimeTable) else None
 
 
-def time_function(value: Any, key: str, size: int) -> Tabulated:
+def time_function(value: Any, key: str, size: int) -> TabulatedFunction:
     """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
     table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
     rows = np.array([check_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
     if np.any(np.isnan(rows) != np.isnan(rows[0])):
         raise InputError(f'{key}: a component that is "free" at one time must be free at all of them')
-    return Tabulated(np.asarray(table.time), rows)
+    return TabulatedFunction(np.asarray(table.time), rows)
 
 
 def check_size(values: Sequence[Any], size: int, key: str) -> Values:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mechanics.time_functions import Tabulated
+from ..mechanics.time_functions import TabulatedFunction
 from ..mesh.selectors import Group, Place
 from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, facets_where, signed_measures
@@ -41,7 +41,7 @@ def resultant_lines(study: Study, dim: int, mesh: MeshData | None) -> Iterator[s
         each, total = facet_area_vectors(mesh, load)
         yield f"{load.key}.{load.kind} on {load.place}: {_on_facets(load, each, total, thick, dim)}"
     for name, function in volume_loads(study, dim).items():
-        assert isinstance(function, Tabulated)
+        assert isinstance(function, TabulatedFunction)
         rows = _weight(study, mesh, name) * thick * function.rows
         yield f"load.{name}: {_said(rows, function.times, 'N' if dim == 3 or thick != 1 else 'N/m')} on the body"
 
@@ -83,7 +83,7 @@ def _area_vectors(mesh: MeshData, facets: npt.NDArray[np.int64]) -> Values:
 
 def _on_facets(load: BoundaryCondition, vector: Values, area: float, thick: float, dim: int) -> str:
     function = load.function
-    assert isinstance(function, Tabulated)
+    assert isinstance(function, TabulatedFunction)
     rows = function.rows * thick
     if load.kind == "traction":
         rows = rows * area

@@ -33,12 +33,12 @@ def acting(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
 
     Without the inertia of prescribed dofs where mass is `lumped` (`work_done`).
     """
-    own = balance.motion.owned
-    forces = balance.applied()
+    own = balance.motion.owned_dofs
+    forces = balance.applied_forces()
     forces[own] += balance.reactions[own]
     if lumped:
         forces[own] -= balance.mass.lumped[own] * balance.rates()[1][own]
-    return forces, balance.drag()
+    return forces, balance.damping_forces()
 
 
 def work_done(
@@ -53,7 +53,7 @@ def work_done(
     The inertia of prescribed dofs, whose velocity may jump, is not among the forces where mass is `lumped`: what moves
     them is the gain of their kinetic energy.
     """
-    late, own, increment = balance.scheme.alpha_f, balance.motion.owned, u - start.u
+    late, own, increment = balance.scheme.alpha_f, balance.motion.owned_dofs, u - start.u
     gained = 0.0
     if lumped:
         gained = 0.5 * float(balance.mass.lumped[own] @ (v[own] ** 2 - start.v[own] ** 2))
@@ -78,24 +78,24 @@ def released_state(
     balance; the end of a step of generalized-alpha is an extrapolation. `response`: displacement that forces (owned
     dofs,) cause in a step, linearly; None where steps resolve all motion (explicit ones).
     """
-    own, forces = balance.motion.owned, end.forces.copy()
+    own, forces = balance.motion.owned_dofs, end.forces.copy()
     reactions = balance.reactions[own]
     balance.update_reactions()
     if not balance.scheme.carries_acceleration:
         forces[own] += balance.reactions[own] - reactions
         return replace(end, forces=forces)
-    free = balance.motion.free
+    free = balance.motion.free_dofs
     if response is None:  # forces balance at the end of the step, where the body is
-        lost = balance.stress.force_lost(before)
+        lost = balance.stress.assemble_released_forces(before)
         change = balance.mass.solve(np.where(free, lost, 0.0), free)
     else:
-        balance.displace(solved)
-        lost = balance.stress.force_lost(before)
-        now = balance.stress.exchange(before)
-        if any(term.keeps_apart for term in balance.terms):
-            balance.displace(end.u)  # gaps are open at the step's end, and need not be where forces balance
+        balance.set_displacement(solved)
+        lost = balance.stress.assemble_released_forces(before)
+        now = balance.stress.exchange_damage(before)
+        if any(term.separates_surface for term in balance.terms):
+            balance.set_displacement(end.u)  # gaps are open at the step's end, and need not be where forces balance
         change = balance.c_a * response(np.where(free, lost, 0.0))
-        balance.stress.exchange(now)
-        balance.displace(end.u)
+        balance.stress.exchange_damage(now)
+        balance.set_displacement(end.u)
     forces[own] -= lost[own]
     return replace(end, forces=forces, a=end.a + change)

@@ -46,7 +46,7 @@ class ExplicitStepper(BalanceStepper):
         assert state.frequencies is not None
         squares = damaged_frequencies(self.balance.stress, state.frequencies, self._of_edges())
         fastest = self.comm.allreduce(float(np.max(squares, initial=0.0)), op=MPI.MAX)
-        added = sum(term.frequency() for term in self.balance.terms)
+        added = sum(term.frequency_bound() for term in self.balance.terms)
         highest = float(np.sqrt(max(fastest + added, KINK * added)))
         stable = SAFETY * stable_step(highest, self._a, self._b)
         # equal steps to the end or the next frame rather than a sliver: rounding up never exceeds the bound
@@ -74,14 +74,14 @@ class ExplicitStepper(BalanceStepper):
     def _attempt(self, state: State, dt: float) -> SolveResult:
         """u by v and a of the start, then a from the forces there."""
         began = time.perf_counter()
-        balance, own = self.balance, self.balance.motion.owned
+        balance, own = self.balance, self.balance.motion.owned_dofs
         half = state.v + dt / 2 * state.a
         u = state.u + dt * half
-        u[own] = balance.motion.at(state.t + dt)[: len(own)]
+        u[own] = balance.motion.displacements_at(state.t + dt)[: len(own)]
         half[own] = (u[own] - state.u[own]) / dt
         self._begin(state, dt)  # rates of the step: (u - u_n) / dt is the velocity half-way
-        balance.displace(u)
-        unbalanced = balance.forces()
+        balance.set_displacement(u)
+        unbalanced = balance.update_forces()
         # mass damping at the velocity of the end, not of half-way: second order
         a: Values = np.asarray(-unbalanced / (balance.mass.lumped * (1 + self._a * dt / 2)), np.float64)
         a[own] = 0.0
@@ -91,7 +91,7 @@ class ExplicitStepper(BalanceStepper):
         return SolveResult(finite, 0, 0, "" if finite else "Forces are not finite any more: the step is too large")
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
-        self.balance.arrive()
+        self.balance.accept_step()
         return self._arrival
 
     def _booked(

@@ -46,7 +46,7 @@ class ImplicitStepper(BalanceStepper):
 
     def forget(self) -> None:
         """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
-        self.balance.forget()
+        self.balance.clear_search()
         self.solver.renew()
         self._tell_solver()
 
@@ -71,7 +71,7 @@ class ImplicitStepper(BalanceStepper):
         """
         broken, released = 0, 0.0
         for _ in range((self.breaking.passes or UNLIMITED) - 1):
-            solved = self.balance.u.x.array[: self.balance.owned].copy()
+            solved = self.balance.u.x.array[: self.balance.owned_dof_count].copy()
             _, v, a = self._arrive(state, dt)
             self._let_flow()
             self.breaking.moving(v, a)
@@ -92,7 +92,7 @@ class ImplicitStepper(BalanceStepper):
     def _return_to(self, solved: Values, state: State, dt: float) -> None:
         """The solution of the step once more."""
         self._begin(state, dt)
-        self.balance.displace(solved)
+        self.balance.set_displacement(solved)
         self.balance.update_reactions()
 
     def _released(self, end: State, solved: Values, result: PassResult) -> State:

@@ -134,7 +134,7 @@ class Unbreakable:
     def __call__(self) -> PassResult:
         """The elastic energy is all there is to tell."""
         stored = self._flow.stored
-        return _Whole(self._balance.stress.stored() if stored is None else stored)
+        return _Whole(self._balance.stress.stored_energy() if stored is None else stored)
 
     def memory(self) -> object:
         """None."""

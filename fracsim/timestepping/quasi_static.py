@@ -79,7 +79,7 @@ class QuasiStaticStepper(ImplicitStepper):
         path = _Path(state.u, state.forces, state.drag, state.out_of_balance)
         broken, released, limit = 0, 0.0, self.breaking.passes or UNLIMITED
         for number in range(limit):
-            self.balance.arrive()
+            self.balance.accept_step()
             path.to(self._solved(), *acting(self.balance, lumped=False))
             flowed = self._let_flow()
             result = self._pass(path, dt)
@@ -99,7 +99,7 @@ class QuasiStaticStepper(ImplicitStepper):
         return self._booked(end, dt, solve, began, broken, result.elastic, path.work, path.lost + (released + flowed))
 
     def _solved(self) -> Values:
-        return self.balance.u.x.array[: self.balance.owned].copy()
+        return self.balance.u.x.array[: self.balance.owned_dof_count].copy()
 
     def _arrived(self, state: State, dt: float, path: _Path) -> State:
         """The end of the step."""
@@ -116,10 +116,10 @@ class QuasiStaticStepper(ImplicitStepper):
         if result.broken or self.comm.allreduce(result.loss, op=MPI.MAX) > 0:
             self._damage_changed(result)
             balance = self.balance
-            residual = balance.forces().copy()
-            own, free = balance.motion.owned, balance.motion.free
+            residual = balance.update_forces().copy()
+            own, free = balance.motion.owned_dofs, balance.motion.free_dofs
             path.forces = path.forces.copy()
-            path.forces[own] = balance.applied()[own] + residual[own]
+            path.forces[own] = balance.applied_forces()[own] + residual[own]
             path.out_of_balance = np.where(free, residual, 0.0)
         self.phases[self.breaking.phase] += self.now() - began
         return result

@@ -25,7 +25,7 @@ def cell_frequencies(stress: Stress) -> Values:
     `gain` has what takes the place of d + 1 with quadratic displacement (mechanics.stability_limit).
     """
     domain, d, material = stress.domain, stress.domain.dim, stress.material
-    corners = stress.corners(np.arange(domain.cell_count))
+    corners = stress.cell_corners(np.arange(domain.cell_count))
     factor = d + 1 if domain.order == 1 else gain(d)
     return frequency_bounds(corners, material.mu, material.lmbda, material.density, factor)
 
@@ -38,7 +38,7 @@ def gain(dim: int) -> float:
     H_q = sum_k h_qk x g_k, h_qk = sum_i dN_i/dl_k u_i: |H_q|^2 <= lmax(L) |h_q|^2 and (tr H_q)^2 <= tr L |h_q|^2, as of
     a P1 simplex, where h are the nodal motions themselves. The sum of the g_k is 0, so the mean over k is left out.
     """
-    from ..mechanics.inertia import SHARES
+    from ..mechanics.inertia import HRZ_FRACTIONS
 
     corners, edges = np.eye(dim + 1), local_edges(dim)
     points, weights = map(np.asarray, basix.make_quadrature(CELL[dim], 2))
@@ -48,7 +48,7 @@ def gain(dim: int) -> float:
         of_middles = 4 * (at[edges[:, 0], None] * corners[edges[:, 1]] + at[edges[:, 1], None] * corners[edges[:, 0]])
         slopes = np.concatenate([of_corners, of_middles])
         rows.append(np.sqrt(w) * (slopes - slopes.mean(axis=1, keepdims=True)))
-    corner, middle = SHARES[dim]
+    corner, middle = HRZ_FRACTIONS[dim]
     shares = np.concatenate([np.full(dim + 1, corner), np.full(len(edges), middle)])
     return float(np.linalg.norm(np.hstack(rows) / np.sqrt(shares)[:, None], 2) ** 2)
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fracture.edge_stress import edge_vectors
-from ..mechanics.inertia import share_of_corner
+from ..mechanics.inertia import corner_mass_fraction
 from ..mechanics.material_fields import PerCell
 from ..mechanics.stress import Stress
 from ..mesh.simplices import local_edges
@@ -40,7 +40,7 @@ def edge_frequencies(stress: Stress) -> EdgeFrequencies:
     cells = np.flatnonzero(~intact.all(axis=1))
     intact = intact[cells]
     projected = projected_frequencies(stress, cells, intact) if stress.chi is None else None
-    springs = spring_frequencies(stress, cells, ~intact) if stress.closes else None
+    springs = spring_frequencies(stress, cells, ~intact) if stress.cracks_close else None
     return EdgeFrequencies(cells, projected, springs)
 
 
@@ -75,7 +75,7 @@ def spring_frequencies(stress: Stress, cells: npt.NDArray[np.int64], broken: npt
     shortest = np.where(broken, square, np.inf).min(axis=1)
     k = _of(cells, spring_modulus(material, d, edges.shape[1]))
     rows = np.where(broken, broken @ np.abs(_joined(d)), 0.0).max(axis=1)
-    return np.asarray(k / shortest * rows / (share_of_corner(domain) * _of(cells, material.density)))
+    return np.asarray(k / shortest * rows / (corner_mass_fraction(domain) * _of(cells, material.density)))
 
 
 def _joined(dim: int) -> Values:

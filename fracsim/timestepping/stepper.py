@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from ..errors import NotConverged
 from ..mechanics.balance import Balance
-from ..mechanics.time_functions import Tabulated
+from ..mechanics.time_functions import TabulatedFunction
 from ..mesh.parallel import total
 from .energy_balance import acting, work_done
 from .protocols import Breaking, Flow, PassResult
@@ -72,7 +72,7 @@ class StepSizes:
     smallest: float
     adapt: bool = True
     breaking: float = math.inf
-    course: Tabulated | None = None
+    course: TabulatedFunction | None = None
     frames: float = 0.0
 
     def to_frame(self, t: float, dt: float) -> float:
@@ -167,16 +167,16 @@ class BalanceStepper:
 
     def start(self, velocity: Values | None = None) -> State:
         """The state at t = 0: at rest, or with a velocity, and in a dynamic study M a = f."""
-        n = self.balance.owned
+        n = self.balance.owned_dof_count
         v = np.zeros(n) if velocity is None else velocity
         return self.settle(State(np.zeros(n), v, np.zeros(n), dt=self.sizes.step))
 
     def settle(self, state: State) -> State:
         """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
-        balance, free = self.balance, self.balance.motion.free
-        balance.look_at(state.t, state.u, state.v)
-        applied, drag, a = balance.applied(), balance.drag(), state.a
-        unbalanced = balance.stress.force() - applied
+        balance, free = self.balance, self.balance.motion.free_dofs
+        balance.evaluate_at(state.t, state.u, state.v)
+        applied, drag, a = balance.applied_forces(), balance.damping_forces(), state.a
+        unbalanced = balance.stress.assemble_forces() - applied
         if drag is not None:
             unbalanced = unbalanced + drag
         if balance.scheme.carries_acceleration:
@@ -188,9 +188,9 @@ class BalanceStepper:
         """The state of a checkpoint, with a body whose damage and flow were read from it."""
         balance = self.balance
         self.breaking.restored()
-        balance.displace(state.u)
+        balance.set_displacement(state.u)
         self._recalled()
-        balance.restore(state.memory.get("saved", {}))
+        balance.from_checkpoint(state.memory.get("saved", {}))
         return self.remember(state)
 
     def forget(self) -> None:
@@ -218,7 +218,7 @@ class BalanceStepper:
         """Have the body as it was in a state (collective)."""
         self._recall(state)
         self._recall_flow_and_terms(state)
-        self.balance.displace(state.u)
+        self.balance.set_displacement(state.u)
 
     def _advance(self, state: State) -> tuple[State, StepReport]:
         began = time.perf_counter()
@@ -250,7 +250,7 @@ class BalanceStepper:
         return result
 
     def _memory(self) -> dict[str, object]:
-        return {"damage": self.breaking.memory(), "flow": self.flow.memory(), "terms": self.balance.memory()}
+        return {"damage": self.breaking.memory(), "flow": self.flow.memory(), "terms": self.balance.snapshot()}
 
     def _recall(self, state: State) -> None:
         if "damage" in state.memory and self.breaking.recall(state.memory["damage"]):
@@ -265,14 +265,14 @@ class BalanceStepper:
         """The step begins, for the first time or once more: with what the body had flowed at its start, and terms as
         they were there."""
         self._recall_flow_and_terms(state)
-        self.balance.begin(state.t + dt, dt, state.u, state.v, state.a)
+        self.balance.begin_step(state.t + dt, dt, state.u, state.v, state.a)
         self.breaking.begin(state.t, dt)
 
     def _recall_flow_and_terms(self, state: State) -> None:
         if "flow" in state.memory:
             self.flow.recall(state.memory["flow"])
         if terms := state.memory.get("terms"):
-            self.balance.recall(terms)
+            self.balance.restore(terms)
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end or the next frame, and no sliver left over before it."""
@@ -317,8 +317,8 @@ class BalanceStepper:
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
         """Arrive at the end of the step, let the body flow and break, and book it."""
         solve, broken, released = self._passes(state, dt, solve)
-        balance, lumped = self.balance, self.balance.mass.diagonal and self.balance.scheme.inertia
-        solved, acted = balance.u.x.array[: balance.owned].copy(), acting(balance, lumped=lumped)
+        balance, lumped = self.balance, self.balance.mass.is_diagonal and self.balance.scheme.inertia
+        solved, acted = balance.u.x.array[: balance.owned_dof_count].copy(), acting(balance, lumped=lumped)
         u, v, a = self._arrive(state, dt)
         work, viscous = work_done(balance, state, u, v, *acted, lumped=lumped)
         forces, drag = acted
@@ -340,9 +340,9 @@ class BalanceStepper:
         """The end of the step with its energies; those given are of this rank, J."""
         balance = self.balance
         self._check_finite(end, work + lost + elastic)
-        elastic += sum(term.stored() for term in balance.terms if term is not balance.stress)
-        worked, rubbed = balance.driven()
-        stiffened = balance.stiffen()
+        elastic += sum(term.stored_energy() for term in balance.terms if term is not balance.stress)
+        worked, rubbed = balance.step_work()
+        stiffened = balance.stiffen_contact()
         work, lost, elastic = work + worked + stiffened, lost + rubbed, elastic + stiffened
         kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
         work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
@@ -359,17 +359,17 @@ class BalanceStepper:
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
-        balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned
-        balance.arrive()
-        x = balance.u.x.array[: balance.owned].copy()
+        balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned_dofs
+        balance.accept_step()
+        x = balance.u.x.array[: balance.owned_dof_count].copy()
         u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
         if scheme.carries_acceleration:
-            a = balance.carried(dt, a)
+            a = balance.carried_acceleration(dt, a)
         if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:
             v[own], a[own] = led
         if scheme.alpha_f:
             self.flow.begin(dt)
-            balance.look_at(state.t + dt, u, v, a)
+            balance.evaluate_at(state.t + dt, u, v, a)
             balance.update_reactions()
         return u, v, a
 

@@ -90,7 +90,7 @@ def _in_touch(run: Any, contact: Any) -> list[tuple[float, int]]:
     while len(found) < STEPS:
         began = time.process_time()
         run.step()
-        if contact.stored() > 0:
+        if contact.stored_energy() > 0:
             found.append((time.process_time() - began, run.scene.stepper.solver.snes.its))
     return found
 

@@ -53,7 +53,7 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     middle = (domain.lower + domain.upper) / 2
     u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
     state = stepper.settle(replace(scene.start(), u=u))
-    energies, newton = [total(comm, scene.balance.stress.stored())[0]], []
+    energies, newton = [total(comm, scene.balance.stress.stored_energy())[0]], []
     while state.t < study["time"]["end"] * (1 - 1e-12):
         state, report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)

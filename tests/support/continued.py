@@ -156,13 +156,13 @@ def numbers(run: Run) -> Numbers:
     every = {each.name: getattr(state, each.name) for each in fields(state) if each.name not in ("memory", "before")}
     found = {key: np.array(value) for key, value in every.items() if value is not None and key != "elastic"}
     found |= {"probes": scene.probes(), "figures": np.array(run.breaks.figures)}
-    found |= {f"term.{key}": np.array(value) for key, value in scene.balance.saved().items()}
+    found |= {f"term.{key}": np.array(value) for key, value in scene.balance.to_checkpoint().items()}
     if scene.balance.stress.chi is not None:
         found["chi"] = scene.balance.stress.chi.x.array.copy()
     if scene.fracture is not None:
         found["integrity"] = scene.fracture.graph.integrity.copy()
     if (plastic := scene.balance.stress.material.plastic) is not None:
-        found["plastic"] = plastic.memory().copy()
+        found["plastic"] = plastic.snapshot().copy()
     return found
 
 

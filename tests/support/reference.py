@@ -50,10 +50,10 @@ def dense_tangent(scene: Scene, *, small: float | None = None) -> Values:
     """The assembled tangent at the present displacement, without inertia, as a dense matrix (serial); `small`: with
     moduli made positive."""
     balance = scene.balance
-    x = balance.vector.duplicate()
+    x = balance.work_vector.duplicate()
     x.array_w[:] = balance.u.x.array
-    balance.stiffness.assemble(small=small)
-    matrix = balance.stiffness.matrix.copy()
+    balance.tangent.assemble(psd_tolerance=small)
+    matrix = balance.tangent.matrix.copy()
     dense = matrix.convert(PETSc.Mat.Type.DENSE).getDenseArray().copy()
     x.destroy()
     return dense - (balance.c_a * np.diag(balance.mass.lumped) if balance.scheme.inertia else 0.0)

@@ -12,8 +12,8 @@ from fracsim.fracture.brittle.surface_criterion import BrittleSurfaces
 from fracsim.fracture.neighbour_average import NeighbourAverage
 from fracsim.fracture.strength import Strength
 from fracsim.mechanics.material_fields import material_fields
-from fracsim.mechanics.matrix_assembly import Assembler
-from fracsim.mechanics.stress import Stress, Weakening
+from fracsim.mechanics.matrix_assembly import VectorAssembler
+from fracsim.mechanics.stress import DegradationModel, Stress
 from fracsim.mesh.domain import Domain, distribute
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.closed_surface import split
@@ -33,7 +33,7 @@ def stiffness_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> St
     """Of a mesh of linear material."""
     domain = distribute(MPI.COMM_SELF, mesh)
     material = material_fields(domain, "linear", young=young, poisson=poisson, density=DENSITY)
-    stress = Stress(Assembler(domain), fem.Function(domain.space), material, Weakening("chi"))
+    stress = Stress(VectorAssembler(domain), fem.Function(domain.space), material, DegradationModel("chi"))
     return Stiffness(stress, np.full(domain.cell_count, DENSITY))
 
 

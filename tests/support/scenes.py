@@ -109,7 +109,7 @@ def cell_corners(scene: Scene) -> Values:
 def deform(scene: Scene, F: Values) -> None:
     """Give the body the homogeneous displacement u = (F - I) X."""
     X = positions(scene)
-    scene.balance.displace((X @ (F - np.eye(len(F))).T).reshape(-1))
+    scene.balance.set_displacement((X @ (F - np.eye(len(F))).T).reshape(-1))
 
 
 def break_across(scene: Scene, normal: list[float], at: float) -> None:

@@ -22,13 +22,13 @@ class Spring(Term):
     @classmethod
     def of(cls, parts: Parts) -> Spring:
         """As TERMS makes it."""
-        return cls(parts.u, parts.assembler.owned, 2.0)
+        return cls(parts.u, parts.assembler.owned_dof_count, 2.0)
 
     @property
     def _at(self) -> Values:
         return np.asarray(self._u.x.array[: self._owned])
 
-    def add_force(self, rows: Values) -> None:
+    def add_nodal_forces(self, rows: Values) -> None:
         """r += k u."""
         rows += self._k * self._at
 
@@ -39,7 +39,7 @@ class Spring(Term):
         K.setDiagonal(diagonal, PETSc.InsertMode.ADD)
         diagonal.destroy()
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """k u . u / 2, J."""
         return float(self._k * self._at @ self._at) / 2
 
@@ -60,13 +60,13 @@ class Tie(Term):
         i, j = self._ends
         return float(self._k * (self._u.x.array[i] - self._u.x.array[j]))
 
-    def add_force(self, rows: Values) -> None:
+    def add_nodal_forces(self, rows: Values) -> None:
         """Equal and opposite."""
         i, j = self._ends
         rows[i] += self._force
         rows[j] -= self._force
 
-    def coupling(self) -> PETSc.Mat:
+    def coupling_matrix(self) -> PETSc.Mat:
         """k [[1, -1], [-1, 1]] on the two dofs."""
         i, j = self._ends
         values = self._k * np.array([1.0, -1.0, -1.0, 1.0])
@@ -74,11 +74,11 @@ class Tie(Term):
         self._matrix.assemble()
         return self._matrix
 
-    def stored(self) -> float:
+    def stored_energy(self) -> float:
         """k (u_i - u_j)^2 / 2, J."""
         return self._force**2 / (2 * self._k)
 
-    def longest_step(self, change: Values) -> float:
+    def max_step_fraction(self, change: Values) -> float:
         """Half, while the two are pulled apart by more than a millionth in a step."""
         i, j = self._ends
         self.steps += 1

@@ -31,6 +31,6 @@ def strained(folder: Path) -> None:
     scene = build_scene(MPI.COMM_SELF, study(BAR, output={"fields": fields, "surface": True}))
     run = Run(scene, folder)
     run.state = replace(run.state, u=(scene.domain.nodes @ A.T).ravel())
-    scene.balance.displace(run.state.u)
+    scene.balance.set_displacement(run.state.u)
     run.write_frame()
     run.history.close()

@@ -32,7 +32,7 @@ def thrown(steps: int = 3) -> tuple[Scene, Walk]:
 
 def _held_back(scene: Scene) -> Values:
     """(n, 1) lengths."""
-    domain, y = scene.domain, scene.balance.vector.duplicate()
+    domain, y = scene.domain, scene.balance.work_vector.duplicate()
     near = np.exp(-100 * np.sum((positions(scene) - 1.0) ** 2, axis=1))
     y.array_w[:] = np.repeat(100 * domain.mean_edge * near, 3)
     line_search.hold_back(domain, y, y)

@@ -7,7 +7,7 @@ from threading import Lock
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.mechanics.jit import compile_together
+from fracsim.mechanics.jit import compile_collectively
 from fracsim.mesh.parallel import from_root, on_root
 
 comm = MPI.COMM_WORLD
@@ -42,7 +42,7 @@ for attempt in (
     lambda: from_root(comm, fails(KeyError("gone"))),
     lambda: on_root(comm, fails(SystemExit(4))),
     lambda: on_root(comm, fails(Unsendable())),
-    lambda: compile_together(comm, fails_on_one),
+    lambda: compile_collectively(comm, fails_on_one),
 ):
     try:
         attempt()

@@ -182,20 +182,20 @@ def dead_cells(mass: str, *ways: str) -> Found:
     block = RUNS["block"]
     scene, state = make_scene(**block | {"time": block["time"] | {"mass": mass}})
     domain, balance = scene.domain, scene.balance
-    balance.begin(0.05, 0.05, state.u, state.v, state.a)
-    balance.displace(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
+    balance.begin_step(0.05, 0.05, state.u, state.v, state.a)
+    balance.set_displacement(np.sin(1e3 * domain.nodes[: domain.node_count]).reshape(-1) / 100)
     weaken(scene)
-    x, y = balance.vector.duplicate(), balance.vector.duplicate()
+    x, y = balance.work_vector.duplicate(), balance.work_vector.duplicate()
     x.array_w[:] = np.cos(1e3 * domain.nodes[: domain.node_count]).reshape(-1)
     found: Found = {}
     for name in ("with", "without", *(f"{way}-without" for way in ways)):
         if name.startswith("fitted"):
-            assert balance.stiffness.shrink(0.7)
-        blocks = balance.stiffness.in_blocks() if name.startswith(("blocks", "brought")) else None
-        balance.stiffness.assemble(blocks_alone=name.startswith("blocks"))
-        (balance.stiffness.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
+            assert balance.tangent.shrink(0.7)
+        blocks = balance.tangent.switch_to_blocks() if name.startswith(("blocks", "brought")) else None
+        balance.tangent.assemble(blocks_only=name.startswith("blocks"))
+        (balance.tangent.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
-        found[f"residual-{name}-dead"] = domain.gather_nodes(balance.forces().reshape(-1, domain.dim))
+        found[f"residual-{name}-dead"] = domain.gather_nodes(balance.update_forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
         balance.damage_changed()
     return {f"{mass}-{key}": values for key, values in found.items()}
@@ -218,20 +218,20 @@ def hanging() -> Found:
     whole, chi = some_whole(domain.cell_input), balance.stress.chi
     assert chi is not None
     chi.x.array[: domain.cell_count] = whole
-    balance.begin(1e3, 1e3, state.u, state.v, state.a)
-    balance.stiffness.assemble()
+    balance.begin_step(1e3, 1e3, state.u, state.v, state.a)
+    balance.tangent.assemble()
     jacobi = PETSc.PC().create(domain.comm)
     jacobi.setType("jacobi")
-    jacobi.setOperators(balance.stiffness.matrix)
+    jacobi.setOperators(balance.tangent.matrix)
     count, part = parts_of_nodes(domain, whole)
     loose = loose_parts(balance, jacobi)
-    assert loose is not None and loose.follow(balance.stiffness.matrix)
+    assert loose is not None and loose.follow(balance.tangent.matrix)
     x = domain.nodes[: domain.node_count]
     turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
-    turned[~balance.motion.free.reshape(-1, 3)] = 0.0
-    a, b = balance.vector.duplicate(), balance.vector.duplicate()
+    turned[~balance.motion.free_dofs.reshape(-1, 3)] = 0.0
+    a, b = balance.work_vector.duplicate(), balance.work_vector.duplicate()
     a.array_w[:] = turned.reshape(-1)
-    balance.stiffness.matrix.mult(a, b)
+    balance.tangent.matrix.mult(a, b)
     loose.pc.apply(b, a)
     b.array_w[:] = np.cos(1e3 * x).reshape(-1)
     found = {"hanging-turned": turned, "hanging-found": a.array_r.reshape(-1, 3).copy(), "hanging-part": part}
@@ -248,7 +248,7 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
     found[f"{name}-energy"] = np.array([state.work, state.dissipated])
     found[f"{name}-mass"] = domain.gather_nodes(scene.balance.mass.lumped.reshape(-1, domain.dim))
     if scene.balance.stress.material.plastic is not None:
-        memory = scene.balance.stress.material.plastic.memory()
+        memory = scene.balance.stress.material.plastic.snapshot()
         found[f"{name}-plastic"] = domain.gather_cells(memory.reshape(domain.cell_count, -1, memory.shape[1]))
     if scene.fracture is not None and scene.balance.stress.chi is not None:
         found[f"{name}-chi"] = domain.gather_cells(scene.balance.stress.chi.x.array[: domain.cell_count])
@@ -405,9 +405,9 @@ def squeezed() -> Found:
     next(steps), next(steps)
     break_across(scene, [0.3, 1.0], 0.4)
     state.remember()
-    at_once = scene.balance.saved()
+    at_once = scene.balance.to_checkpoint()
     next(steps), next(steps)
-    later, u = scene.balance.saved(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
+    later, u = scene.balance.to_checkpoint(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
     walls = {f"squeezed-{when}-{name.removeprefix('contact.')}": np.array(values)
              for when, saved in (("at-once", at_once), ("later", later)) for name, values in saved.items()}  # fmt: skip
     return walls | {"squeezed-u": u}

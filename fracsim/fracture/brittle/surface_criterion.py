@@ -99,7 +99,7 @@ class BrittleSurfaces:
     def _gradients(self, cells: Cells) -> Values:
         """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0). Of quadratic cells
         the mean, as stress is: that of linear cells with `_mean_corners`."""
-        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.corners(cells)
+        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.cell_corners(cells)
         if self._domain.order == 2 and not self._stress.energy.linear:
             now = self._mean_corners(cells)
         span, moved = (corners[:, 1:] - corners[:, :1] for corners in (rest, now))

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from ...mechanics.jit import quadratic_functions
+from ...mechanics.jit import quadratic_shape_functions
 from ...mesh.domain import Domain
 
 Ints = npt.NDArray[np.integer]
@@ -34,7 +34,7 @@ class Patch:
         if domain.order == 1:
             corners = domain.dim + 1
             return cls(domain.cell_nodes[cells], slopes[:, None], np.full((1, corners), 1 / corners))
-        values, by_coordinate = quadratic_functions(domain.mesh)
+        values, by_coordinate = quadratic_shape_functions(domain.mesh)
         each = np.einsum("pka,nai->npki", by_coordinate, slopes[:, 1:])
         return cls(domain.all_cell_nodes[cells], each, values)
 

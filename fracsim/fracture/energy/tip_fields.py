@@ -139,13 +139,13 @@ class Sight:
         sigma = self._eshelby(patch.everywhere(chi), there, stored, H)
         inertia, push = np.zeros((2, len(H), self._domain.dim))
         if self.motion is not None:
-            density = np.where(self._stress.closes | (chi > 0), self._density[cells], 0.0)
+            density = np.where(self._stress.cracks_close | (chi > 0), self._density[cells], 0.0)
             v, a = map(self._domain.with_ghosts, self.motion)
             kinetic, inertia, push = self._moved(patch.everywhere(density), H, patch, v, a)
             for axis in range(self._domain.dim):
                 sigma[:, axis, axis] += kinetic
         sigma, inertia, H, push = map(patch.means, (sigma, inertia, H, push))
-        if self._stress.closes:
+        if self._stress.cracks_close:
             sigma += self._pressed(cells, 1 - chi)
         flat = (H, push) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
         seen, sigma, inertia, H, push = asked(own, sigma, inertia, *flat)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..c_library import at, library
+from ..c_library import at, load_library
 
 SOURCE = Path(__file__).with_suffix(".c")
 Ints = npt.NDArray[np.int64]
@@ -57,7 +57,7 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Moments:
     given = [np.ascontiguousarray(points), *(np.ascontiguousarray(each, np.int64) for each in (elements, body))]
     many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
     near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # each about a point of its own
-    sums = library(SOURCE).sums
+    sums = load_library(SOURCE).sums
     sums(*map(c_int64, (len(elements), d, count)), *map(at, (*given, many, near, volume, first, second)))
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
     across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]

@@ -82,7 +82,7 @@ class SurfaceOutput:
             if broken is not None and pattern is not None:
                 at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
                 surface.update(pattern, cut)
-            beside = {name: drawn for term in self._beside for name, drawn in term.drawn(state.t).items()}
+            beside = {name: drawn for term in self._beside for name, drawn in term.output_surfaces(state.t).items()}
             files.write(surface.at(state.t, *at_corners, broken_at=at, fields=nodal, apart=self._apart), beside)
             if self._passing is not None:
                 self._passing.look(state.t, surface, at_corners[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ...mechanics.surface_data import Drawn
+from ...mechanics.surface_data import SurfaceData
 from ..atomic_write import append, replace_text
 from ..file_ownership import FRAME
 from .body_surface import Frame
@@ -33,7 +33,7 @@ class SurfaceFiles:
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
         self._columns = columns(dim, turning=turning)
         self._entries = self._kept(resume_at) if resume_at is not None and self._pvd.exists() else []
-        self._last: dict[str, tuple[Drawn, str]] = {}  # what was drawn beside the body, and its file
+        self._last: dict[str, tuple[SurfaceData, str]] = {}  # what was drawn beside the body, and its file
         rows = self._kept_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
         keep = {entry.file for entry in self._entries}
@@ -55,7 +55,7 @@ class SurfaceFiles:
         """Frames in each file."""
         return {self._pvd.name: len(self.times), self._csv.name: self._with_rows}
 
-    def write(self, frame: Frame, beside: dict[str, Drawn] | None = None) -> Path:
+    def write(self, frame: Frame, beside: dict[str, SurfaceData] | None = None) -> Path:
         """The VTUs first, then the files that name them; `beside`: by the names of obstacles."""
         number = len(self.times)
         body = Entry(frame.t, f"surface/surface_{number:06d}.vtu")
@@ -67,7 +67,7 @@ class SurfaceFiles:
         self._write_pvd()
         return self._folder / body.file
 
-    def _drawn(self, name: str, drawn: Drawn, number: int) -> str:
+    def _drawn(self, name: str, drawn: SurfaceData, number: int) -> str:
         """The file of what stands beside the body: the last one for as long as it does not move."""
         before, file = self._last.get(name, (None, ""))
         if before is None or not np.array_equal(before.points, drawn.points):

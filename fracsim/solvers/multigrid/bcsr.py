@@ -18,7 +18,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 
-from ...mesh.c_library import FASTER, at, built_together, prepared
+from ...mesh.c_library import FAST_FLAGS, at, compile_on_all_ranks, unchecked_function
 from .hierarchy import Blocks
 
 Single = npt.NDArray[np.float32]
@@ -67,7 +67,7 @@ class Rows:
         self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
         self._all = *self._pattern, at(numbers)
         self._residual, self._smooth, self._add = (
-            prepared(made, name, *self._all) for name in ("residual", "smooth", "add")
+            unchecked_function(made, name, *self._all) for name in ("residual", "smooth", "add")
         )  # fmt: skip
 
     def take(self, blocks: Values, left: Values, right: Values) -> None:
@@ -122,7 +122,7 @@ class Diagonal:
 def code(comm: MPI.Comm, size: int) -> CDLL | None:
     """For blocks of size x size; None without a compiler (collective)."""
     lanes = next(n for n in (2, 4, 8) if n >= size)
-    return built_together(comm, "rows", SOURCE.read_text(), [*FASTER, f"-DR={size}", f"-DLANES={lanes}"])
+    return compile_on_all_ranks(comm, "rows", SOURCE.read_text(), [*FAST_FLAGS, f"-DR={size}", f"-DLANES={lanes}"])
 
 
 class Between:
@@ -134,7 +134,9 @@ class Between:
         pattern = c_int64(len(P.starts) - 1), at(P.starts), at(P.columns)
         made.scale(*pattern, at(P.values), at(left), at(right), at(numbers))
         self._all = *pattern, at(numbers)
-        self._add, self._add_transposed = (prepared(made, name, *self._all) for name in ("add", "add_transposed"))
+        self._add, self._add_transposed = (
+            unchecked_function(made, name, *self._all) for name in ("add", "add_transposed")
+        )
 
     def add(self, x: Vector, y: Vector) -> None:
         """y += P x, of x with its ghosts."""
@@ -147,4 +149,6 @@ class Between:
 
 def prolongation_code(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:
     """For blocks of that size; None without a compiler (collective)."""
-    return built_together(comm, "between", PROLONGATION_SOURCE.read_text(), [*FASTER, f"-DR={rows}", f"-DC={columns}"])
+    return compile_on_all_ranks(
+        comm, "between", PROLONGATION_SOURCE.read_text(), [*FAST_FLAGS, f"-DR={rows}", f"-DC={columns}"]
+    )

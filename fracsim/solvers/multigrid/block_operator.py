@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from petsc4py import PETSc
 
 if TYPE_CHECKING:
-    from ...mechanics.bcsr_matvec import Products
+    from ...mechanics.bcsr_matvec import BlockMatrix
     from .fine_level import Finest
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
@@ -31,7 +31,7 @@ class Blocks:
         single: what is multiplied with instead, in single precision.
     """
 
-    def __init__(self, tangent: PETSc.Mat, assembled: Products | None, pattern: Callable[[], int]) -> None:
+    def __init__(self, tangent: PETSc.Mat, assembled: BlockMatrix | None, pattern: Callable[[], int]) -> None:
         """`pattern`: Stiffness.pattern."""
         self.tangent, self._pattern = tangent, pattern
         self.assembled = assembled

@@ -50,4 +50,4 @@ class Finest(Level):
         self._rows.multiply(self._lost, self._unscaled, self._z, given, found)
         to, by_nodes = (each.reshape(-1, self._size) for each in (found, given))
         for each in self.beside:
-            to[each.nodes] += each.product(by_nodes[each.nodes])
+            to[each.nodes] += each.multiply(by_nodes[each.nodes])

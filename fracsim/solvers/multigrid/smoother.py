@@ -22,7 +22,7 @@ from .hierarchy import Blocks, Copy
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ...mechanics.tie_matrix import Tied
+    from ...mechanics.tie_matrix import TieMatrix
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -62,7 +62,7 @@ class Level:
         large = np.abs(copy.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
         self._comm, self._owned, self._size = nodes.comm, nodes.size_local * size, size
-        self.beside: list[Tied] = []
+        self.beside: list[TieMatrix] = []
         self._rows = Rows(made, size, own.starts, own.columns)
         self._inverse = Diagonal(made, size, nodes.size_local)
         self.b, self.x, self.left, self._d, self._to = (Vector(nodes, size) for _ in range(5))
@@ -144,7 +144,7 @@ class Level:
         """Nodes, and the product of x with what is beside the blocks there."""
         for each in self.beside:
             scale = self._scale_at(each.nodes)
-            yield each.nodes, scale * each.product(scale * self._by_nodes(self.x)[each.nodes])
+            yield each.nodes, scale * each.multiply(scale * self._by_nodes(self.x)[each.nodes])
 
     def _scale_at(self, nodes: Ints) -> Values:
         return self.scale[: self._owned].reshape(-1, self._size)[nodes]

@@ -47,7 +47,7 @@ from .hierarchy import Blocks, copied
 from .smoother import Effort, Level
 
 if TYPE_CHECKING:
-    from ...mechanics.bcsr_matvec import Products
+    from ...mechanics.bcsr_matvec import BlockMatrix
 
 Values = npt.NDArray[np.float64]
 # by the size of a level's blocks; by the sizes of the finer level's and the coarser's, for what is between them
@@ -68,7 +68,7 @@ class Cycle:
         thorough: whether more is done with coarser levels, which takes as long as the finest then.
     """
 
-    def __init__(self, body: PETSc.PC, products: Products, codes: Codes) -> None:
+    def __init__(self, body: PETSc.PC, products: BlockMatrix, codes: Codes) -> None:
         """`body`: of the kind that `in_single` takes; `products`: with the tangent, which it has yet to `follow`;
         `codes`: for the sizes of its blocks (collective)."""
         self.body, self._products, self._tangent = body, products, products.matrix
@@ -122,7 +122,7 @@ class Cycle:
 
     def follow(self) -> None:
         """Take the tangent as it is now for the finest level (collective)."""
-        self.finest.beside = self._products.beside
+        self.finest.beside = self._products.ties
         self.finest.take(self._values)
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -174,7 +174,7 @@ class Cycle:
             each.destroy()
 
 
-def in_single(body: PETSc.PC, products: Products) -> Cycle | None:
+def in_single(body: PETSc.PC, products: BlockMatrix) -> Cycle | None:
     """The cycle of multigrid that is set up from a tangent, of the products with this; None where it is of another kind
     than PETSc's own choice for smoothed aggregation, or there is no compiler (collective)."""
     if body.getType() != "gamg" or body.getMGLevels() < 2:

@@ -38,11 +38,11 @@ def problem_of(scene: Any, step: float) -> dict[str, Any]:
     `step`: s; 0: statics.
     """
     domain, balance, study = scene.domain, scene.balance, scene.study
-    rest, size = np.zeros(balance.owned), domain.dim
-    balance.look_at(study.time.end, rest, rest)
-    held = np.zeros(balance.owned, bool)
-    held[balance.motion.owned] = True
-    force = np.where(held, 0.0, -balance.forces())
+    rest, size = np.zeros(balance.owned_dof_count), domain.dim
+    balance.evaluate_at(study.time.end, rest, rest)
+    held = np.zeros(balance.owned_dof_count, bool)
+    held[balance.motion.owned_dofs] = True
+    force = np.where(held, 0.0, -balance.update_forces())
     material = study.material
     return {
         "points": domain.nodes, "cells": in_their_order(domain), "held": held.reshape(-1, size),

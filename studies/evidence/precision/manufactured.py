@@ -54,7 +54,7 @@ class Load(Term):
         energy = parts.stress.material.energy
         self._P = first_piola_kirchhoff(energy, F, turn(F) if energy.needs_rotation else None)
 
-    def work(self, w: Expr, dx: ufl.Measure) -> Form:
+    def virtual_work(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work, N m."""
         return -ufl.inner(self._P, ufl.grad(w)) * dx(metadata={"quadrature_degree": 6})
 
@@ -89,7 +89,7 @@ def solved(energy: str, order: int, dim: int, h: float) -> Scene:
         scene = build_scene(MPI.COMM_SELF, validate(study, "manufactured"))
     motion, nodes = scene.balance.motion, scene.domain.nodes
     values = np.stack(wanted(nodes.T), axis=1).reshape(-1)[motion.dofs]
-    motion.at = lambda t: t * values  # type: ignore[method-assign]
+    motion.displacements_at = lambda t: t * values  # type: ignore[method-assign]
     _, report = scene.stepper.advance(scene.start())
     assert report.solve.converged
     return scene
