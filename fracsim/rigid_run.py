@@ -33,7 +33,7 @@ from .output.run_folder import OutputClock, check_text, make_folder, missing_fra
 from .output.summary import say, write_summary
 from .rigid.rigid_stepper import RigidReport
 from .scene.rigid_scene import RigidScene
-from .timestepping.stepper import Abandoned
+from .timestepping.stepper import StepAborted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -204,7 +204,7 @@ class RigidRun:
         while not self.scene.ended(self.state):
             try:
                 report = self.step()
-            except Abandoned:
+            except StepAborted:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
             if done or self._clock.due(self.state.t, self.state.step):

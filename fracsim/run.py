@@ -32,7 +32,7 @@ from .scene import Scene, build_scene
 from .study import Study
 from .study.conditions import initial_cracks
 from .study.reader import add_missing_defaults, study_text
-from .timestepping.stepper import Abandoned, StepReport
+from .timestepping.stepper import StepAborted, StepReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -96,7 +96,7 @@ class Run:
             raise refusal(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.restored()
-        self.state = scene.stepper.resume(state)
+        self.state = scene.stepper.from_checkpoint(state)
         asked = scene.study.model_dump(mode="json")["time"]["step"]
         if notes.values()["time"]["step"] != asked:  # else the size of the last step goes on
             self.state = replace(self.state, dt=scene.study.time.max_step)
@@ -156,7 +156,7 @@ class Run:
         """Take a step and write its row of history.csv, but no frame. Raises NotConverged, CannotWrite, and Abandoned
         where the run is to stop, with the state of before (collective)."""
         if self._forgets:
-            self.scene.stepper.forget()
+            self.scene.stepper.discard_unsaved_data()
             self._forgets = False
         self.interrupt.begin_step()
         self.state, report = self.scene.stepper.advance(self.state)
@@ -222,7 +222,7 @@ class Run:
 
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
-        self.scene.stepper.heed(self.interrupt.abandons)
+        self.scene.stepper.set_stop_request(self.interrupt.abandons)
         try:
             try:
                 self._loop()
@@ -245,7 +245,7 @@ class Run:
         while not self.ended:
             try:
                 report = self.step()
-            except Abandoned:
+            except StepAborted:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.ended
             if done or self._clock.due(self.state.t, self.state.step):
@@ -259,7 +259,7 @@ class Run:
 
     def _tell(self, report: StepReport) -> None:
         broken, _, pieces = self.breaks.figures
-        more = f"Newton {report.solve.newton}  {report.seconds:.2g} s/step"
+        more = f"Newton {report.solve.newton_iterations}  {report.seconds:.2g} s/step"
         self._progress.update(Done(self.state.t, report.dt, self.state.step, broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
@@ -404,7 +404,7 @@ def _run_rigid(
 
     def heed() -> None:
         if interrupt.abandons():
-            raise Abandoned
+            raise StepAborted
 
     alone, progress = comm.size == 1, Progress(first=comm.rank == 0, end=study.time.end)
     with Interrupt(MPI.COMM_SELF, wall_limit, alone=alone) as interrupt, FolderLock(folder) as lock, progress:

@@ -97,7 +97,7 @@ def break_now(run: Any, flags: Any) -> None:
     fracture.graph.break_idle()
     fracture.degradation(True, *fracture.evaluate())
     fracture.changed()
-    run.state = run.scene.stepper.remember(run.state)
+    run.state = run.scene.stepper.with_current_history(run.state)
     run.note_breaks()
     run.scene.balance.damage_changed()
     run.scene.solver.damage_changed()
@@ -144,8 +144,8 @@ class Bare:
         from ..forms.energies import NeoHookean, lame
         from ..mechanics.jit import jit_options
         from ..mechanics.matrix_assembly import TangentAssembler
-        from ..solvers.linear_solver import rigid_body_modes
-        from ..solvers.preconditioner import MULTIGRID
+        from ..solvers.linear_solver import near_nullspace
+        from ..solvers.preconditioner import GAMG_OPTIONS
 
         scene = study(n)
         V, mesh = domain.space, domain.mesh
@@ -173,12 +173,12 @@ class Bare:
         self.assembly = TangentAssembler(self.K) if in_lanes else None
         self.A = self.assembly.matrix if self.assembly is not None else fem_petsc.create_matrix(self.K)
         self.b = fem_petsc.create_vector(self.R)
-        self.A.setNearNullSpace(rigid_body_modes(domain))
+        self.A.setNearNullSpace(near_nullspace(domain))
         self.diagonal, self.du = self.A.createVecLeft(), self.A.createVecLeft()
         self.ksp = PETSc.KSP().create(mesh.comm)
         self.ksp.setOptionsPrefix("bare_")
         options = PETSc.Options()
-        for key, value in (MULTIGRID | {"ksp_type": "cg", "ksp_rtol": 1e-6}).items():
+        for key, value in (GAMG_OPTIONS | {"ksp_type": "cg", "ksp_rtol": 1e-6}).items():
             options[f"bare_{key}"] = str(value).lower() if isinstance(value, bool) else value
         self.ksp.setFromOptions()
         self.ksp.setOperators(self.A)

@@ -49,7 +49,7 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     u, tangents = state.u.copy(), len(made)
     assert scene.solver is not None and scene.solver._newton._patches is not None
     made.clear()
-    monkeypatch.setattr(nonlinear_solver.Solver, "damage_changed", lambda *_: None)
+    monkeypatch.setattr(nonlinear_solver.NonlinearSolver, "damage_changed", lambda *_: None)
     scene, state = thrown()
     assert scene.solver is not None and scene.solver._newton._patches is None
     np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
@@ -68,8 +68,8 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
     u[corner] = -0.3
     balance.set_displacement(u.reshape(-1))
     before, high = balance.update_forces().copy().reshape(-1, 3), balance.incremental_potential()[0]
-    few = nonlinear_elimination.patches_of(balance)
-    assert few is not None and few.rest(0.0)
+    few = nonlinear_elimination.create_elimination(balance)
+    assert few is not None and few.relax_nodes(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, 3) - u).max(axis=1))
     touched = np.unique(scene.domain.cell_nodes[(scene.domain.cell_nodes == corner).any(axis=1)])
     assert set(touched) <= set(moved) and len(moved) < 0.7 * len(u)
@@ -94,8 +94,8 @@ def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatc
     u[node] += 2.0
     balance.set_displacement(u.reshape(-1))
     before, high, stored = balance.update_forces().copy(), balance.incremental_potential()[0], tethers.stored_energy()
-    few = nonlinear_elimination.patches_of(balance)
-    assert few is not None and few.rest(0.0)
+    few = nonlinear_elimination.create_elimination(balance)
+    assert few is not None and few.relax_nodes(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, dim) - u).max(axis=1))
     assert node in moved
     assert np.linalg.norm(

@@ -72,7 +72,7 @@ def test_quadratic_cells_are_cut_as_linear_ones(dim: int) -> None:
     for order in (1, 2):
         mesh = {"builder": "box", "size": [1.0, 0.8, 0.5][:dim], "h": 0.2, "pattern": "unstructured", "order": order}
         scene = strained(dim, stretched(dim, [1.0, 0.3, 0.2]), "neo-hookean", mesh=mesh)
-        assert scene.fracture().broken > 0
+        assert scene.fracture().broken_edges > 0
         found.append((*cuts(scene), scene.fracture.criterion.starts))
         assert scene_surface(scene).pieces == 2
     np.testing.assert_array_equal(found[0][0], found[1][0])
@@ -104,7 +104,7 @@ def test_a_planar_cut_halves_a_cylinder(axis: list[float]) -> None:
     are those of the mesh on the two sides of that plane, to round-off."""
     mesh = {"builder": "cylinder", "radius": 0.25, "length": 1.0, "h": 0.1, "axis": "x"}
     scene = strained(3, stretched(3, axis), mesh=mesh, fracture={"strength": 0.05, "approach": "edge"})
-    assert scene.fracture().broken > 0
+    assert scene.fracture().broken_edges > 0
     made, start = scene_surface(scene), scene.fracture.criterion.starts
     assert made.pieces == 2 and start.shape == (1, 3)
     above = volume_above(mesh_of(scene), start[0], np.array(axis) / np.linalg.norm(axis))
@@ -229,16 +229,16 @@ def test_the_cell_over_its_strength_starts_first() -> None:
     """Stress 0.056 everywhere (E e = 0.06 at most): the weak region breaks, and with it off nothing does."""
     weak = {"strength": 1.0, "approach": "chi"}
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture=weak)
-    assert scene.fracture().broken == 0 and len(scene.fracture.criterion.starts) == 0
+    assert scene.fracture().broken_edges == 0 and len(scene.fracture.criterion.starts) == 0
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture={"strength": 0.06 * (1 - 1e-5)})
-    assert scene.fracture().broken > 0
+    assert scene.fracture().broken_edges > 0
     scene = strained(2, stretched(2, [1.0, 0.0]), fracture={"strength": 0.06 * (1 + 1e-5)})
-    assert scene.fracture().broken == 0
+    assert scene.fracture().broken_edges == 0
 
 
 def test_compression_starts_nothing() -> None:
     scene = strained(3, stretched(3, [1.0, 0.0, 0.0], -0.5))
-    assert scene.fracture().broken == 0
+    assert scene.fracture().broken_edges == 0
 
 
 # --- directions -----------------------------------------------------------------------------------------------------
@@ -284,7 +284,7 @@ def test_a_turned_body_has_the_same_cuts(dim: int) -> None:
     U = stretched(dim, [1.0, 0.5, 0.2], 0.3)
     found = [strained(dim, Q @ U, "neo-hookean", brittle={"surfaces": 4}) for Q in (np.eye(dim), rotation(dim, 3))]
     for scene in found:
-        assert scene.fracture().broken > 0
+        assert scene.fracture().broken_edges > 0
     (keys, cut), (turned_keys, turned_cut) = map(cuts, found)
     assert np.array_equal(keys, turned_keys)
     np.testing.assert_allclose(cut, turned_cut, atol=1e-8)

@@ -18,9 +18,9 @@ from fracsim.mechanics.time_functions import constant_function
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.selectors import Group
 from fracsim.meshes.builders.box import Box
-from fracsim.solvers.nonlinear_solver import Solver
+from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.timestepping.implicit import ImplicitStepper
-from fracsim.timestepping.protocols import NoFlow, Unbreakable
+from fracsim.timestepping.protocols import NoFracture, NoPlasticFlow
 from fracsim.timestepping.stepper import StepSizes
 
 LENGTH, YOUNG, DENSITY = 2.0, 8.0, 2.0  # m, Pa, kg/m^3: waves of 2 m/s
@@ -47,7 +47,7 @@ def test_a_bar_swings_in_its_first_mode() -> None:
     terms = [Stress(assembler, u, material), Inertia(u, mass)]
     balance = Balance(assembler, u, terms, motion, mass, Newmark(), dt)
     sizes = StepSizes(dt, end=25 * dt, smallest=dt)
-    stepper = ImplicitStepper(balance, sizes, NoFlow(), Unbreakable(balance), Solver(balance, {}))
+    stepper = ImplicitStepper(balance, sizes, NoPlasticFlow(), NoFracture(balance), NonlinearSolver(balance, {}))
     state = stepper.start((np.sin(k * domain.nodes[:, :1]) * [1.0, 0.0]).reshape(-1))
     while state.step < 25:
         state, report = stepper.advance(state)

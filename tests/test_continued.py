@@ -16,7 +16,7 @@ from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from fracsim.study.reader import study_text
-from fracsim.timestepping.stepper import Abandoned
+from fracsim.timestepping.stepper import StepAborted
 from support.continued import CASES, differences, other, unlike
 from support.ranks import run_on_ranks
 from support.scenes import make_study
@@ -48,9 +48,9 @@ def test_a_solver_that_is_renewed_leaves_nothing(tmp_path: Path, name: str) -> N
     assert solver is not None
     run.step()
     before = [weakref.ref(each) for each in (solver._newton, solver.linear, run.scene.balance.tangent)]
-    run.scene.stepper.heed(lambda: next(asked, True))
+    run.scene.stepper.set_stop_request(lambda: next(asked, True))
     run.checkpoint()
-    with pytest.raises(Abandoned):
+    with pytest.raises(StepAborted):
         while True:
             run.step()
     gc.collect()

@@ -17,7 +17,7 @@ from fracsim.mechanics.tie_matrix import TieMatrix
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers import preconditioner
 from fracsim.solvers.multigrid import block_operator
-from fracsim.solvers.nonlinear_solver import Solver
+from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
 
@@ -39,9 +39,9 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
         )
         scene = build_scene(MPI.COMM_SELF, data)
         state = Walk(scene)
-        before = [state.advance().solve.krylov for _ in range(2)][-1]
+        before = [state.advance().solve.krylov_iterations for _ in range(2)][-1]
         cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])
-        more.append([state.advance().solve.krylov for _ in range(3)][-1] - before)
+        more.append([state.advance().solve.krylov_iterations for _ in range(3)][-1] - before)
         assert scene.fracture.graph.split.any()
     assert more[0] < more[1] / 2, f"{more[0]} iterations more than before the crack, {more[1]} with such aggregates"
 
@@ -74,7 +74,7 @@ def bent_its(size: tuple[float, ...], h: float, given: dict[str, Any]) -> int:
         solver={"snes_type": "ksponly", "ksp_rtol": 1e-5} | given,
     )
     state = Walk(build_scene(MPI.COMM_SELF, data))
-    return [state.advance().solve.krylov for _ in range(4)][-1]
+    return [state.advance().solve.krylov_iterations for _ in range(4)][-1]
 
 
 def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,7 +90,7 @@ def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) 
     scene, by_nodes = shattered(0.025, 0, {}, 3)
     assert by_nodes[-1] <= 1.5 * by_entries[-1]
     solver = scene.solver
-    assert isinstance(solver, Solver)
+    assert isinstance(solver, NonlinearSolver)
     for due in (preconditioner.Due.NOTHING, preconditioner.Due.REFRESH, preconditioner.Due.REBUILD):
         solver.linear.preconditioner.due = due
         solver.linear_response(np.ones(scene.balance.owned_dof_count))
@@ -134,7 +134,7 @@ def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.Monk
     scene, its = shattered(0.04, 10, {"ksp_rtol": 1e-9}, 6, step=5e-3)
     asked, _ = shattered(0.04, 10, {"ksp_rtol": 1e-9, "pc_type": "jacobi"}, 6, step=5e-3)
     solver, u, v = scene.solver, scene.balance.u.x.array, asked.balance.u.x.array
-    assert isinstance(solver, Solver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
+    assert isinstance(solver, NonlinearSolver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
     np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
     monkeypatch.setattr(preconditioner, "SWEPT", 1.0)
     solver.linear_response(np.ones(scene.balance.owned_dof_count))
@@ -164,7 +164,7 @@ def shattered(
     state = Walk(scene)
     state.advance()
     cut(scene, random_planes(planes, scene.domain.lower, scene.domain.upper))
-    return scene, [state.advance().solve.krylov for _ in range(steps)]
+    return scene, [state.advance().solve.krylov_iterations for _ in range(steps)]
 
 
 def cut(scene: Scene, planes: list[Any]) -> None:
@@ -188,7 +188,7 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
         monkeypatch.setattr(block_operator, "SMALL", 0)
     scene, _ = shattered(0.06, 10, {}, 2)
     solver, nodes = scene.solver, np.array([5, 0, 17, 40])
-    assert isinstance(solver, Solver) and (solver.linear._blocks is not None) is first
+    assert isinstance(solver, NonlinearSolver) and (solver.linear._blocks is not None) is first
     K, d = solver.linear.operator, scene.domain.dim
     if first:
         random, tied = np.random.default_rng(1), np.array([17, 3, 5])
@@ -215,7 +215,7 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
         monkeypatch.setattr(Tangent, "switch_to_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
-    assert isinstance(solver, Solver) and solver.linear._blocks is not None
+    assert isinstance(solver, NonlinearSolver) and solver.linear._blocks is not None
     assert (solver.linear._blocks.assembled is not None) is first
     pc = solver.linear.preconditioner.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
@@ -230,7 +230,7 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
             tangent = single_entries(scene)
         else:
             tangent.scale(factor)
-        solver.linear._blocks.follow()
+        solver.linear._blocks.update_copy()
         tangent.mult(x, alone)
         solver.linear._blocks.mult(tangent, x, by_blocks)
         by_blocks.axpy(-1.0, alone)

@@ -14,7 +14,7 @@ from cases import BAR, study
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers import linear_solver as linear_room
 from fracsim.solvers import preconditioner as preconditioner_room
-from fracsim.solvers.linear_solver import Linear
+from fracsim.solvers.linear_solver import LinearSolver
 from fracsim.solvers.multigrid import bcsr, block_operator, smoother, vcycle
 from fracsim.solvers.preconditioner import Due
 from support.scenes import Walk
@@ -36,7 +36,7 @@ def bar(dim: int, given: dict[str, Any], **tables: Any) -> Scene:
     return build_scene(MPI.COMM_SELF, study(BAR, **usual | tables))
 
 
-def linear_of(scene: Scene) -> Linear:
+def linear_of(scene: Scene) -> LinearSolver:
     return scene.solver.linear  # type: ignore[union-attr]
 
 
@@ -60,7 +60,7 @@ def inverse_blocks(A: Values, size: int) -> Values:
     return B
 
 
-def by_hand(A: list[Values], P: list[Values], levels: list[smoother.Level]) -> Values:
+def by_hand(A: list[Values], P: list[Values], levels: list[smoother.SmoothedLevel]) -> Values:
     """M of the finest level in double precision, p by Chebyshev's polynomial of the eigenvalues of L^T A L, L L^T = B:
     r after n steps is T_n((m - l) / h) / T_n(m / h) of r before; C is as many cycles as there shall be, each of what
     the one before has left; the coarsest matrix is inverted."""
@@ -68,8 +68,8 @@ def by_hand(A: list[Values], P: list[Values], levels: list[smoother.Level]) -> V
     for here, between, level in zip(A[1:], P, levels, strict=True):
         L = np.linalg.cholesky(inverse_blocks(here, level._size))
         values, vectors = np.linalg.eigh(L.T @ here @ L)
-        most, effort = largest_of(level), level.effort
-        m, h = (1.1 + effort.low) / 2 * most, (1.1 - effort.low) / 2 * most
+        most, effort = largest_of(level), level.smoothing
+        m, h = (1.1 + effort.lower_bound) / 2 * most, (1.1 - effort.lower_bound) / 2 * most
         T = np.polynomial.Chebyshev.basis(effort.steps)
         left = T((m - values) / h) / T(m / h)
         p = L @ (vectors * ((1 - left) / values)) @ vectors.T @ L.T
@@ -87,9 +87,9 @@ def largest_eigenvalue(B: Values, A: Values) -> float:
     return float(np.linalg.eigvalsh(L.T @ A @ L)[-1])
 
 
-def largest_of(level: smoother.Level) -> float:
+def largest_of(level: smoother.SmoothedLevel) -> float:
     """The eigenvalue that it smooths for."""
-    return 2 / (level._weights[0][1] * (1.1 + level.effort.low))
+    return 2 / (level._weights[0][1] * (1.1 + level.smoothing.lower_bound))
 
 
 def dense(matrix: PETSc.Mat) -> Values:
@@ -112,13 +112,13 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     preconditioner.due = Due.REFRESH
     assert linear.solve()
     made, pc = preconditioner._cycle, preconditioner.pc
-    assert isinstance(made, vcycle.Cycle) and preconditioner.serving.handle == made.pc.handle
+    assert isinstance(made, vcycle.SinglePrecisionVCycle) and preconditioner.serving.handle == made.pc.handle
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
     sizes = [level._size for level in made._levels]
     assert sizes[-1] == dim < sizes[0]
     largest = [largest_of(level) for level in made._levels]
-    finest, *coarser = [level.effort for level in made._levels[::-1]]
+    finest, *coarser = [level.smoothing for level in made._levels[::-1]]
     usual = [finest] * len(coarser)
     assert finest == (2, 0.1, 1) and coarser == (usual if slowly else list(vcycle.THOROUGH[: len(coarser)])) != []
     inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
@@ -155,10 +155,10 @@ def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest
             boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.0, 0.0, 0.01]}],
             time={"end": 9.0, "scheme": "backward-euler", "step": 3.0},
         )  # fmt: skip
-        its.append(Walk(scene).advance().solve.krylov)
+        its.append(Walk(scene).advance().solve.krylov_iterations)
         made = linear_of(scene).preconditioner._cycle
         assert made is not None
-        assert (made._levels[-2].effort == vcycle.THOROUGH[0]) == (size is strip and slowly < 1)
+        assert (made._levels[-2].smoothing == vcycle.THOROUGH[0]) == (size is strip and slowly < 1)
     assert its[0] < 0.8 * its[1] and its[2] < its[0]
 
 
@@ -170,7 +170,7 @@ def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytes
     for given in ({}, {"mg_levels_pc_type": "jacobi"}):
         scene = bar(3, given | {"ksp_rtol": 1e-8})
         walk = Walk(scene)
-        its.append([walk.advance().solve.krylov for _ in range(4)])
+        its.append([walk.advance().solve.krylov_iterations for _ in range(4)])
         u.append(walk.u)
         assert (linear_of(scene).preconditioner._cycle is None) == bool(given)
     assert all(0.8 * double <= single <= double for single, double in zip(*its, strict=True)) and min(its[0]) > 5
@@ -212,9 +212,9 @@ def test_what_is_rounded_is_found_by_the_next_correction(step: float, monkeypatc
     for rounded in (linear_room.ROUNDED, np.inf):
         monkeypatch.setattr(linear_room, "ROUNDED", rounded)
         scene = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-9}, **more)
-        assert step < 0.8 or linear_room.inertia_share(scene.balance) < 2e-6
+        assert step < 0.8 or linear_room.mass_stiffness_ratio(scene.balance) < 2e-6
         walk = Walk(scene)
-        its.append([walk.advance().solve.newton for _ in range(4)])
+        its.append([walk.advance().solve.newton_iterations for _ in range(4)])
         u.append(walk.u)
         assert (linear_of(scene).operator.getPythonContext().single is None) == (rounded == np.inf)
     assert its[0] == its[1]
@@ -245,7 +245,7 @@ def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.Mon
 
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(block_operator, "SMALL", 0)
-    monkeypatch.setattr(bcsr, "code", lambda *_: None)
+    monkeypatch.setattr(bcsr, "compile_block_csr", lambda *_: None)
     scene = bar(3, {})
     assert Walk(scene).advance().solve.converged
     preconditioner = linear_of(scene).preconditioner

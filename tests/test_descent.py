@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 from petsc4py import PETSc
 
-from fracsim.solvers.line_search import Descent
+from fracsim.solvers.line_search import MeritFunction
 
 
 class Hill:
@@ -30,8 +30,8 @@ class Hill:
 def rises(*heights: float) -> list[float]:
     """What a line search sees that sets out from 0 and tries these."""
     hill, x = Hill(), PETSc.Vec().createSeq(1)
-    descent, seen = Descent(cast("Any", hill), cast("Any", None)), []
-    descent.set_out()
+    descent, seen = MeritFunction(cast("Any", hill), cast("Any", None)), []
+    descent.begin_line_search()
     for height in (0.0, *heights):
         x.array_w[:] = height
         seen.append(descent(x))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from fracsim.solvers import nonlinear_solver as solver_room
-from fracsim.solvers.line_search import EXACT, PATIENCE, POSITIVE, Downhill, Way
+from fracsim.solvers.line_search import EXACT_TANGENTS, PATIENCE, POSITIVE_TANGENTS, ModifiedNewton, TangentModification
 from support.scenes import Walk
 from test_cycle import bar
 
 
-def stalls_after(norms: list[float], how: Way | None) -> int | None:
+def stalls_after(norms: list[float], how: TangentModification | None) -> int | None:
     """The iteration at which an attempt with such residuals stops, if it does."""
     now: list[float] = []
     vector = SimpleNamespace(duplicate=lambda: None)
@@ -22,11 +22,11 @@ def stalls_after(norms: list[float], how: Way | None) -> int | None:
         setObjective=lambda _: None, setFunction=lambda *_: None, getFunctionNorm=lambda: now[-1]
     )
     balance: Any = SimpleNamespace(vector=vector)
-    down = Downhill(balance, snes)
-    down.made_positive(how)
+    down = ModifiedNewton(balance, snes)
+    down.use_modification(how)
     for its, norm in enumerate(norms):
         now.append(norm)
-        if down.stalls(norm, its):
+        if down.has_stalled(norm, its):
             return its
     return None
 
@@ -37,15 +37,17 @@ ROUND = [100.0, 10.0, 0.1, *[0.11] * 30]  # exact below a hundredth: from the th
 @pytest.mark.parametrize(
     ("norms", "how", "at"),
     [
-        (ROUND, POSITIVE[0], 2 + PATIENCE),
-        (ROUND, POSITIVE[2], None),  # positive all the way: goes down, however slowly
+        (ROUND, POSITIVE_TANGENTS[0], 2 + PATIENCE),
+        (ROUND, POSITIVE_TANGENTS[2], None),  # positive all the way: goes down, however slowly
         (ROUND, None, None),
-        ([1.0] * 30, EXACT, PATIENCE),
-        ([100.0, 10.0, *[20.0] * 30], POSITIVE[0], None),  # far away residuals may rise
-        ([100.0, *(0.5 * 0.99**k for k in range(30))], POSITIVE[0], None),
+        ([1.0] * 30, EXACT_TANGENTS, PATIENCE),
+        ([100.0, 10.0, *[20.0] * 30], POSITIVE_TANGENTS[0], None),  # far away residuals may rise
+        ([100.0, *(0.5 * 0.99**k for k in range(30))], POSITIVE_TANGENTS[0], None),
     ],
 )
-def test_what_goes_about_in_circles_gives_up(norms: list[float], how: Way | None, at: int | None) -> None:
+def test_what_goes_about_in_circles_gives_up(
+    norms: list[float], how: TangentModification | None, at: int | None
+) -> None:
     assert stalls_after(norms, how) == at
 
 

@@ -47,7 +47,7 @@ def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
     is (3/4 + 1/2) / (1 + 1/2) = 5/6, as the diagonals carry half of the stress along the load (test_fracture)."""
     scene, state = make_scene(**PULL)
     part = scene.fracture
-    scene.stepper.breaking = Breaking(part.stress, part.graph, part.criterion, Softening(), passes=1)
+    scene.stepper.breaking = Breaking(part.stress, part.graph, part.criterion, Softening(), max_passes=1)
     march(scene, state, 5)
     graph = part.graph
     aligned = np.ptp(scene.domain.nodes[graph.edge_nodes][:, :, 1], axis=1) < 1e-9
@@ -74,10 +74,10 @@ def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
     going = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path)
     graph = going.scene.fracture.graph
     graph.weaken(np.random.default_rng(3).choice([0.0, 0.25, 0.5, 1.0], len(graph.integrity)))
-    going.scene.fracture.restored()
+    going.scene.fracture.damage_restored()
     going.state = going.scene.stepper.remember(going.state)
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path, restart=True)
     np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)
     np.testing.assert_array_equal(again.scene.fracture.graph.pattern, graph.pattern)
-    assert again.state.memory["damage"].integrity.min() == 0
+    assert again.state.history["damage"].integrity.min() == 0

@@ -378,7 +378,7 @@ def test_event_by_event_the_crack_takes_its_energy(
     unit load tells all: load^2 = G_c / |g|."""
     scene = notched(kind, n, end=200.0, order=order)
     criterion, state, rows = scene.fracture.criterion, scene.start(), []
-    criterion.toughness, scene.fracture.passes, forces = 1e-30, 1, Seen.forces
+    criterion.toughness, scene.fracture.max_passes, forces = 1e-30, 1, Seen.forces
 
     def watched(seen: Seen) -> Values:
         found = forces(seen)

@@ -243,14 +243,14 @@ def test_what_is_kept_of_the_tips_is_what_is_found_anew() -> None:
     """While a front gets on, and once it is taken back: the tips and forces of a criterion that begins there."""
     scene = plate(8, {"time": [0, 1, 5], "value": [[0, 0, 0], [0, 0, 4.2e-6], [0, 0, 5.4e-6]]}, 5.0)
     criterion, breaking, state = criterion_of(scene), scene.fracture, scene.start()
-    before = breaking.memory()
+    before = breaking.snapshot()
     criterion.tips()
     counts = [len(criterion.sight.crack.number)]
     for step in range(6):
         if step < 5:
             state, _ = scene.stepper.advance(state)
         else:
-            breaking.recall(before)
+            breaking.restore(before)
         anew = RowTips(scene.balance.stress, breaking.graph, criterion.strength, criterion.toughness, criterion.cut)
         anew.tips()
         kept, found = seen(scene), anew.sight.look(*breaking.evaluate())

@@ -74,7 +74,7 @@ def test_factors_where_iterations_fail() -> None:
         scene = build_scene(MPI.COMM_WORLD, validate(study, "x"))
         state = Walk(scene)
         state.advance()
-        assert scene.solver is not None and scene.stepper.trouble.steps_failed == 0
+        assert scene.solver is not None and scene.stepper.failures.steps_failed == 0
         ksp = scene.solver.snes.ksp
         assert (ksp.getType(), ksp.pc.getType()) == ("cg", "gamg")
         results.append(state.u)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 
-from fracsim.solvers.direct_solver import Factors
+from fracsim.solvers.direct_solver import DirectSolver
 from fracsim.studies.evidence import solvers
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene
@@ -36,7 +36,7 @@ def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
         study = solvers.loaded([2.0, 1.0], 0.1, solvers.RUBBER | {"poisson": 0.4999}, [1e5, -2e4], 2)
         tight = solver | {"snes_rtol": 1e-9}
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=tight)
-        krylov = sum(walk.advance().solve.krylov for _ in range(2))
+        krylov = sum(walk.advance().solve.krylov_iterations for _ in range(2))
         found[way] = krylov, displacement(scene, walk)
         scene.destroy()
     assert found["default"][0] < found["CG"][0] / 5
@@ -50,7 +50,7 @@ def test_a_body_that_cg_is_cheap_for_keeps_it() -> None:
     found = []
     for solver in (solvers.WAYS["default"], solvers.WAYS["CG"]):
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=solver)
-        found.append([walk.advance().solve.krylov for _ in range(2)])
+        found.append([walk.advance().solve.krylov_iterations for _ in range(2)])
         assert scene.solver is not None and scene.solver._choice.left == 0
         scene.destroy()
     assert found[0] == found[1]
@@ -102,7 +102,7 @@ def test_factors_that_could_not_be_made_are_not_kept() -> None:
     ksp, (b, x) = PETSc.KSP().create(PETSc.COMM_SELF), K.createVecs()
     b.set(1.0)
     ksp.setType("cg")
-    factors = Factors(SimpleNamespace(pc=ksp.getPC(), due=None, keep=True), symmetric=True, dofs=2, dim=2)
+    factors = DirectSolver(SimpleNamespace(pc=ksp.getPC(), due=None, keep=True), symmetric=True, dofs=2, dim=2)
     for _ in range(2):
         with factors.of(ksp):
             ksp.setPC(factors._pc)

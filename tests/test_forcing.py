@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import fracsim.mechanics.tangent as tangent_module
-from fracsim.solvers.forcing_terms import LOOSE, LOOSEST, MOST, ROUGHEST, SHARE, SMALL, Forcing, Sparing
+from fracsim.solvers.forcing_terms import (
+    LOOSE,
+    LOOSEST,
+    MOST,
+    ROUGHEST,
+    SHARE,
+    SMALL,
+    ContractionForcing,
+    EisenstatWalkerForcing,
+)
 from support.scenes import make_scene, march, positions
 from test_itself import SOFT, two_blocks
 
@@ -22,61 +31,61 @@ def nothing() -> float:
 
 def test_digits_are_asked_for_as_the_residual_falls() -> None:
     """0.9 (|r_k| / |r_k-1|)^2 between rtol and LOOSE; no more of them than the solution needs."""
-    forcing = Forcing(RTOL)
-    assert forcing.rough(10.0, 0.0) == LOOSE  # nothing is known of the first
-    assert forcing.rough(5.0, 0.0) == LOOSE
-    assert forcing.rough(0.1, 0.0) == pytest.approx(0.9 * 0.02**2)
-    assert forcing.rough(1e-6, 0.0) == RTOL
-    assert forcing.rough(1e-8, 1e-10) == pytest.approx(1e-3)
-    forcing.begin()
-    assert forcing.rough(1e-6, 0.0) == LOOSE and forcing.exact() == RTOL
+    forcing = EisenstatWalkerForcing(RTOL)
+    assert forcing.tolerance_for(10.0, 0.0) == LOOSE  # nothing is known of the first
+    assert forcing.tolerance_for(5.0, 0.0) == LOOSE
+    assert forcing.tolerance_for(0.1, 0.0) == pytest.approx(0.9 * 0.02**2)
+    assert forcing.tolerance_for(1e-6, 0.0) == RTOL
+    assert forcing.tolerance_for(1e-8, 1e-10) == pytest.approx(1e-3)
+    forcing.begin_attempt()
+    assert forcing.tolerance_for(1e-6, 0.0) == LOOSE and forcing.tight_tolerance() == RTOL
 
 
 def test_iterations_are_those_of_an_exact_solve() -> None:
     """A residual that falls to a tenth an iteration takes 2 to 1e-2 and 5 to 1e-5."""
-    forcing = Forcing(RTOL)
-    assert forcing.iterations(5) == 5
-    forcing.rough(1.0, 0.0)
-    assert forcing.iterations(2) == 5
+    forcing = EisenstatWalkerForcing(RTOL)
+    assert forcing.equivalent_iterations(5) == 5
+    forcing.tolerance_for(1.0, 0.0)
+    assert forcing.equivalent_iterations(2) == 5
 
 
 def test_without_contact_a_solve_leaves_a_share_of_what_the_tangent_leaves() -> None:
     """q^2 where it is new, 2 q where it is kept, and a share of little at least; the first q is that of the last
     attempt."""
-    sparing = Sparing(RTOL)
-    assert not sparing.reach(1.0, 1e-5, nothing)
-    assert sparing.tolerance(1e-5, kept=False) == RTOL  # nothing is known of the first
-    assert not sparing.reach(0.05, 1e-5, nothing)
-    assert sparing.tolerance(1e-5, kept=False) == pytest.approx(SHARE * 0.05**2)
-    assert sparing.reach(1e-4, 1e-5, nothing)  # which leaves 4e-7 of r, less than LEFT of little
-    assert sparing.tolerance(1e-5, kept=True) == pytest.approx(SMALL * 1e-5 / 1e-4)
-    sparing.begin()
-    sparing.reach(1.0, 1e-5, nothing)
-    assert sparing.tolerance(1e-5, kept=False) == pytest.approx(SHARE * 0.05)
+    sparing = ContractionForcing(RTOL)
+    assert not sparing.record_iterate(1.0, 1e-5, nothing)
+    assert sparing.tolerance_for(1e-5, kept=False) == RTOL  # nothing is known of the first
+    assert not sparing.record_iterate(0.05, 1e-5, nothing)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(SHARE * 0.05**2)
+    assert sparing.record_iterate(1e-4, 1e-5, nothing)  # which leaves 4e-7 of r, less than LEFT of little
+    assert sparing.tolerance_for(1e-5, kept=True) == pytest.approx(SMALL * 1e-5 / 1e-4)
+    sparing.begin_attempt()
+    sparing.record_iterate(1.0, 1e-5, nothing)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(SHARE * 0.05)
 
 
 def test_what_cg_leaves_is_not_taken_for_what_the_tangent_leaves() -> None:
     """Where CG leaves more of r than of its own norm the first solve of the next attempt leaves less of that, so that
     at most MOST of q are CG's."""
-    sparing = Sparing(RTOL)
-    sparing.reach(10.0, 1e-5, nothing)
-    assert sparing.tolerance(1e-5, kept=False) == RTOL
-    sparing.reach(0.5, 1e-5, lambda: 1e-3)  # ten times RTOL of r
-    sparing.begin()
-    sparing.reach(10.0, 1e-5, nothing)
-    assert sparing.tolerance(1e-5, kept=False) == pytest.approx(MOST * 0.05 / 10)
+    sparing = ContractionForcing(RTOL)
+    sparing.record_iterate(10.0, 1e-5, nothing)
+    assert sparing.tolerance_for(1e-5, kept=False) == RTOL
+    sparing.record_iterate(0.5, 1e-5, lambda: 1e-3)  # ten times RTOL of r
+    sparing.begin_attempt()
+    sparing.record_iterate(10.0, 1e-5, nothing)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(MOST * 0.05 / 10)
 
 
 def test_no_correction_is_rougher_than_may_be() -> None:
-    sparing = Sparing(RTOL)
-    sparing.reach(1.0, 1e-6, nothing)
-    assert not sparing.reach(0.9, 1e-6, nothing)  # a tangent that leaves nearly all of r
-    assert sparing.tolerance(1e-6, kept=False) == ROUGHEST
-    sparing.reach(1e-9, 1e-6, nothing)
-    assert sparing.tolerance(1e-6, kept=True) == LOOSEST  # far below what is little
-    sparing.reach(0.0, 0.0, nothing)
-    assert sparing.tolerance(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
-    assert sparing.iterations(2) == 0  # too few to tell
+    sparing = ContractionForcing(RTOL)
+    sparing.record_iterate(1.0, 1e-6, nothing)
+    assert not sparing.record_iterate(0.9, 1e-6, nothing)  # a tangent that leaves nearly all of r
+    assert sparing.tolerance_for(1e-6, kept=False) == ROUGHEST
+    sparing.record_iterate(1e-9, 1e-6, nothing)
+    assert sparing.tolerance_for(1e-6, kept=True) == LOOSEST  # far below what is little
+    sparing.record_iterate(0.0, 0.0, nothing)
+    assert sparing.tolerance_for(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
+    assert sparing.equivalent_iterations(2) == 0  # too few to tell
 
 
 @pytest.fixture
@@ -102,7 +111,7 @@ def test_a_swinging_bar_moves_as_with_exact_solves(made: list[int]) -> None:
             boundary=[{"on": "left", "fix": "xyz"}], load={"gravity": [0.0, 0.0, -100.0]},
             time={"scheme": "backward-euler", "step": 0.005, "end": 0.12},
         )  # fmt: skip
-        krylov = sum(report.solve.krylov for report in march(scene, state))
+        krylov = sum(report.solve.krylov_iterations for report in march(scene, state))
         return state.u.copy(), krylov, len(made)
 
     u, krylov, tangents = let_go()
@@ -125,7 +134,7 @@ def test_a_load_on_an_end_takes_no_more_corrections_than_with_exact_solves() -> 
             time={"scheme": "backward-euler", "step": 5e-3, "end": 0.05},
         )  # fmt: skip
         solves = [report.solve for report in march(scene, state)]
-        return sum(solve.newton for solve in solves), sum(solve.krylov for solve in solves)
+        return sum(solve.newton_iterations for solve in solves), sum(solve.krylov_iterations for solve in solves)
 
     (corrections, its), (exact, more_its) = loaded(), loaded(ksp_rtol=RTOL)
     assert corrections == exact and its < more_its
@@ -147,7 +156,7 @@ def test_a_collision_ends_as_with_exact_solves(
         v[positions(scene)[:, 0] < 1.01, 0] = 1.0
         state.v = v.reshape(-1)
         state.settle()
-        its = sum(report.solve.newton for report in march(scene, state))
+        its = sum(report.solve.newton_iterations for report in march(scene, state))
         return state.u.copy(), its, len(made)
 
     u, its, tangents = thrown()

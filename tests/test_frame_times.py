@@ -83,7 +83,7 @@ def test_frames_are_at_their_times_where_steps_fail(tmp_path: Path) -> None:
 
     stepper._attempt = failing  # type: ignore[attr-defined]
     Run(scene, tmp_path / "out")()
-    assert stepper.trouble.steps_failed == 3
+    assert stepper.failures.steps_failed == 3
     np.testing.assert_allclose(times_of(tmp_path / "out"), 0.03 * np.arange(11), rtol=1e-6)
 
 

@@ -91,11 +91,15 @@ def test_a_resolve_that_fails_after_a_break_is_counted() -> None:
         def once(guess: Any, calls: list[int] = calls) -> Any:
             calls[0] += 1
             result = solve(guess)
-            return result if calls[0] == 1 else type(result)(False, result.newton, result.krylov, "no")
+            return (
+                result
+                if calls[0] == 1
+                else type(result)(False, result.newton_iterations, result.krylov_iterations, "no")
+            )
 
         stepper.solver.solve = once
         walk.advance()
-    assert stepper.troubles()["unbalanced_steps"] == 1 and stepper.troubles()["steps_failed"] == 0
+    assert stepper.failure_counts()["unbalanced_steps"] == 1 and stepper.failure_counts()["steps_failed"] == 0
 
 
 def test_stress_that_is_no_number_is_counted() -> None:
@@ -107,5 +111,5 @@ def test_stress_that_is_no_number_is_counted() -> None:
     )
     deform(scene, np.diag([1.0, 0.0]))
     scene.fracture()
-    assert scene.stepper.troubles()["cells_not_finite"] == scene.domain.cell_count
+    assert scene.stepper.failure_counts()["cells_not_finite"] == scene.domain.cell_count
     assert walk.t == 0

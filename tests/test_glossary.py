@@ -11,7 +11,7 @@ import fracsim
 from fracsim.forms.schemes import SCHEMES
 from fracsim.output.history import COLUMNS
 from fracsim.study.time_and_output import FIELDS
-from fracsim.timestepping.stepper import Trouble
+from fracsim.timestepping.stepper import FailureCounts
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "docs" / "glossary.md").read_text()
@@ -45,7 +45,7 @@ def test_rows_have_a_meaning() -> None:
 
 def test_columns_fields_and_figures_are_defined() -> None:
     """All names that files of the output folder have."""
-    trouble = {field.name for field in dataclasses.fields(Trouble)}
+    trouble = {field.name for field in dataclasses.fields(FailureCounts)}
     names = {*COLUMNS, *FIELDS, *SCHEMES, *trouble, *keys_of_summaries()}
     assert not names - CODE
 

@@ -125,7 +125,7 @@ def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
         reports = march(scene, state)
         assert len(reports) == 10
         gaps.append(contact.least_gap() / contact.law.distance)
-        its.append([report.solve.newton for report in reports])
+        its.append([report.solve.newton_iterations for report in reports])
         forces.append(scene.probes()[0])
     assert min(gaps) > TIGHT
     assert sum(its[1][5:]) <= sum(its[0][5:]) + 5

@@ -17,7 +17,7 @@ from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.facet_components import parts_of_nodes
 from fracsim.mesh.fragments import find_pieces
 from fracsim.scene import Scene
-from fracsim.solvers.deflation import loose_parts
+from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.multigrid import block_operator
 from fracsim.solvers.preconditioner import Due
 from support.scenes import Walk, each_step, make_scene, march
@@ -156,7 +156,7 @@ def tied(dim: int, **tables: Any) -> tuple[Scene, Walk, NodeTies]:
     near = close[graph.edge_nodes].any(axis=1)
     for _ in range(4):
         one_pass(scene, graph, near & (rng.random(len(near)) < 0.6), 1.0 + rng.random(scene.domain.cell_count))
-    scene.fracture.restored()
+    scene.fracture.damage_restored()
     scene.balance.stress.chi.x.array[graph.split] = 0.0
     scene.balance.damage_changed()
     scene.balance.edges_broke(graph.pattern)
@@ -374,8 +374,8 @@ def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
     own = int(part[domain.cell_nodes[cell]].max())
     node = np.flatnonzero(domain.node_input == tethers.ties.nodes[0, 0])
     assert own > 0 and part[node] == -1
-    loose = loose_parts(balance, jacobi)
-    assert loose is not None and loose.follow(balance.tangent.matrix)
+    loose = create_deflation(balance, jacobi)
+    assert loose is not None and loose.update_operator(balance.tangent.matrix)
     x = domain.nodes + walk.state.u.reshape(-1, dim)
     spin = np.array([[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]])[:dim, :dim]
     goes = (part == own) | np.isin(domain.node_input, tethers.ties.nodes[tethers.ties.cell == tethers.ties.cell[0], 0])

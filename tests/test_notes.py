@@ -204,9 +204,9 @@ def test_the_step_that_check_tells_is_the_one_that_is_taken(base: dict[str, Any]
 
 
 def test_quadratic_cells_have_the_bound_of_the_stepper() -> None:
-    from fracsim.timestepping.stable_time_step import gain
+    from fracsim.timestepping.stable_time_step import quadratic_gain
 
-    assert {dim: gain(dim) for dim in (2, 3)} == pytest.approx(QUADRATIC, rel=1e-3)
+    assert {dim: quadratic_gain(dim) for dim in (2, 3)} == pytest.approx(QUADRATIC, rel=1e-3)
 
 
 def test_check_counts_the_steps_that_are_stable() -> None:

@@ -46,7 +46,7 @@ def test_one_tangent_serves_all_steps(scheme: str) -> None:
     made, balance = tangents_of(scene), scene.balance
     late = balance.scheme.alpha_f
     for report in each_step(scene, state):
-        assert report.solve.newton <= 2
+        assert report.solve.newton_iterations <= 2
         if not late:
             scale = np.abs(balance.reactions).max()
             rest = balance.update_forces()[balance.motion.free_dofs]
@@ -83,7 +83,7 @@ def test_a_whole_body_at_rest_is_solved_as_one() -> None:
     }  # fmt: skip
     (scene, state), (_, exact) = make_scene(**tables | {"solver": {}}), make_scene(**tables)
     solves = [report.solve for report in each_step(scene, state)]
-    assert [each.newton for each in solves] == [1, 0, 0, 0, 0] and solves[0].krylov > 3
+    assert [each.newton_iterations for each in solves] == [1, 0, 0, 0, 0] and solves[0].krylov_iterations > 3
     assert len(list(each_step(exact.scene, exact))) == 5
     np.testing.assert_allclose(state.u, exact.u, atol=1e-6 * np.abs(exact.u).max())
     assert not make_scene(**tables | TORN | {"solver": {}})[0].solver.linear.linearly

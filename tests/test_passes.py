@@ -42,7 +42,7 @@ def test_passes_go_on_until_nothing_breaks() -> None:
     total = 0
     for _ in range(10):
         total += march(scene, state, 1)[0].broken
-        assert scene.fracture().broken == 0
+        assert scene.fracture().broken_edges == 0
     assert total == np.count_nonzero(scene.fracture.graph.broken) > 0
 
 

@@ -164,7 +164,7 @@ def test_a_step_is_solved_with_the_last_flow_once_more(energy: str) -> None:
     plastic, random = scene.balance.stress.material.plastic, np.random.default_rng(5)
     before = np.eye(3) + 0.1 * random.uniform(-1, 1, (3, 3))
     deform(scene, before)
-    scene.stepper.flow.begin(0.1)
+    scene.stepper.flow.begin_step(0.1)
     scene.stepper.flow()
     rows = plastic.inverse_rows.copy()
     G = rows[0].reshape(3, 3)
@@ -192,7 +192,7 @@ def test_a_stretch_never_turns_over() -> None:
     """Flow that took nearly all of a deviator, then a step ten times as long: the stand-in keeps det F_p = 1."""
     scene, _ = homogeneous("neo-hookean", yield_stress=1e-4)
     deform(scene, np.diag([3.0, 1.0, 0.3]))
-    scene.stepper.flow.begin(0.1)
+    scene.stepper.flow.begin_step(0.1)
     scene.stepper.flow()
     plastic = scene.balance.stress.material.plastic
     G = plastic.inverse_rows[0].reshape(3, 3).copy()
@@ -208,10 +208,10 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
     for size in (0.02, 0.3) if measure == "von-mises" else (0.02,):  # pressure does not flow
         scene, _ = homogeneous(energy, yield_stress=0.01, hardening=0.02, measure=measure)
         deform(scene, np.eye(3) + size * np.random.default_rng(2).uniform(-1, 1, (3, 3)))
-        scene.stepper.flow.begin(0.1)
+        scene.stepper.flow.begin_step(0.1)
         scene.stepper.flow()
         assert plastic_strain(scene).all()
-        assert scene.stepper.flow.stored == pytest.approx(scene.balance.stress.stored_energy(), rel=10 * CLOSE)
+        assert scene.stepper.flow.elastic_energy == pytest.approx(scene.balance.stress.stored_energy(), rel=10 * CLOSE)
 
 
 def two_halves(folder: Path) -> Path:
@@ -277,7 +277,7 @@ def test_the_return_is_that_of_a_dense_solver(energy: str, measure: str) -> None
     inverse[:] = G
     plastic_strain(scene)[:] = 0.02
     deform(scene, F)
-    flow.begin(0.1)
+    flow.begin_step(0.1)
     flow()
     U, S, Vt = np.linalg.svd(F @ G)
     e = np.log(S) - np.log(S).mean()
@@ -304,7 +304,7 @@ def test_stress_beyond_yield_decays_with_the_flow_rate(energy: str) -> None:
         scene, state = homogeneous(energy, yield_stress=Y, flow_rate=rate)
         deform(scene, F)
         for _ in range(round(0.5 / dt)):
-            scene.stepper.flow.begin(dt)
+            scene.stepper.flow.begin_step(dt)
             scene.stepper.flow()
         found = Frames(scene.balance.stress, ["von_mises"])(state, None)[1].values
         np.testing.assert_allclose(found, Y + (q_0 - Y) * np.exp(-rate * 0.5), rtol=20 * CLOSE)
@@ -317,7 +317,7 @@ def led(scene: Scene, path: Any, steps: int) -> None:
     """Lead the body through the deformation gradients path(t), t in [0, 1]."""
     for n in range(1, steps + 1):
         deform(scene, path(n / steps))
-        scene.stepper.flow.begin(1 / steps)
+        scene.stepper.flow.begin_step(1 / steps)
         scene.stepper.flow()
 
 
@@ -480,9 +480,11 @@ def test_a_failed_step_does_not_flow() -> None:
 
     def now_and_then(state: State, dt: float) -> Any:
         outcome = attempt(state, dt)
-        return outcome if next(tries) else type(outcome)(False, outcome.newton, outcome.krylov, "no")
+        return (
+            outcome if next(tries) else type(outcome)(False, outcome.newton_iterations, outcome.krylov_iterations, "no")
+        )
 
     scene.stepper._attempt = now_and_then  # type: ignore[method-assign]
     march(scene, state)
-    assert scene.stepper.trouble.steps_failed == 2
+    assert scene.stepper.failures.steps_failed == 2
     assert stress(scene) == pytest.approx(bilinear(4 * TINY, 0.1), rel=20 * TINY)

@@ -92,7 +92,7 @@ def test_a_first_guess_that_is_inside_out_gives_way_to_the_start_of_the_step() -
     volumes = [np.linalg.det(np.diff(at[cells], axis=1)) for at in (x, x + 0.1 * v)]
     assert (volumes[0] * volumes[1] < 0).any()  # where it would go by itself
     state.advance()
-    assert scene.stepper.troubles()["steps_failed"] == 0
+    assert scene.stepper.failure_counts()["steps_failed"] == 0
     ends = np.linalg.det(np.diff((x + state.u.reshape(-1, 3))[cells], axis=1))
     assert (volumes[0] * ends > 0).all()
     np.testing.assert_allclose((mass * state.v.reshape(-1, 3)).sum(axis=0), (mass * v).sum(axis=0), atol=1e-6)

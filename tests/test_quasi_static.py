@@ -55,7 +55,7 @@ def test_steps_end_in_balance(energy: str) -> None:
         assert residual <= 1e-6 * largest
         assert report.solve.converged
     assert scene.fracture.graph.broken_count > 20
-    assert scene.stepper.trouble.unbalanced_steps == 0
+    assert scene.stepper.failures.unbalanced_steps == 0
 
 
 @pytest.mark.parametrize(

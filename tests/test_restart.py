@@ -145,7 +145,7 @@ def test_a_restart_takes_the_explicit_step_of_its_damage(tmp_path: Path, unilate
     fracture.graph.break_edges(np.random.default_rng(3).uniform(size=len(fracture.graph.broken)) < 0.4)
     fracture.degradation.restore()
     fracture.changed()
-    going.state = state = going.scene.stepper.settle(going.state)
+    going.state = state = going.scene.stepper.with_forces(going.state)
     going.note_breaks()
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path, restart=True)

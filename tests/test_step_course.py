@@ -51,10 +51,12 @@ def test_one_number_is_a_table_of_it(tmp_path: Path) -> None:
 
 def test_a_corner_that_is_reached_but_for_round_off_makes_no_sliver() -> None:
     sizes = StepSizes(
-        1.0, 9.0, 1e-3, course=TabulatedFunction(np.array([0.0, 0.3, 5.0]), np.array([[0.1], [0.1], [1.0]]))
+        1.0, 9.0, 1e-3, schedule=TabulatedFunction(np.array([0.0, 0.3, 5.0]), np.array([[0.1], [0.1], [1.0]]))
     )
-    assert sizes.at(0.1 + 0.2) == pytest.approx(0.1) and sizes.at(0.3 * (1 - 1e-12)) == pytest.approx(0.1)
-    assert sizes.at(4.5) == pytest.approx(0.5) and sizes.at(6.0) == 1.0
+    assert sizes.largest_step_at(0.1 + 0.2) == pytest.approx(0.1) and sizes.largest_step_at(
+        0.3 * (1 - 1e-12)
+    ) == pytest.approx(0.1)
+    assert sizes.largest_step_at(4.5) == pytest.approx(0.5) and sizes.largest_step_at(6.0) == 1.0
 
 
 def test_what_is_wrong_with_a_table() -> None:

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix, random_array
 
 from fracsim.mechanics.low_rank_springs import DIRECTIONS, DOFS, StiffCoupling, stiff_directions
-from fracsim.solvers.low_rank import Woodbury
+from fracsim.solvers.low_rank import WoodburyPreconditioner
 
 RANDOM = np.random.default_rng(5)
 
@@ -62,6 +62,6 @@ def test_a_body_with_springs_is_inverted_exactly(stiffness: float) -> None:
     x, y = operator.createVecs()
     x.array_w[:] = RANDOM.normal(size=n)
     half = [StiffCoupling(operator, U[:, part], S[part]) for part in (slice(0, 1), slice(1, m))]
-    Woodbury(body, half, x).apply(body, x, y)
+    WoodburyPreconditioner(body, half, x).apply(body, x, y)
     expected = np.linalg.solve(K + U @ np.diag(S) @ U.T, x.array_r)
     np.testing.assert_allclose(y.array_r, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())

@@ -249,6 +249,6 @@ def test_a_step_is_solved_again_with_new_walls_beside_an_obstacle(itself: bool |
     while not scene.ended(state):
         state, report = scene.stepper.advance(state)
         broken.append(report.broken)
-        solves.append(report.solve.newton)
+        solves.append(report.solve.newton_iterations)
     assert sum(broken) > 0 and np.isfinite(state.u).all()
     assert scene.fracture is not None and scene.fracture.graph.broken_count == sum(broken)

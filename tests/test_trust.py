@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import block_diag, csr_array
 
-from fracsim.solvers.nonlinear_elimination import trusted_step
+from fracsim.solvers.nonlinear_elimination import steihaug_step
 
 RANDOM = np.random.default_rng(11)
 
@@ -28,7 +28,7 @@ def test_several_problems_at_once() -> None:
     radius = np.array([10.0, 0.1, 0.5, 1.0])
     K, g = csr_array(block_diag([part[0] for part in parts])), np.concatenate([part[1] for part in parts])
     of = np.repeat(np.arange(4), [len(part[1]) for part in parts])
-    z, promised = trusted_step(K, np.tile(np.eye(3), (len(g), 1, 1)), g, of, radius)
+    z, promised = steihaug_step(K, np.tile(np.eye(3), (len(g), 1, 1)), g, of, radius)
     for each, (A, force) in enumerate(parts):
         step, pull = z[of == each].reshape(-1), force.reshape(-1)
         assert np.isclose(promised[each], -(pull @ step + step @ A @ step / 2))

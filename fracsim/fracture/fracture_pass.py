@@ -31,12 +31,12 @@ class PassResult:
         before: copies of the fields of damage before the pass, where edges broke.
     """
 
-    broken: int
-    loss: float
-    released: float
-    elastic: float
-    died: bool
-    before: list[Values] = field(default_factory=list)
+    broken_edges: int
+    largest_chi_loss: float
+    released_energy: float
+    elastic_energy: float
+    cells_died: bool
+    previous_damage: list[Values] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Breaking:
     Attributes:
         graph: edges and their integrity.    criterion: which edges fail.    law: what is left of an edge that does.
         degradation: what broken edges take out of the energy.
-        passes: most passes in a step; None: until nothing changes.
+        max_passes: most passes in a step; None: until nothing changes.
         opened: (edges,) where edges that were broken before the start are cut, NaN elsewhere; None: there are none.
     """
 
@@ -67,7 +67,7 @@ class Breaking:
         criterion: Criterion,
         law: EdgeLaw | None = None,
         *,
-        passes: int | None = 1,
+        max_passes: int | None = 1,
         opened: Values | None = None,
         degradation: Degradation | None = None,
         pace: float | None = None,
@@ -75,7 +75,7 @@ class Breaking:
     ) -> None:
         """`pace`: passes a second, in place of `passes`: in short steps not one in each; `joining`: which of the edges
         that fail hold nodes that would be crumbs (collective)."""
-        self.stress, self.graph, self.criterion, self.passes = stress, graph, criterion, passes
+        self.stress, self.graph, self.criterion, self.max_passes = stress, graph, criterion, max_passes
         self.law: EdgeLaw = law or Brittle()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.opened, self._pace, self._joining = opened, pace, joining
@@ -87,12 +87,12 @@ class Breaking:
         self._memory: Damage | None = None
 
     @property
-    def pattern(self) -> npt.NDArray[np.uint8]:
+    def broken_edge_patterns(self) -> npt.NDArray[np.uint8]:
         """(cells,) broken edges of each cell."""
         return self.graph.pattern
 
     @property
-    def not_finite(self) -> int:
+    def nonfinite_cells(self) -> int:
         """Cells of this rank whose stress was no number (crushed flat), over all passes."""
         return self._undamaged.not_finite
 
@@ -100,15 +100,15 @@ class Breaking:
         """Cauchy stress (cells, 3 or 6) in Pa and energy density (cells,) in J/m^3 of the undamaged material."""
         return self._undamaged()
 
-    def begin(self, t: float, dt: float) -> None:
+    def begin_step(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""
         self.degradation.begin(t, dt)
         self._now, self._dt = t + dt, dt
         if self._pace is not None:
-            self.passes = max(1, math.ceil(self._pace * dt))
+            self.max_passes = max(1, math.ceil(self._pace * dt))
             self._due = math.floor(self._pace * (t + dt)) > math.floor(self._pace * t)
 
-    def moving(self, v: Values, a: Values) -> None:
+    def set_rates(self, v: Values, a: Values) -> None:
         """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
         self.criterion.moving(v, a, self._now, self._dt)
 
@@ -152,25 +152,25 @@ class Breaking:
         """Damage is not what `memory` gave last: edges were weakened from elsewhere."""
         self._memory = None
 
-    def restored(self) -> None:
+    def damage_restored(self) -> None:
         """Edges and chi were read from a checkpoint: bring the other fields of damage to them."""
         self.degradation.restore()
         self.changed()
 
-    def memory(self) -> Damage:
+    def snapshot(self) -> Damage:
         """Copies of the damage of now, on this rank; the same object until something changes."""
         if self._memory is None:
             fields = [each.x.array.copy() for each in self.stress.damage_fields]
             self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
         return self._memory
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """Be damaged as `memory` says; whether that is anything else than now."""
-        assert isinstance(memory, Damage)
-        if memory is self._memory:
+        assert isinstance(saved, Damage)
+        if saved is self._memory:
             return False
-        self.graph.set_integrity(memory.integrity)
-        self.stress.exchange_damage(memory.fields)
-        self.criterion.recall(memory.criterion)
-        self._memory = memory
+        self.graph.set_integrity(saved.integrity)
+        self.stress.exchange_damage(saved.fields)
+        self.criterion.recall(saved.criterion)
+        self._memory = saved
         return True

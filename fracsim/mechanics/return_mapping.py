@@ -46,7 +46,7 @@ class ReturnMapping:
         stored: this rank's share of int psi dX after it, J; without damage.
     """
 
-    stored: float | None = 0.0
+    elastic_energy: float | None = 0.0
 
     def __init__(self, stress: Stress) -> None:
         plastic, domain = stress.material.plastic, stress.domain
@@ -57,7 +57,7 @@ class ReturnMapping:
         asked = trial.state(), trial.measures()
         self._state, self._measures = (point_expression(domain, each, every_step=True) for each in asked)
 
-    def begin(self, dt: float) -> None:
+    def begin_step(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""
         self.plastic.begin_step(dt)
 
@@ -76,7 +76,7 @@ class ReturnMapping:
                 power[:, part] = block.find()
                 lost += self._lost(block)
                 psi[where] = block.after[:, 2]
-        self.stored = float(plastic.volumes @ psi)
+        self.elastic_energy = float(plastic.volumes @ psi)
         if plastic.prediction is not None and dt:
             plastic.prediction.record_flow(points, power, dt)
         plastic.begin_step(0.0)
@@ -87,14 +87,14 @@ class ReturnMapping:
         self._flowed = len(points) > 0
         return lost
 
-    def memory(self) -> Values:
+    def snapshot(self) -> Values:
         """(points, 10 or 16) what the cells remember of their flow: see Plasticity.memory."""
         return self.plastic.snapshot()
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """The cells remember no more than that."""
-        assert isinstance(memory, np.ndarray)
-        return self.plastic.restore(memory)
+        assert isinstance(saved, np.ndarray)
+        return self.plastic.restore(saved)
 
     def _put_back(self) -> None:
         """F_p of the step's start, in place of what it was solved with."""

@@ -67,8 +67,8 @@ def write_checkpoint(
     nodal = {name: getattr(state, name) for name in (*_NODAL, *_SOMETIMES)}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
     clock |= {"elastic": float(total(comm, state.elastic)[0]), "dt_before": 0.0}
-    if state.before is not None:
-        nodal["u_before"], clock["dt_before"] = state.before
+    if state.previous_increment is not None:
+        nodal["u_before"], clock["dt_before"] = state.previous_increment
     nodal = {name: values for name, values in nodal.items() if values is not None}
     cells: dict[str, Any] = {}
     if state.frequencies is not None:
@@ -172,11 +172,11 @@ def read_checkpoint(
         plastic.restore(rows.reshape(-1, rows.shape[-1]))
     read: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
     read["elastic"] = 0.0 if comm.rank else clock["elastic"]
-    read["before"] = None if before is None else (before, clock["dt_before"])
+    read["previous_increment"] = None if before is None else (before, clock["dt_before"])
     if "frequencies" in names:
         read["frequencies"] = scattered(domain.gather_cells, "frequencies")
     remembered = {name.removeprefix(_TERMS): values for name, values in small.items() if name.startswith(_TERMS)}
-    return replace(state, **read, memory={"saved": remembered})
+    return replace(state, **read, history={"saved": remembered})
 
 
 class _Checks:

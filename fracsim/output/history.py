@@ -156,7 +156,7 @@ class History:
         """One row; `damage` is (broken edges, split cells, pieces). Raises CannotWrite (collective)."""
         values: list[int | float] = [
             state.step, state.t, report.dt, report.kinetic, report.elastic, state.dissipated, state.work, *damage,
-            report.solve.newton, report.solve.krylov, report.seconds,
+            report.solve.newton_iterations, report.solve.krylov_iterations, report.seconds,
         ]  # fmt: skip
         of_body = [each if factor == 1 else each * factor for each, factor in zip(values, self._factor, strict=True)]
         self.append_row([*of_body, *probes])

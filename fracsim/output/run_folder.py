@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError
-from ..timestepping.stepper import intervals
+from ..timestepping.stepper import count_intervals
 from .atomic_write import reason, replace_text
 from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import check_whole, read_times
@@ -189,9 +189,9 @@ class OutputClock:
         """Whether it is, at the end of this step at time t, s."""
         if self._every is not None:
             return step % self._every == 0
-        return intervals(t, self._interval) > self._passed
+        return count_intervals(t, self._interval) > self._passed
 
     def wrote(self, t: float) -> None:
         """A frame was written at time t, s. A late one does not push back the others, which are at whole intervals."""
         if self._every is None:
-            self._passed = intervals(t, self._interval)
+            self._passed = count_intervals(t, self._interval)

@@ -44,7 +44,7 @@ class Meter:
         cpu, memory = total(self._comm, [time.process_time() - self._cpu_began, _peak_memory()])
         seconds = {"setup": self.setup, **self._stepper.phases, "output": self.output}
         return {
-            "trouble": _sum(earlier["trouble"], self._stepper.troubles()),
+            "trouble": _sum(earlier["trouble"], self._stepper.failure_counts()),
             "wall": earlier["wall"] + time.perf_counter() - self._began,
             "cpu": earlier["cpu"] + float(cpu),
             "memory": max(earlier["memory"], float(memory)),

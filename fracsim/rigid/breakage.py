@@ -21,7 +21,7 @@ from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.fragments import Pieces, find_pieces
 from ..mesh.input_topology import MeshTopology
-from ..solvers.petsc_options import Options
+from ..solvers.petsc_options import PetscOptions
 from .surface_loads import PointLoads, patches, point_loads
 
 if TYPE_CHECKING:
@@ -102,9 +102,9 @@ class Operator(Protocol):
     @property
     def finest(self) -> float: ...
 
-    def whole(self, options: Options | None = None) -> Analysis: ...
+    def whole(self, options: PetscOptions | None = None) -> Analysis: ...
 
-    def body(self, share: Values, options: Options | None = None) -> Analysis: ...
+    def body(self, share: Values, options: PetscOptions | None = None) -> Analysis: ...
 
     def tensor(self, u: Values, share: Values) -> Values: ...
 
@@ -123,7 +123,7 @@ class Breakable:
         graph: EdgeGraph,
         criterion: BrittleSurfaces | None,
         within: Within,
-        options: Options | None = None,
+        options: PetscOptions | None = None,
         flow: Flow | None = None,
         heed: Callable[[], None] | None = None,
     ) -> None:

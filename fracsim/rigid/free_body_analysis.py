@@ -44,22 +44,22 @@ from ..forms.kinematics import deformation_gradient, symmetric_components
 from ..mechanics.jit import CellExpression, CellForm, cell_measure
 from ..mechanics.matrix_assembly import TangentAssembler
 from ..mechanics.stress import Stress
-from ..solvers.petsc_options import Options, OptionSet, refusing
-from ..solvers.preconditioner import MULTIGRID
-from ..solvers.rigid_body_modes import rigid_modes
+from ..solvers.petsc_options import PetscOptions, PetscOptionSet, call_petsc
+from ..solvers.preconditioner import GAMG_OPTIONS
+from ..solvers.rigid_body_modes import rigid_body_nullspace
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-DEFAULTS: Options = {
+DEFAULTS: PetscOptions = {
     "ksp_type": "cg",
     "ksp_rtol": 1e-8,
     "ksp_max_it": 2000,
-    **MULTIGRID,
+    **GAMG_OPTIONS,
     "pc_gamg_threshold": 0.0,  # no aggregates across cells of other pieces, which carry nothing
     "mg_coarse_pc_type": "svd",  # the coarsest matrix has the rigid modes too: it is singular
 }
 FEW = 1500  # nodes of a body: fewer are preconditioned by an incomplete factor
-FACTOR: Options = {"pc_type": "icc"}
+FACTOR: PetscOptions = {"pc_type": "icc"}
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,13 @@ class Stiffness:
         self._tensor = CellExpression(domain.comm, domain.mesh, symmetric_components(sigma), domain.cell_count)
         self._whole: FreeBody | None = None
 
-    def whole(self, options: Options | None = None) -> FreeBody:
+    def whole(self, options: PetscOptions | None = None) -> FreeBody:
         """The body of all cells; kept, for all copies of the mesh."""
         if self._whole is None:
             self._whole = self.body(np.ones(self.stress.domain.cell_count), options)
         return self._whole
 
-    def body(self, share: Values, options: Options | None = None) -> FreeBody:
+    def body(self, share: Values, options: PetscOptions | None = None) -> FreeBody:
         """Of the cells with a share (cells,)."""
         return FreeBody(self, share, options)
 
@@ -148,7 +148,7 @@ class FreeBody:
         relief: takes the rigid acceleration off a load.    matrix: K.    iterations: of CG in the last solve.
     """
 
-    def __init__(self, stiffness: Stiffness, share: Values, given: Options | None = None) -> None:
+    def __init__(self, stiffness: Stiffness, share: Values, given: PetscOptions | None = None) -> None:
         """`given`: PETSc options over DEFAULTS, and FACTOR of what is small."""
         domain = stiffness.stress.domain
         assert domain.comm.size == 1
@@ -158,21 +158,21 @@ class FreeBody:
         self._shape, self.iterations = (len(domain.nodes), domain.dim), 0
         self.matrix = stiffness.matrix(share, self.nodes)
         places = domain.nodes[self.nodes]
-        self._null = rigid_modes(domain.comm, places - places.mean(axis=0))
+        self._null = rigid_body_nullspace(domain.comm, places - places.mean(axis=0))
         modes = np.stack([mode.array_r.copy() for mode in self._null.getVecs()], axis=1)
         each = (share * stiffness.density * domain.volumes)[alive] / corners.shape[1]
         mass = np.bincount(corners.ravel(), np.repeat(each, corners.shape[1]), minlength=len(domain.nodes))
         self.relief = Relief(mass[self.nodes].astype(float), modes)
         self._solver(DEFAULTS | (FACTOR if len(self.nodes) < FEW else {}) | (given or {}))
 
-    def _solver(self, options: Options) -> None:
+    def _solver(self, options: PetscOptions) -> None:
         self.matrix.setNullSpace(self._null)
         self.matrix.setNearNullSpace(self._null)
-        self._options = OptionSet(options)
+        self._options = PetscOptionSet(options)
         ksp = self._ksp = PETSc.KSP().create(self.matrix.comm)
         ksp.setOptionsPrefix(self._options.prefix)
         ksp.setOperators(self.matrix)
-        refusing(ksp.setFromOptions)
+        call_petsc(ksp.setFromOptions)
         self._u, self._f = self.matrix.createVecs()
 
     def __call__(self, force: Values) -> Values:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..contact.obstacle import Obstacle
 from ..errors import NotConverged
-from ..timestepping.stepper import Abandoned
+from ..timestepping.stepper import StepAborted
 from .bodies import Bodies
 from .contact_records import Touches
 from .engine import Engine
@@ -183,7 +183,7 @@ class RigidStepper:
         begun, self._abandoned = self._begun(), None
         try:
             return self._advance(state, begun)
-        except Abandoned:
+        except StepAborted:
             self._abandoned = begun
             raise
 

@@ -18,7 +18,7 @@ from ..errors import NotConverged
 from ..forms.kinematics import SYMMETRIC_COMPONENTS
 from ..mechanics.stress import Stress
 from ..meshes.data import Shell
-from ..solvers.petsc_options import Options
+from ..solvers.petsc_options import PetscOptions
 from .free_body_analysis import Relief
 from .shell_triangles import Plates
 
@@ -54,13 +54,13 @@ class ShellStiffness:
         edge = float(np.sqrt(2.3 * self.plates.area.mean()))
         return float(np.cbrt(edge * self.shell.thickness**2 / 3))
 
-    def whole(self, options: Options | None = None) -> ShellBody:
+    def whole(self, options: PetscOptions | None = None) -> ShellBody:
         """The body of all triangles; kept, for all copies of the mesh."""
         if self._whole is None:
             self._whole = self.body(np.ones(self.stress.domain.cell_count), options)
         return self._whole
 
-    def body(self, share: Values, _: Options | None = None) -> ShellBody:
+    def body(self, share: Values, _: PetscOptions | None = None) -> ShellBody:
         """Of the cells with a share (cells,); there are factors, and no options."""
         return ShellBody(self, share)
 

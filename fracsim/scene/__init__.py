@@ -30,13 +30,13 @@ from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
 from ..mesh.parallel import on_root  # noqa: E402
 from ..output.history import Probe, Probes  # noqa: E402
-from ..solvers.nonlinear_solver import Solver  # noqa: E402
-from ..solvers.weak_callbacks import free_dropped  # noqa: E402
+from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
+from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
 from ..study import Study, TimeSettings  # noqa: E402
 from ..study.check import build_checked_mesh  # noqa: E402
 from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
 from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
-from ..timestepping.protocols import Breaking, Flow, Unbreakable  # noqa: E402
+from ..timestepping.protocols import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State  # noqa: E402
 from ..timestepping.stepper import Stepper, StepSizes  # noqa: E402
 from .inelastic_updates import breaking_of, flow_of  # noqa: E402
@@ -60,7 +60,7 @@ class Scene:
     study: Study
     domain: Domain
     balance: Balance
-    solver: Solver | None
+    solver: NonlinearSolver | None
     stepper: Stepper
     fracture: EdgeBreaking | None
     probes: Probes
@@ -101,7 +101,7 @@ def scene_on(
 ) -> Scene:
     """The scene of a study on a mesh that is there; `material`: in place of the study's own; `stage`: as above."""
     stage("setting up the balance of forces (kernels are compiled the first time)")
-    free_dropped(domain.comm)
+    collect_dropped_scenes(domain.comm)
     scheme = make_scheme(study.time)
     balance = balance_of(study, domain, scheme, material or material_of(study, domain))
     if not scheme.inertia:
@@ -109,8 +109,8 @@ def scene_on(
     stage("setting up what breaks and what solves")
     flow = flow_of(study, balance)
     breaking = breaking_of(study, balance)
-    solver = Solver(balance, study.solver) if scheme.implicit else None
-    breaks, frames = breaking or Unbreakable(balance, flow), study.frame_interval
+    solver = NonlinearSolver(balance, study.solver) if scheme.implicit else None
+    breaks, frames = breaking or NoFracture(balance, flow), study.frame_interval
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
     ways = {
         each.name: each.displacement for each in obstacle_placements(study, domain.dim) if each.displacement is not None
@@ -125,7 +125,12 @@ def make_scheme(timing: TimeSettings) -> Scheme:
 
 
 def make_stepper(
-    balance: Balance, timing: TimeSettings, flow: Flow, breaking: Breaking, solver: Solver | None, frames: float = 0.0
+    balance: Balance,
+    timing: TimeSettings,
+    flow: PlasticFlowProtocol,
+    breaking: FractureProtocol,
+    solver: NonlinearSolver | None,
+    frames: float = 0.0,
 ) -> Stepper:
     """What steps a balance of this scheme; `frames`: s between times at which steps end, 0: they need not."""
     smallest, course = timing.smallest or timing.min_step / 1024, step_size_function(timing)

@@ -13,7 +13,7 @@ from ..mesh.domain import Domain
 from ..study import BrittleSettings, Study
 from ..study.conditions import fibre_direction, initial_cracks
 from ..study.energy_checks import check_branching_dimension
-from ..timestepping.protocols import Flow, NoFlow
+from ..timestepping.protocols import NoPlasticFlow, PlasticFlowProtocol
 from .material_model import per_cell
 
 Values = npt.NDArray[np.float64]
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from ..mesh.edge_graph import EdgeGraph
 
 
-def flow_of(study: Study, balance: Balance) -> Flow:
+def flow_of(study: Study, balance: Balance) -> PlasticFlowProtocol:
     """What flows."""
     if study.plasticity is None:
-        return NoFlow()
+        return NoPlasticFlow()
     from ..mechanics.return_mapping import ReturnMapping
 
     return ReturnMapping(balance.stress)
@@ -56,7 +56,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     else:
         criterion = _criterion(study, balance.stress, graph)
         joining = _joining(study, balance, graph, criterion.strength)
-        breaking = Breaking(balance.stress, graph, criterion, passes=passes, opened=opened, joining=joining)
+        breaking = Breaking(balance.stress, graph, criterion, max_passes=passes, opened=opened, joining=joining)
     if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
         balance.set_cuts(lambda: graph.gather_broken(cut[:, None]))
     if opened is not None:
@@ -94,7 +94,7 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
         from ..fracture.energy.tip_constraints import JoinedTips
 
         criterion = JoinedTips(tips, graph, joining)
-    return Breaking(stress, graph, criterion, passes=passes, opened=opened, degradation=splitting, pace=pace)
+    return Breaking(stress, graph, criterion, max_passes=passes, opened=opened, degradation=splitting, pace=pace)
 
 
 def _cohesive(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
@@ -110,7 +110,7 @@ def _cohesive(study: Study, balance: Balance, graph: EdgeGraph, passes: int | No
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     tips = CohesiveTips(stress, cuts, strength, toughness, opened)
     softening = Softening(stress, cuts, strength, toughness, tips.cut)
-    return CohesiveBreaking(stress, graph, cuts, tips, softening, passes=passes, opened=opened)
+    return CohesiveBreaking(stress, graph, cuts, tips, softening, max_passes=passes, opened=opened)
 
 
 def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:

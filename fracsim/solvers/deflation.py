@@ -28,7 +28,7 @@ from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.facet_components import parts_of_nodes
 from ..mesh.parallel import allgather, total
-from .weak_callbacks import AppliedBy
+from .weak_callbacks import ApplyContext
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -36,7 +36,7 @@ Ints = npt.NDArray[np.int64]
 DEPENDENT = 1e-8  # of the largest eigenvalue of a part's Gram matrix: motions that are the same on its nodes
 
 
-class LooseParts:
+class DeflatedPreconditioner:
     """The context of a PETSc preconditioner.
 
     Attributes:
@@ -45,14 +45,14 @@ class LooseParts:
 
     def __init__(self, balance: Balance, body: PETSc.PC, nodes: Ints, part: Ints, count: int) -> None:
         """`nodes`: (n,) owned ones that move with their `part` (n,) of so many."""
-        self._balance, self.body = balance, body
+        self._balance, self.base_pc = balance, body
         self._nodes, self._part, self._count = nodes, part, count
         self.pc = PETSc.PC().create(balance.domain.comm)
         self.pc.setType("python")
-        self.pc.setPythonContext(AppliedBy(self.apply))
+        self.pc.setPythonContext(ApplyContext(self.apply))
         self._rest = balance.work_vector.duplicate()
 
-    def follow(self, tangent: PETSc.Mat) -> bool:
+    def update_operator(self, tangent: PETSc.Mat) -> bool:
         """Serve the tangent of now, and the body where it is. False: all that hangs is held (collective)."""
         balance, domain = self._balance, self._balance.domain
         x, free = domain.nodes[self._nodes], balance.motion.free_dofs.reshape(-1, domain.dim)[self._nodes]
@@ -92,17 +92,17 @@ class LooseParts:
         x.copy(rest)
         moved = self._solve(total(comm, self._Zt @ rest.array_r[at]))
         rest.array_w[near] -= self._KZ @ moved
-        self.body.apply(rest, y)
+        self.base_pc.apply(rest, y)
         moved -= self._solve(total(comm, self._KZt @ y.array_r[near]))
         y.array_w[at] += self._Z @ moved
 
-    def forget(self) -> None:
+    def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         self.pc.destroy()
         self._rest.destroy()
 
 
-def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
+def create_deflation(balance: Balance, base_pc: PETSc.PC) -> DeflatedPreconditioner | None:
     """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part (collective)."""
     domain, multiplier = balance.domain, balance.stress.energy_multiplier
     if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
@@ -110,7 +110,7 @@ def loose_parts(balance: Balance, body: PETSc.PC) -> LooseParts | None:
     count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
     _join_tied(balance, part)
     nodes = np.flatnonzero(part > 0)
-    return LooseParts(balance, body, nodes, part[nodes] - 1, count - 1) if count > 1 else None
+    return DeflatedPreconditioner(balance, base_pc, nodes, part[nodes] - 1, count - 1) if count > 1 else None
 
 
 def _join_tied(balance: Balance, part: Ints) -> None:

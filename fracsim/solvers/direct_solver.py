@@ -30,7 +30,7 @@ TRIED, FLOPS = 40, 11  # iterations for one tangent from which on it is tried wh
 MANY, COMPACT = 4, 1 / 16
 
 
-class Factors:
+class DirectSolver:
     """The factors of one KSP, which its preconditioner gives way to.
 
     Attributes:

@@ -27,7 +27,7 @@ from collections.abc import Callable
 LOOSE = 1e-2
 
 
-class Forcing:
+class EisenstatWalkerForcing:
     """The relative tolerances of the solves in one attempt."""
 
     def __init__(self, rtol: float) -> None:
@@ -35,23 +35,23 @@ class Forcing:
         self._rtol = self._used = rtol
         self._last = 0.0
 
-    def begin(self) -> None:
+    def begin_attempt(self) -> None:
         """An attempt begins: no residual is known."""
         self._last = 0.0
 
-    def exact(self) -> float:
+    def tight_tolerance(self) -> float:
         """The tolerance where no contact acts."""
         self._last, self._used = 0.0, self._rtol
         return self._used
 
-    def rough(self, norm: float, little: float) -> float:
+    def tolerance_for(self, norm: float, little: float) -> float:
         """That at a residual of `norm`, N, where `little` N is a solution."""
         gained = (norm / self._last) ** 2 if self._last else 1.0
         enough = 0.1 * little / norm if norm else 1.0
         self._last, self._used = norm, min(LOOSE, max(self._rtol, 0.9 * gained, enough))
         return self._used
 
-    def iterations(self, its: int) -> int:
+    def equivalent_iterations(self, its: int) -> int:
         """How many a solve to the exact tolerance would have taken, which took `its` (at a constant rate)."""
         return round(its * math.log(self._rtol) / math.log(self._used))
 
@@ -63,7 +63,7 @@ ROUGHEST, LOOSEST = 1e-2, 0.1  # no correction is rougher, and no last one: of a
 ENOUGH = 3  # iterations that tell how quickly CG converges
 
 
-class Sparing:
+class ContractionForcing:
     """The same of a body that touches nothing.
 
     Attributes:
@@ -75,13 +75,13 @@ class Sparing:
         # of the last attempt: share of r that its first iteration has left, and what CG has left of r there, for what
         # it was to leave of the preconditioned residual
         self._first_left, self._first_excess = 0.0, 1.0
-        self.begin()
+        self.begin_attempt()
 
-    def begin(self) -> None:
+    def begin_attempt(self) -> None:
         """An attempt begins: no residual is known."""
         self._norms: list[float] = []
 
-    def reach(self, norm: float, little: float, left_by_cg: Callable[[], float]) -> bool:
+    def record_iterate(self, norm: float, little: float, left_by_cg: Callable[[], float]) -> bool:
         """An iterate has a residual of `norm`, N, where `little` N is a solution; whether the tangent of the last one
         does for it. `left_by_cg`: what CG has left of r on the way there, N."""
         self._norms.append(norm)
@@ -90,14 +90,14 @@ class Sparing:
             self._first_excess = max(1.0, SHARE / MOST * left_by_cg() / (self._used * self._norms[0] or math.inf))
         return len(self._norms) > 1 and 2 * self._left * norm <= LEFT * little
 
-    def tolerance(self, little: float, *, kept: bool) -> float:
+    def tolerance_for(self, little: float, *, kept: bool) -> float:
         """That of the solve from there; `kept`: with the tangent of the last iterate."""
         first, enough = len(self._norms) == 1, SMALL * little / self._norms[-1] if self._norms[-1] else 1.0
         left = self._first_left / self._first_excess if first else (2 * self._left if kept else self._left**2)
         self._used = max(self.rtol, min(ROUGHEST, SHARE * left), min(enough, LOOSEST))
         return self._used
 
-    def exact(self) -> float:
+    def tight_tolerance(self) -> float:
         """The tolerance of a solve by itself."""
         self._used = self.rtol
         return self._used
@@ -107,6 +107,6 @@ class Sparing:
         """Share of r that the last iteration has left."""
         return self._norms[-1] / self._norms[-2] if self._norms[-2] else 1.0
 
-    def iterations(self, its: int) -> int:
+    def equivalent_iterations(self, its: int) -> int:
         """How many a solve to the exact tolerance would have taken, which took `its`; 0: too few to tell."""
         return round(its * math.log(self.rtol) / math.log(self._used)) if its >= ENOUGH else 0

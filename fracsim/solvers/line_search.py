@@ -30,7 +30,7 @@ from petsc4py import PETSc
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.parallel import total
-from .weak_callbacks import weakly
+from .weak_callbacks import weak_callback
 
 # Potentials that differ by less than this share of their terms are the same.
 ROUND_OFF = 1e4 * float(np.finfo(float).eps)
@@ -40,31 +40,31 @@ FEW = 0.03  # of all nodes, which are held back at most
 PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
 
 
-class Descent:
+class MeritFunction:
     """The objective of a SNES, J: how far it is above where the step set out."""
 
     def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
         self._balance, self._snes = balance, snes
         self._from, self._residual = balance.work_vector.duplicate(), balance.work_vector.duplicate()
-        self.begin()
+        self.begin_solve()
 
-    def begin(self) -> None:
+    def begin_solve(self) -> None:
         """A solve begins: nothing is known of it."""
         self._whole: float | None = None  # J, what the whole step of an iteration rises by
         self._known, self._known_at, self._residual_at = (0.0, 0.0), -1, -1  # after how many moves of the body
         self._height, self._norm, self._sets_out, self._by_norm = 0.0, 0.0, True, False
         self._rested = False
 
-    def set_out(self) -> None:
+    def begin_line_search(self) -> None:
         """The direction of an iteration is found: PETSc asks for its start next."""
         self._sets_out = True
 
-    def rested(self) -> None:
+    def note_elimination(self) -> None:
         """Some nodes went down by themselves, where the residual of others may rise: from here on the norm is no merit,
         or what they gained would be given back, again and again."""
         self._rested = True
 
-    def residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
+    def evaluate_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r at x into b (collective)."""
         self._balance.set_iterate(x)
         if self._residual_at == self._balance.displacement_version:
@@ -125,7 +125,7 @@ class Descent:
         self._residual.destroy()
 
 
-def hold_back(domain: Domain, y: PETSc.Vec, r: PETSc.Vec) -> None:
+def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec) -> None:
     """Shorten a correction x <- x - y, m, of the FEW nodes that go further than an edge, where it still leads down a
     potential whose derivative at x is `r`, N (collective)."""
     moves = y.array_r.reshape(-1, domain.dim)
@@ -142,7 +142,7 @@ def hold_back(domain: Domain, y: PETSc.Vec, r: PETSc.Vec) -> None:
     whole.destroy()
 
 
-class Way(NamedTuple):
+class TangentModification(NamedTuple):
     """How an attempt goes down.
 
     Attributes:
@@ -152,19 +152,24 @@ class Way(NamedTuple):
     """
 
     exact_below: float
-    small: float
-    anew: bool = False
-    goes_on: bool = False
+    eigenvalue_floor: float
+    rebuild_preconditioner: bool = False
+    from_last_iterate: bool = False
 
 
 # with positive moduli; the second and the third go on from where exact tangents have misled the one before
-POSITIVE = Way(1e-2, 1e-2), Way(1e-2, 0.0, goes_on=True), Way(0.0, 0.0, goes_on=True), Way(0.0, 0.0, anew=True)
+POSITIVE_TANGENTS = (
+    TangentModification(1e-2, 1e-2),
+    TangentModification(1e-2, 0.0, from_last_iterate=True),
+    TangentModification(0.0, 0.0, from_last_iterate=True),
+    TangentModification(0.0, 0.0, rebuild_preconditioner=True),
+)
 
 
-EXACT = Way(math.inf, 0.0, goes_on=True)  # exact tangents throughout
+EXACT_TANGENTS = TangentModification(math.inf, 0.0, from_last_iterate=True)  # exact tangents throughout
 
 
-class Downhill:
+class ModifiedNewton:
     """What a SNES goes by.
 
     Attributes:
@@ -174,39 +179,39 @@ class Downhill:
     def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
         """Makes the incremental potential of `balance`, which has one, the objective of `snes`."""
         self.snes, self._balance = snes, balance
-        self.descent = descent = Descent(balance, snes)
-        objective, residual = weakly(descent.__call__), weakly(descent.residual)
+        self.merit = descent = MeritFunction(balance, snes)
+        objective, residual = weak_callback(descent.__call__), weak_callback(descent.evaluate_residual)
         snes.setObjective(lambda _, x: objective(x))
         snes.setFunction(lambda _, x, b: residual(x, b), balance.work_vector)
-        self.made_positive(None)
+        self.use_modification(None)
 
-    def made_positive(self, how: Way | None) -> None:
+    def use_modification(self, how: TangentModification | None) -> None:
         """An attempt begins: tangents are those of a way, or exact."""
         self._how, self._highest = how, 0.0
         self._least, self._least_at = math.inf, 0
 
     @property
-    def small(self) -> float | None:
+    def eigenvalue_floor(self) -> float | None:
         """Of the tangent at the present iterate (Stiffness.assemble); None: it is exact."""
         if self._how is None:
             return None
         norm = self.snes.getFunctionNorm()
         self._highest = max(self._highest, norm)
-        return None if norm < self._how.exact_below * self._highest else self._how.small
+        return None if norm < self._how.exact_below * self._highest else self._how.eigenvalue_floor
 
-    def hold_back(self, y: PETSc.Vec) -> None:
+    def clip_correction(self, y: PETSc.Vec) -> None:
         """Of a correction what would throw few nodes far, where moduli are made positive (line_search). Without inertia
         nothing tells where a part goes that hangs by a thread (collective)."""
-        if self._balance.scheme.inertia and self.small is not None:
-            hold_back(self._balance.domain, y, self.snes.getFunction()[0])
+        if self._balance.scheme.inertia and self.eigenvalue_floor is not None:
+            clip_correction(self._balance.domain, y, self.snes.getFunction()[0])
 
-    def stalls(self, norm: float, its: int) -> bool:
+    def has_stalled(self, norm: float, its: int) -> bool:
         """Whether it goes about in circles: exact tangents that are not positive, though CG does not notice, lead past
         the solution for as long as they may. |r| is `norm`, N, after `its` iterations."""
         if norm < self._least or not its:
             self._least, self._least_at = norm, its
-        return self._how is not None and self.small is None and its - self._least_at >= PATIENCE
+        return self._how is not None and self.eigenvalue_floor is None and its - self._least_at >= PATIENCE
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
-        self.descent.destroy()
+        self.merit.destroy()

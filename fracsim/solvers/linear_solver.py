@@ -25,23 +25,23 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from .direct_solver import FACTORISED, Factors
-from .forcing_terms import Forcing, Sparing
-from .multigrid.block_operator import Blocks, worth_it
-from .petsc_options import Options, OptionSet, refusing
-from .preconditioner import MULTIGRID, Due, Preconditioner, inertia_share
-from .rigid_body_modes import rigid_modes
+from .direct_solver import FACTORISED, DirectSolver
+from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
+from .multigrid.block_operator import BlockOperator, blocks_pay_off
+from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
+from .preconditioner import GAMG_OPTIONS, Due, Preconditioner, mass_stiffness_ratio
+from .rigid_body_modes import rigid_body_nullspace
 
 if TYPE_CHECKING:
-    from .deflation import LooseParts
-    from .multigrid.vcycle import Cycle
+    from .deflation import DeflatedPreconditioner
+    from .multigrid.vcycle import SinglePrecisionVCycle
 
-GUESS: Options = {"ksp_guess_type": "fischer", "ksp_guess_fischer_model": "1,10"}  # 10 solutions and their forces
+GUESS: PetscOptions = {"ksp_guess_type": "fischer", "ksp_guess_fischer_model": "1,10"}  # 10 solutions and their forces
 AT_REST = 0.3  # of what Newton's method would leave: so far without inertia
 ENOUGH = 3  # iterations that tell how quickly CG converges
 _SILENT = ("snes_rtol", "ksp_rtol", "ksp_type")
 Values = npt.NDArray[np.float64]
-DEFAULTS: Options = {
+DEFAULTS: PetscOptions = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
     "snes_max_it": 50,  # near a limit it would be the last digits that decide whether a step is halved
@@ -61,7 +61,7 @@ SHRINK_BELOW = 0.9
 ROUNDED = 1e-6
 
 
-def is_linear(balance: Balance, given: Options, method: str) -> bool:
+def is_linear(balance: Balance, given: PetscOptions, method: str) -> bool:
     """Whether steps are single solves: of a linear body by CG or factors, where nobody asked for another way, nor to be
     shown Newton's."""
     own = all(key in _SILENT or key.startswith(("pc_", "mg_")) for key in given)
@@ -71,7 +71,7 @@ def is_linear(balance: Balance, given: Options, method: str) -> bool:
     return own and balance.linear and balance.symmetric and held
 
 
-class Ending:
+class LinearStepCG:
     """CG for solves that end a step.
 
     Attributes:
@@ -81,14 +81,14 @@ class Ending:
     def __init__(self, comm: object, most: int) -> None:
         """`most`: iterations."""
         self._ksp = ksp = PETSc.KSP().create(comm)
-        self._options = OptionSet(GUESS)
+        self._options = PetscOptionSet(GUESS)
         ksp.setOptionsPrefix(self._options.prefix)
         ksp.setType("cg")
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ksp.setFromOptions()
         ksp.setConvergenceHistory(most + 1, reset=True)
         self._most = most
-        self.its, self.left = 0, 0.0
+        self.iterations, self.residual_norm = 0, 0.0
 
     def solve(self, A: PETSc.Mat, K: PETSc.Mat, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec, little: float) -> bool:
         """K x = b down to |r| = `little`, N, `A` being K for products; whether it is solved (collective)."""
@@ -98,15 +98,15 @@ class Ending:
         ksp.setOperators(A, K)
         ksp.setTolerances(rtol=0.0, atol=little, max_it=self._most)
         ksp.solve(b, x)
-        self.its, self.left = ksp.its, ksp.norm
+        self.iterations, self.residual_norm = ksp.its, ksp.norm
         return bool(ksp.reason > 0)
 
     def to_share(self, rtol: float) -> int:
         """Iterations that a solve to a share of the residual would have taken; 0: too few to tell."""
         begun = self._ksp.getConvergenceHistory()[:1]
-        if self.its < ENOUGH or not 0 < self.left < begun[0]:
+        if self.iterations < ENOUGH or not 0 < self.residual_norm < begun[0]:
             return 0
-        return round(self.its * math.log(rtol) / math.log(self.left / begun[0]))
+        return round(self.iterations * math.log(rtol) / math.log(self.residual_norm / begun[0]))
 
     def destroy(self) -> None:
         """Give back PETSc's objects, and take the options out of its database."""
@@ -114,7 +114,7 @@ class Ending:
         self._ksp.destroy()
 
 
-class Linear:
+class LinearSolver:
     """K, and solving with it.
 
     Attributes:
@@ -129,9 +129,9 @@ class Linear:
         self,
         balance: Balance,
         ksp: PETSc.KSP,
-        options: OptionSet,
-        given: Options,
-        chosen: Options,
+        options: PetscOptionSet,
+        given: PetscOptions,
+        chosen: PetscOptions,
         small: Callable[[], float | None],
     ) -> None:
         """`given`: of the study, `chosen`: with the defaults; `small`: how positive K is made at the present u
@@ -139,28 +139,28 @@ class Linear:
         self.balance, self.stiffness, self.ksp, self._smallness = balance, balance.tangent, ksp, small
         self.failures = 0
         self._small: float | None = None  # of the last tangent
-        self._blocks: Blocks | None = None  # of the tangent
+        self._blocks: BlockOperator | None = None  # of the tangent
         self._products: PETSc.Mat | None = None  # a matrix of them
         self._condensed: PETSc.Mat | None = None  # of what is multiplied with, and of parts of low rank
         self.correction = balance.work_vector.duplicate()
-        self._near_null = rigid_body_modes(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
+        self._near_null = near_nullspace(balance.domain) if chosen["pc_type"] in ("gamg", "ml", "hypre") else None
         self._by_blocks = chosen["pc_type"] == "gamg"
         self._may_hasten = _is_own(given)
         self._take_tangent()
-        refusing(ksp.setFromOptions)
+        call_petsc(ksp.setFromOptions)
         options.check(given, self._set_up_at_rest)
         self.iterative = ksp.getType() != "preonly"  # a direct solver's factors are for one tangent only
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
             large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
-            bring=self._bring, pattern=lambda: self.stiffness.pattern_version, inertia=lambda: inertia_share(balance),
+            bring=self._bring, pattern=lambda: self.stiffness.pattern_version, inertia=lambda: mass_stiffness_ratio(balance),
             nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
         self.linearly = is_linear(balance, given, ksp.getType())
-        self._ending = Ending(ksp.comm, int(ksp.max_it)) if self.linearly and self.iterative else None
+        self._ending = LinearStepCG(ksp.comm, int(ksp.max_it)) if self.linearly and self.iterative else None
         self.forcing = None if self._asked else _forcing(balance, chosen)
-        self.factors = Factors(
+        self.factors = DirectSolver(
             self.preconditioner, symmetric=balance.symmetric, dofs=balance.work_vector.getSize(), dim=balance.domain.dim
         )
 
@@ -178,11 +178,11 @@ class Linear:
         self._forget_condensed()
         self.operator = self._products or self.stiffness.matrix
         if self.stiffness.may_be_incomplete:
-            from .low_rank import Condensed
+            from .low_rank import LowRankOperator
 
             stiffness = self.stiffness
             parts, springs = (lambda: stiffness.low_rank_updates), (lambda: stiffness.stiff_couplings)
-            self.operator = self._condensed = Condensed(self.operator, parts, springs).matrix()
+            self.operator = self._condensed = LowRankOperator(self.operator, parts, springs).to_petsc()
         self._know_rigid_motions()
 
     def _forget_condensed(self) -> None:
@@ -200,12 +200,12 @@ class Linear:
     def _use_blocks(self) -> None:
         """Multiply with the tangent in blocks, where that is quicker."""
         if self._blocks is not None:
-            self._blocks.forget()
+            self._blocks.release_copy()
             self._blocks = self._products = None
-        if self._by_blocks and worth_it(self.stiffness.matrix):
+        if self._by_blocks and blocks_pay_off(self.stiffness.matrix):
             stiffness, blocks = self.stiffness, self.stiffness.switch_to_blocks()
-            self._blocks = Blocks(stiffness.matrix, blocks, lambda: stiffness.pattern_version)
-            self._products = self._blocks.matrix()
+            self._blocks = BlockOperator(stiffness.matrix, blocks, lambda: stiffness.pattern_version)
+            self._products = self._blocks.to_petsc()
 
     def shrink(self) -> bool:
         """Where the body was damaged, see whether a smaller tangent does; whether there is a new one (collective)."""
@@ -232,17 +232,17 @@ class Linear:
         if forcing is None:
             self._assemble_tangent()
             return
-        self.preconditioner.its = forcing.iterations(self.ksp.its)
-        if isinstance(forcing, Sparing):
-            kept = forcing.reach(norm, little, self._left_by_cg) and self._small == self._smallness()
+        self.preconditioner.its = forcing.equivalent_iterations(self.ksp.its)
+        if isinstance(forcing, ContractionForcing):
+            kept = forcing.record_iterate(norm, little, self._left_by_cg) and self._small == self._smallness()
             if not kept:
                 self._assemble_tangent()
                 self._multiply_in_single()
-            self.ksp.setTolerances(rtol=forcing.tolerance(little, kept=kept))
+            self.ksp.setTolerances(rtol=forcing.tolerance_for(little, kept=kept))
             return
         self._assemble_tangent()
         self.ksp.setTolerances(
-            rtol=forcing.rough(norm, little) if self.stiffness.has_contact_coupling else forcing.exact()
+            rtol=forcing.tolerance_for(norm, little) if self.stiffness.has_contact_coupling else forcing.tight_tolerance()
         )
 
     def _left_by_cg(self) -> float:
@@ -253,7 +253,7 @@ class Linear:
         """K and what its preconditioner is due."""
         self._assemble()
         if self._blocks is not None:
-            self._blocks.follow()
+            self._blocks.update_copy()
         if (self.stiffness.low_rank_updates or self.stiffness.stiff_couplings) and self.ksp.getType() == "preonly":
             self.ksp.setType("gmres")  # factors are of the rest
         self._know_rigid_motions()
@@ -263,7 +263,7 @@ class Linear:
     def _multiply_in_single(self) -> None:
         """Let CG go by the tangent that its preconditioner keeps in single precision, half the bytes, where what that
         leaves of a correction is less than what the next one is for anyhow (collective)."""
-        if self._blocks is not None and self.ksp.getType() == "cg" and inertia_share(self.balance) > ROUNDED:
+        if self._blocks is not None and self.ksp.getType() == "cg" and mass_stiffness_ratio(self.balance) > ROUNDED:
             self._blocks.single = self.preconditioner.finest
 
     def _hold(self) -> None:
@@ -273,24 +273,24 @@ class Linear:
         if not springs:
             self.ksp.setPC(body)
             return
-        from .low_rank import Woodbury
+        from .low_rank import WoodburyPreconditioner
 
         body.setReusePreconditioner(True)
-        pc = PETSc.PC().createPython(Woodbury(body, springs, self.balance.work_vector), comm=self.ksp.comm)
+        pc = PETSc.PC().createPython(WoodburyPreconditioner(body, springs, self.balance.work_vector), comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
 
-    def _loosen(self, body: PETSc.PC) -> LooseParts | None:
-        from .deflation import loose_parts
+    def _loosen(self, body: PETSc.PC) -> DeflatedPreconditioner | None:
+        from .deflation import create_deflation
 
-        return loose_parts(self.balance, body)
+        return create_deflation(self.balance, body)
 
-    def _hasten(self, body: PETSc.PC) -> Cycle | None:
+    def _hasten(self, body: PETSc.PC) -> SinglePrecisionVCycle | None:
         if not self._may_hasten or self._blocks is None or (assembled := self._blocks.assembled) is None:
             return None
-        from .multigrid.vcycle import in_single
+        from .multigrid.vcycle import create_vcycle
 
-        return in_single(body, assembled)
+        return create_vcycle(body, assembled)
 
     def _bring(self) -> None:
         self.stiffness.update_entries()
@@ -347,7 +347,7 @@ class Linear:
         self._assemble_tangent()
         self.preconditioner.its = None
         if self.forcing is not None:
-            ksp.setTolerances(rtol=self.forcing.exact())
+            ksp.setTolerances(rtol=self.forcing.tight_tolerance())
         ksp.setOperators(self.operator, self.stiffness.matrix)
         ksp.solve(self.balance.work_vector, self.correction)
         return bool(ksp.reason > 0)
@@ -368,7 +368,7 @@ class Linear:
             products, tangent, preconditioner.serving, self.balance.work_vector, self.correction, little
         )
         preconditioner.its = ending.to_share(float(self.ksp.rtol))
-        return (ending.left, ending.its) if solved else None
+        return (ending.residual_norm, ending.iterations) if solved else None
 
     def destroy(self) -> None:
         """Give back PETSc's objects."""
@@ -378,16 +378,16 @@ class Linear:
         if self._ending is not None:
             self._ending.destroy()
         if self._blocks is not None:
-            self._blocks.forget()
+            self._blocks.release_copy()
         self._forget_condensed()
         if self._near_null is not None:
             self._near_null.destroy()
 
 
-def chosen_options(balance: Balance, given: Options) -> Options:
+def chosen_options(balance: Balance, given: PetscOptions) -> PetscOptions:
     """The study's options over the defaults."""
     multigrid = given.get("pc_type", "gamg") == "gamg"
-    chosen = DEFAULTS | (MULTIGRID if multigrid else {})
+    chosen = DEFAULTS | (GAMG_OPTIONS if multigrid else {})
     if multigrid and balance.scheme.inertia:
         # no aggregates across edges that carry nothing; without inertia every edge keeps RESIDUAL_STIFFNESS
         chosen |= {"pc_gamg_threshold": 0.0}
@@ -396,25 +396,25 @@ def chosen_options(balance: Balance, given: Options) -> Options:
     return chosen | given
 
 
-def _forcing(balance: Balance, chosen: Options) -> Forcing | Sparing | None:
+def _forcing(balance: Balance, chosen: PetscOptions) -> EisenstatWalkerForcing | ContractionForcing | None:
     """How exactly Newton's method solves; None: always as exactly. (Without inertia a piece hangs by next to nothing: a
     residual that is small leaves its place open.)"""
     rtol = float(chosen["ksp_rtol"])
     if balance.limits_newton_steps:
-        return Forcing(rtol) if balance.conservative else None
-    return Sparing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
+        return EisenstatWalkerForcing(rtol) if balance.conservative else None
+    return ContractionForcing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
 
 
-def _may_change(balance: Balance, given: Options) -> bool:
+def _may_change(balance: Balance, given: PetscOptions) -> bool:
     """Whether multigrid of another kind may take over: nobody asked for this one, and inertia holds what hangs."""
     return _is_own(given) and balance.scheme.inertia
 
 
-def _is_own(given: Options) -> bool:
+def _is_own(given: PetscOptions) -> bool:
     """Whether multigrid is of the program's own choice."""
     return not any(key.startswith(("pc_", "mg_")) for key in given)
 
 
-def rigid_body_modes(domain: Domain) -> PETSc.NullSpace:
+def near_nullspace(domain: Domain) -> PETSc.NullSpace:
     """The rigid motions of the whole body, about its centre (solvers.rigid_body_modes)."""
-    return rigid_modes(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)
+    return rigid_body_nullspace(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)

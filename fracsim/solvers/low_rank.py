@@ -25,7 +25,7 @@ from ..mesh.parallel import total
 Values = npt.NDArray[np.float64]
 
 
-class Condensed:
+class LowRankOperator:
     """The context of a PETSc matrix; preconditioners are made of K alone: k more iterations see to the part of low
     rank, and woodbury to springs."""
 
@@ -46,14 +46,14 @@ class Condensed:
         for each in self._springs():
             each.matrix.multAdd(x, y, y)
 
-    def matrix(self) -> PETSc.Mat:
+    def to_petsc(self) -> PETSc.Mat:
         """The matrix."""
         result: Any = PETSc.Mat().createPython(self._tangent.getSizes(), self, comm=self._tangent.comm)
         result.setUp()
         return result
 
 
-class Woodbury:
+class WoodburyPreconditioner:
     """The context of a PETSc preconditioner."""
 
     def __init__(self, body: PETSc.PC, springs: list[StiffCoupling], like: PETSc.Vec) -> None:

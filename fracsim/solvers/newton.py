@@ -15,14 +15,14 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
-from ..timestepping.stepper import Abandoned, SolveResult
-from .linear_solver import Linear, chosen_options
-from .petsc_options import Options, OptionSet, refusing
-from .weak_callbacks import weakly
+from ..timestepping.stepper import SolveResult, StepAborted
+from .linear_solver import LinearSolver, chosen_options
+from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
+from .weak_callbacks import weak_callback
 
 if TYPE_CHECKING:
-    from .line_search import Downhill
-    from .nonlinear_elimination import Patches
+    from .line_search import ModifiedNewton
+    from .nonlinear_elimination import NonlinearElimination
 
 Values = npt.NDArray[np.float64]
 
@@ -41,7 +41,7 @@ _SNES = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items()
 _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
-class Newton:
+class NewtonSolver:
     """SNES on a `Balance`, and others that share its linear solver.
 
     Attributes:
@@ -50,56 +50,56 @@ class Newton:
         gets_dear: of Krylov iterations and Newton's, whether an attempt is given up for them.
     """
 
-    def __init__(self, balance: Balance, given: Options) -> None:
+    def __init__(self, balance: Balance, given: PetscOptions) -> None:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance = balance
-        self.first_down: Downhill | None = None
-        self._down: Downhill | None = None  # what the SNES of the last attempt goes by
+        self.first_down: ModifiedNewton | None = None
+        self._down: ModifiedNewton | None = None  # what the SNES of the last attempt goes by
         self.gets_dear: Callable[[int, int], bool] = lambda krylov, its: False
         self._abandons: Callable[[], bool] = lambda: False
         self._abandoned = False  # in the last solve
         chosen = chosen_options(balance, given)
-        self._options = OptionSet(chosen)
+        self._options = PetscOptionSet(chosen)
         snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
         self._made = [snes]
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(lambda _, x, b: balance.assemble_free_residual(x, b), balance.work_vector)
         self._x = balance.work_vector.duplicate()
         try:
-            refusing(snes.setFromOptions)
-            self.linear = Linear(balance, snes.ksp, self._options, given, chosen, lambda: self._smallness)
+            call_petsc(snes.setFromOptions)
+            self.linear = LinearSolver(balance, snes.ksp, self._options, given, chosen, lambda: self._smallness)
         except InputError:
             self._options.remove()
             raise
         self._take_tangent()
-        snes.setConvergenceTest(weakly(self._converged))
+        snes.setConvergenceTest(weak_callback(self._converged))
         if balance.limits_newton_steps:
-            snes.setLineSearchPreCheck(weakly(self._limit))
+            snes.setLineSearchPreCheck(weak_callback(self._limit))
             if balance.conservative:
-                from .line_search import Downhill
+                from .line_search import ModifiedNewton
 
-                self.first_down = self._down = Downhill(balance, snes)
+                self.first_down = self._down = ModifiedNewton(balance, snes)
         self._rtol = self._own_rtol = float(chosen["snes_rtol"])
         self._single = chosen["snes_type"] == "ksponly"
         self._by_steps = chosen["snes_type"] == "newtonls"
-        self._patches: Patches | None = None  # of a body that breaks
+        self._patches: NonlinearElimination | None = None  # of a body that breaks
         self._first_norm = self._last_little = 0.0
         self._norms: list[float] = []  # of the residual in the last attempt
         self._rests = 0  # how often few nodes came to rest in it
 
-    def another_downhill(self) -> Downhill:
+    def another_downhill(self) -> ModifiedNewton:
         """A second SNES, with the linear solver of the first."""
-        from .line_search import Downhill
+        from .line_search import ModifiedNewton
 
         snes = PETSc.SNES().create(self.balance.domain.comm)
         snes.setOptionsPrefix(self._options.prefix)
         snes.setKSP(self.snes.ksp)
-        down = Downhill(self.balance, snes)
+        down = ModifiedNewton(self.balance, snes)
         self._made.append(snes)
         self._take_tangent()
-        snes.setLineSearchPreCheck(weakly(self._limit))
+        snes.setLineSearchPreCheck(weak_callback(self._limit))
         snes.setFromOptions()
-        snes.setConvergenceTest(weakly(self._converged))
+        snes.setConvergenceTest(weak_callback(self._converged))
         return down
 
     @property
@@ -112,7 +112,7 @@ class Newton:
         """Whether the last attempt went by the incremental potential."""
         return self._down is not None
 
-    def heed(self, abandons: Callable[[], bool]) -> None:
+    def set_stop_request(self, abandons: Callable[[], bool]) -> None:
         """Ask `abandons` (collective) between iterations whether to go on; else an attempt raises Abandoned."""
         self._abandons = abandons
 
@@ -122,14 +122,14 @@ class Newton:
         """Linearise into the matrix that the balance has now."""
         linear = self.linear
         for snes in self._made:
-            snes.setJacobian(weakly(self._linearise), linear.operator, self.balance.tangent.matrix)
+            snes.setJacobian(weak_callback(self._linearise), linear.operator, self.balance.tangent.matrix)
 
     def _linearise(self, *_: object) -> None:
         self.linear.linearise(self.snes.getFunctionNorm(), self._last_little)
 
     @property
     def _smallness(self) -> float | None:
-        return None if self._down is None else self._down.small
+        return None if self._down is None else self._down.eigenvalue_floor
 
     def shrink(self) -> None:
         """Take a smaller tangent where one does (collective)."""
@@ -138,7 +138,7 @@ class Newton:
 
     # --- an attempt ---
 
-    def attempt(self, guess: Values | None, down: Downhill | None = None) -> SolveResult:
+    def attempt(self, guess: Values | None, down: ModifiedNewton | None = None) -> SolveResult:
         """From `guess`; None: from where the last attempt has come to. `down`: by which SNES, None: by the first."""
         self.snes, self._down = (self._first, self.first_down) if down is None else (down.snes, down)
         self._norms, self._rests = [], 0
@@ -146,7 +146,7 @@ class Newton:
         self.balance.begin_solve()
         extended = 0 if guess is None else self._start_from(guess)
         if self.linear.linearly and (solved := self._solve_as_linear()) is not None:
-            return replace(solved, krylov=solved.krylov + extended)
+            return replace(solved, krylov_iterations=solved.krylov_iterations + extended)
         newton, krylov, held = self._solve_in_legs()
         reason = self.snes.reason
         self.balance.set_iterate(self._x)
@@ -176,13 +176,13 @@ class Newton:
                 break
             self._rtol = ON_THE_WAY if left else self._own_rtol
             if self._down is not None:
-                self._down.descent.begin()
+                self._down.merit.begin_solve()
             if self.linear.forcing is not None:
-                self.linear.forcing.begin()
+                self.linear.forcing.begin_attempt()
             self._abandoned = False
             self.snes.solve(None, self._x)
             if self._abandoned:
-                raise Abandoned
+                raise StepAborted
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
                 return newton, krylov, False
@@ -199,7 +199,7 @@ class Newton:
             if solved:
                 return SolveResult(True, its, krylov, "")
             if self._abandons():
-                raise Abandoned
+                raise StepAborted
             if its == LINEAR_SOLVES or (made := self.linear.correct(self._little(left))) is None:
                 break
             left, krylov = made[0], krylov + made[1]
@@ -214,15 +214,15 @@ class Newton:
         preconditioner at the next tangent, where that pays."""
         self.linear.preconditioner.damage_changed(broke)
         if broke != 0 and self._patches is None and self._by_steps:
-            from .nonlinear_elimination import patches_of
+            from .nonlinear_elimination import create_elimination
 
-            self._patches = patches_of(self.balance)
+            self._patches = create_elimination(self.balance)
 
     def _limit(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The step x <- x - y, no longer than the terms of the balance allow (collective)."""
         if self._down is not None:
-            self._down.descent.set_out()
-            self._down.hold_back(y)
+            self._down.merit.begin_line_search()
+            self._down.clip_correction(y)
         if not self.balance.limits_newton_steps:
             return
         share = self.balance.max_step_fraction(-y.array_r)
@@ -252,7 +252,11 @@ class Newton:
             return int(reason.DIVERGED_INNER)
         if self.gets_dear(snes.getLinearSolveIterations(), its):
             return int(reason.DIVERGED_INNER)
-        if self._down is not None and self.balance.scheme.inertia and self._down.stalls(snes.getFunctionNorm(), its):
+        if (
+            self._down is not None
+            and self.balance.scheme.inertia
+            and self._down.has_stalled(snes.getFunctionNorm(), its)
+        ):
             return int(reason.DIVERGED_MAX_IT)  # half the step is done in a few iterations
         self._norms.append(snes.getFunctionNorm())
         return int(reason.DIVERGED_LINE_SEARCH if self.crawls else reason.ITERATING)
@@ -264,11 +268,11 @@ class Newton:
             return False
         if snes.getFunctionNorm() < FAST * self._norms[-1]:  # nothing holds it up
             return False
-        if not self._patches.rest(self._last_little):
+        if not self._patches.relax_nodes(self._last_little):
             return False
         self._rests += 1
         if self._down is not None:
-            self._down.descent.rested()
+            self._down.merit.note_elimination()
         x, r = snes.getSolution(), snes.getFunction()[0]
         x.array_w[:] = self.balance.u.x.array[: self.balance.owned_dof_count]
         snes.computeFunction(x, r)

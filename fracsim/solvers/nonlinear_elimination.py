@@ -55,14 +55,14 @@ LEAST = 1e-8  # of the greatest eigenvalue of a block that is preconditioned wit
 POOR, GOOD = 0.05, 0.7
 
 
-def trusted_step(K: sparray, inverse: Values, g: Values, of: Ints, radius: Values) -> tuple[Values, Values]:
+def steihaug_step(K: sparray, inverse: Values, g: Values, of: Ints, radius: Values) -> tuple[Values, Values]:
     """Steps z (n, d) of problems that share no entry of K, and by how much each lowers its model (p,).
 
     `inverse`: (n, d, d) blocks to precondition with; `g`: (n, d); `of`: (n,) the problem of each node; `radius`: (p,).
     """
 
     def sums(values: Values) -> Values:
-        return of_each(of, values.sum(axis=1), len(radius))
+        return sum_by_patch(of, values.sum(axis=1), len(radius))
 
     z, r = np.zeros_like(g), g.copy()
     y = np.einsum("nij,nj->ni", inverse, r)
@@ -87,12 +87,12 @@ def trusted_step(K: sparray, inverse: Values, g: Values, of: Ints, radius: Value
     return z, -0.5 * sums((g + r) * z)
 
 
-def of_each(of: Ints, values: Values, count: int) -> Values:
+def sum_by_patch(of: Ints, values: Values, count: int) -> Values:
     """(count,) sums of values (n,), each `of` (n,) a problem."""
     return np.asarray(np.bincount(of, values, count), np.float64)
 
 
-def patches_of(balance: Balance) -> Patches | None:
+def create_elimination(balance: Balance) -> NonlinearElimination | None:
     """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
     cell are constant forces, inertia and ties; None: it has not (collective)."""
     others = [term for term in balance.terms if term is not balance.stress]
@@ -100,10 +100,10 @@ def patches_of(balance: Balance) -> Patches | None:
     whole = balance.domain.order == 1 and balance.stress.rotation is None
     lumped = balance.mass.is_diagonal and balance.scheme.inertia
     fit = whole and lumped and not bent and not balance.limits_newton_steps and balance.conservative
-    return Patches(balance) if fit else None
+    return NonlinearElimination(balance) if fit else None
 
 
-class Patches:
+class NonlinearElimination:
     """Those of a balance."""
 
     def __init__(self, balance: Balance) -> None:
@@ -119,7 +119,7 @@ class Patches:
         """Compiled where it is first asked for (collective)."""
         return CellEnergy(self._balance.stress)
 
-    def rest(self, little: float) -> bool:
+    def relax_nodes(self, little: float) -> bool:
         """Bring the few nodes that hold most of the residual to rest, down to `little`, N, as it counts for the whole
         body; whether any moved (collective)."""
         nodes = self._heavy()
@@ -238,7 +238,7 @@ class _Region:
         work = ((linear / 2 + self._constant) * w).sum(axis=1)
         sums = linear + self._constant
         np.add.at(sums, self._at[inside], forces[inside])
-        parts = of_each(self.of_cell, energy, self.count), of_each(self.of, work, self.count)
+        parts = sum_by_patch(self.of_cell, energy, self.count), sum_by_patch(self.of, work, self.count)
         return _Look(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
 
     @cached_property
@@ -274,7 +274,7 @@ class _Region:
 
     def norms(self, forces: Values) -> Values:
         """(count,) |r| of each patch, N."""
-        return np.asarray(np.sqrt(of_each(self.of, np.square(forces).sum(axis=1), self.count)))
+        return np.asarray(np.sqrt(sum_by_patch(self.of, np.square(forces).sum(axis=1), self.count)))
 
 
 class _Pattern(NamedTuple):
@@ -325,7 +325,7 @@ def _settle(region: _Region, little: float, edge: float) -> bool:
         if not going.any():
             break
         pulled = np.where(going[region.of, None], now.forces, 0.0)
-        step, promised = trusted_step(*region.tangent(now.stiffness), pulled, region.of, radius)
+        step, promised = steihaug_step(*region.tangent(now.stiffness), pulled, region.of, radius)
         there = region.look(w + step)
         fell, slack = now.potential - there.potential, ROUND_OFF * now.size
         gain = np.divide(fell, promised, out=np.zeros_like(fell), where=promised > 0)

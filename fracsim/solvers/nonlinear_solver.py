@@ -20,15 +20,15 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..timestepping.stepper import SolveResult
-from .direct_solver import MANY, SOONER_THAN_GMRES, Factors
-from .line_search import EXACT, POSITIVE
-from .newton import Newton
-from .petsc_options import Options, blamed_on
+from .direct_solver import MANY, SOONER_THAN_GMRES, DirectSolver
+from .line_search import EXACT_TANGENTS, POSITIVE_TANGENTS
+from .newton import NewtonSolver
+from .petsc_options import PetscOptions, option_errors
 from .preconditioner import Due
 
 if TYPE_CHECKING:
-    from .line_search import Downhill, Way
-    from .linear_solver import Linear
+    from .line_search import ModifiedNewton, TangentModification
+    from .linear_solver import LinearSolver
 
 # solves that start with factors once iterations have failed: the first time, and at most
 FIRST_SPELL, LONGEST_SPELL = 8, 256
@@ -38,7 +38,7 @@ RESTART = 200
 ASTRAY = 8  # solves that go downhill at once, after two running whose first exact tangents have misled
 
 
-class Choice:
+class SolverSelector:
     """What the solves of one KSP begin with.
 
     Attributes:
@@ -46,7 +46,7 @@ class Choice:
         watches: whether a solve stops where iterations get dear.    dear: whether the last one has.
     """
 
-    def __init__(self, factors: Factors, *, may_prefer: bool) -> None:
+    def __init__(self, factors: DirectSolver, *, may_prefer: bool) -> None:
         """`may_prefer`: whether factors may be taken because they are cheaper, not only where iterations fail."""
         self._factors, self._may_prefer = factors, may_prefer
         self.left, self._spell, self._preferred = 0, FIRST_SPELL, False
@@ -78,7 +78,7 @@ class Choice:
 
     def was_dear(self, result: SolveResult, *, positively: bool) -> bool:
         """Whether factors would have cost less than the iterations of a solve."""
-        cheap = result.krylov <= self.worth(result.newton, positively=positively)
+        cheap = result.krylov_iterations <= self.worth(result.newton_iterations, positively=positively)
         return self._may_prefer and result.converged and not cheap
 
     def gets_dear(self, krylov: int, newton: int, *, positively: bool) -> bool:
@@ -94,10 +94,10 @@ class Choice:
         return self._factors.worth * (min(newton, MANY) if positively else max(newton, 1))
 
 
-class Solver:
+class NonlinearSolver:
     """What solves a `Balance`, set up once and kept for the whole run."""
 
-    def __init__(self, balance: Balance, given: Options) -> None:
+    def __init__(self, balance: Balance, given: PetscOptions) -> None:
         """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
         self.balance, self._given = balance, given
         self._failures_before = 0  # linear solves that failed before `renew`
@@ -106,14 +106,14 @@ class Solver:
 
     def _make(self) -> None:
         balance, given = self.balance, self._given
-        self._newton = newton = Newton(balance, given)
-        newton.heed(self._abandons)
-        self._downhill: Downhill | None = newton.first_down
+        self._newton = newton = NewtonSolver(balance, given)
+        newton.set_stop_request(self._abandons)
+        self._downhill: ModifiedNewton | None = newton.first_down
         self._led_astray = 0  # solves running whose first exact tangents have misled
         self._astray = 0  # solves to come that go downhill at once
         own = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in given)
         may_prefer = own and self.linear.may_factorise(SOONER_THAN_GMRES[balance.domain.dim])
-        self._choice = Choice(self.linear.factors, may_prefer=may_prefer)
+        self._choice = SolverSelector(self.linear.factors, may_prefer=may_prefer)
         newton.gets_dear = lambda krylov, its: self._choice.gets_dear(krylov, its, positively=self._positively)
 
     @property
@@ -122,7 +122,7 @@ class Solver:
         return self._newton.snes
 
     @property
-    def linear(self) -> Linear:
+    def linear(self) -> LinearSolver:
         """What linear systems are solved with."""
         return self._newton.linear
 
@@ -135,7 +135,7 @@ class Solver:
         """Solve r(u) = 0 from the owned values `guess`; u holds the result, also where it is no solution
         (nonlinear_solver). Raises Abandoned (heed), and InputError where PETSc cannot solve with the options of the
         study."""
-        with blamed_on(self._given):
+        with option_errors(self._given):
             return self._solve(guess)
 
     def _solve(self, guess: Values) -> SolveResult:
@@ -155,14 +155,14 @@ class Solver:
             choice.iterate()
         return result
 
-    def heed(self, abandons: Callable[[], bool]) -> None:
+    def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Ask `abandons` (collective) between Newton iterations; where it says so, `solve` raises Abandoned."""
-        self._abandons = abandons
-        self._newton.heed(abandons)
+        self._abandons = stop_requested
+        self._newton.set_stop_request(stop_requested)
 
     def linear_response(self, force: Values) -> Values:
         """(owned dofs,) displacement that a force on free dofs causes in a step at the present u (Linear.response)."""
-        with blamed_on(self._given):
+        with option_errors(self._given):
             self._newton.shrink()
             return self.linear.response(force, directly=bool(self._choice.left))
 
@@ -170,7 +170,7 @@ class Solver:
         """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows)."""
         self._newton.damage_changed(broke)
 
-    def renew(self) -> None:
+    def rebuild(self) -> None:
         """Take the tangent that the balance has now, and keep nothing of earlier solves but counts (collective)."""
         self._failures_before = self.linear_failures
         self.destroy()
@@ -208,7 +208,7 @@ class Solver:
         if self._astray:
             self._astray -= 1
             start: Values | None = guess
-            result = self._attempt_downhill(guess, POSITIVE)
+            result = self._attempt_downhill(guess, POSITIVE_TANGENTS)
         else:
             result, start = self._attempt_exactly_first(guess)
         stalled = self.snes.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT and self.linear.may_factorise()
@@ -226,7 +226,7 @@ class Solver:
         newton = self._newton
         result = newton.attempt(guess)
         if newton.crawls:
-            result = self._attempt_downhill(None, (EXACT,))
+            result = self._attempt_downhill(None, (EXACT_TANGENTS,))
         start = None if newton.goes_down and not self.balance.remaining_motion() else guess  # on the way down: goes on
         self._see_whether_astray(result)
         if self._misled(result):
@@ -236,7 +236,7 @@ class Solver:
                 # Smoothers of an older tangent need not be positive for this one.
                 self.linear.preconditioner.due = Due.REBUILD
             if self.balance.conservative:
-                result = self._attempt_downhill(start, POSITIVE)
+                result = self._attempt_downhill(start, POSITIVE_TANGENTS)
             else:
                 with self.linear.set_up_anew():
                     result = newton.attempt(start)
@@ -245,7 +245,7 @@ class Solver:
     def _see_whether_astray(self, result: SolveResult) -> None:
         """Of an attempt with exact tangents: whether its first one has misled, as that of the solve before."""
         down = self.balance.scheme.inertia and self.balance.conservative
-        self._led_astray = self._led_astray + 1 if down and not result.newton and self._misled(result) else 0
+        self._led_astray = self._led_astray + 1 if down and not result.newton_iterations and self._misled(result) else 0
         if self._led_astray > 1:
             self._astray = ASTRAY
 
@@ -256,23 +256,23 @@ class Solver:
         or contact set the pace that place is no better."""
         return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_newton_steps
 
-    def _attempt_downhill(self, guess: Values | None, ways: tuple[Way, ...]) -> SolveResult:
+    def _attempt_downhill(self, guess: Values | None, ways: tuple[TangentModification, ...]) -> SolveResult:
         """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive
         moduli would cost more than they save, where exact tangents do: an iteration more.)"""
         down = self._downhill = self._downhill or self._newton.another_downhill()
         for way in ways:
-            down.made_positive(way)
-            with self.linear.set_up_anew() if way.anew else nullcontext():
-                result = self._newton.attempt(None if way.goes_on else guess, down)
+            down.use_modification(way)
+            with self.linear.set_up_anew() if way.rebuild_preconditioner else nullcontext():
+                result = self._newton.attempt(None if way.from_last_iterate else guess, down)
             if not self._misled(result):
                 break
-        down.made_positive(None)
+        down.use_modification(None)
         return result
 
     def _attempt_directly(self, guess: Values | None) -> SolveResult:
         with self._to_the_end(), self.linear.factors.of(self.snes.ksp):
             result = self._newton.attempt(guess)
-            if result.newton and result.converged and self.snes.ksp.getType() == "preonly":
+            if result.newton_iterations and result.converged and self.snes.ksp.getType() == "preonly":
                 self.linear.factors.learn(self.snes.ksp)
         return result
 

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 
-Options = dict[str, bool | int | float | str]
+PetscOptions = dict[str, bool | int | float | str]
 
 # what a misspelt option is compared with
 COMMON = (
@@ -31,34 +31,34 @@ PETSc.Options()["vec_mdot_use_gemv"] = "false"
 _library = ctypes.CDLL(PETSc.__file__)  # petsc4py 3.22 does not wrap PetscOptionsUsed
 
 
-class OptionSet:
+class PetscOptionSet:
     """The options of one SNES, in the database while this object lives: multigrid reads its levels' at every set-up."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: PetscOptions) -> None:
         self.prefix = f"fracsim{next(_prefixes)}_"
         self._keys: list[str] = []
         self._removal = finalize(self, _remove, self.prefix, self._keys)
         self._removal.atexit = False  # PETSc has ended by then
         self.change(options)
 
-    def change(self, options: Options) -> None:
+    def change(self, options: PetscOptions) -> None:
         """Other values, or more options, for what is set up from now on."""
         database = PETSc.Options()
         for key, value in options.items():
             database[self.prefix + key] = str(value).lower() if isinstance(value, bool) else str(value)
         self._keys.extend(key for key in options if key not in self._keys)
 
-    def check(self, given: Options, set_up: Callable[[], None]) -> None:
+    def check(self, given: PetscOptions, set_up: Callable[[], None]) -> None:
         """InputError for an option that PETSc does not look up; `set_up` makes it look up those of inner solvers."""
         if not self._unused(given):
             return
-        refusing(set_up)
+        call_petsc(set_up)
         for key in self._unused(given):
             near = difflib.get_close_matches(key, COMMON, n=1, cutoff=0.6)
             hint = f"did you mean {near[0]}?" if near else "see PETSc's manual pages of SNES, KSP and PC"
             raise InputError(f"solver.{key} is not an option that PETSc looks up here; {hint}")
 
-    def _unused(self, keys: Options) -> list[str]:
+    def _unused(self, keys: PetscOptions) -> list[str]:
         return [key for key in keys if not _is_used(self.prefix + key)]
 
     def remove(self) -> None:
@@ -72,17 +72,17 @@ def _remove(prefix: str, keys: list[str]) -> None:
         database.delValue(prefix + key)
 
 
-def refusing(work: Callable[[], None]) -> None:
+def call_petsc(call: Callable[[], None]) -> None:
     """Run what reads options; a value that PETSc refuses becomes an InputError."""
     try:
-        work()
+        call()
     except PETSc.Error as error:
         message = str(error).splitlines()[-1].split("] ", 1)[-1]
         raise InputError(f"[solver]: PETSc refuses an option: {message}") from None
 
 
 @contextmanager
-def blamed_on(given: Options) -> Iterator[None]:
+def option_errors(given: PetscOptions) -> Iterator[None]:
     """What PETSc refuses only once it solves becomes an InputError, where the study has given options."""
     try:
         yield

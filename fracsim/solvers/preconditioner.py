@@ -42,36 +42,36 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import total
-from .petsc_options import Options, OptionSet
+from .petsc_options import PetscOptions, PetscOptionSet
 
 if TYPE_CHECKING:
-    from .deflation import LooseParts
-    from .multigrid.fine_level import Finest
-    from .multigrid.vcycle import Cycle
+    from .deflation import DeflatedPreconditioner
+    from .multigrid.fine_level import FineLevel
+    from .multigrid.vcycle import SinglePrecisionVCycle
 
 HELD = 1e-3  # above which what hangs by a node or an edge is held by its inertia
 SWEPT = 1e-2  # above which sweeps do without coarse spaces: no force gets far in a step
-MULTIGRID: Options = {
+GAMG_OPTIONS: PetscOptions = {
     "pc_type": "gamg",
     "pc_gamg_reuse_interpolation": True,
     "mg_levels_ksp_type": "chebyshev",
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
 }
-OF_PIECES: Options = {
+OF_PIECES: PetscOptions = {
     "pc_gamg_agg_nsmooths": 0,
     "mg_levels_ksp_type": "richardson",
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
-SWEEPS: Options = {"pc_type": "sor"}
-LEVELS: Options = {"pc_type": "gamg"}
+SWEEPS: PetscOptions = {"pc_type": "sor"}
+LEVELS: PetscOptions = {"pc_type": "gamg"}
 # on the finest level: one step, with blocks of a node's dofs, within bounds of their own spectrum
-BY_NODES: Options = {"pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"}
-STRONG_LINKS: Options = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
+BY_NODES: PetscOptions = {"pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"}
+STRONG_LINKS: PetscOptions = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
 # on several ranks PETSc (3.22) coarsens the square of a graph of strong links, since it does not end without (MISk)
-STRONG_LINKS_ON_RANKS: Options = STRONG_LINKS | {"pc_gamg_aggressive_square_graph": True}
-ALL_LINKS: Options = {"pc_gamg_threshold": 0.0, "pc_gamg_aggressive_square_graph": True}
+STRONG_LINKS_ON_RANKS: PetscOptions = STRONG_LINKS | {"pc_gamg_aggressive_square_graph": True}
+ALL_LINKS: PetscOptions = {"pc_gamg_threshold": 0.0, "pc_gamg_aggressive_square_graph": True}
 SLOW = 25  # iterations of a whole body from which on aggregates of strong links are tried
 WORTH_IT = 0.9  # of these iterations, which they may take at most
 REBUILD_ABOVE = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
@@ -90,7 +90,7 @@ PATTERN = "pattern"  # attribute of a PC: Stiffness.pattern when it was set up
 FRESH = 5
 
 
-def inertia_share(balance: Balance) -> float:
+def mass_stiffness_ratio(balance: Balance) -> float:
     """The inertia of a cell as a share of its stiffness, in the step that is solved now (collective)."""
     domain, material = balance.domain, balance.stress.material
     sums = [np.sum(each * domain.volumes) for each in (material.young, material.density)]
@@ -119,13 +119,13 @@ class Preconditioner:
     def __init__(
         self,
         ksp: PETSc.KSP,
-        options: OptionSet,
+        options: PetscOptionSet,
         *,
         keep: bool,
         may_change: bool,
         large: bool,
-        loosen: Callable[[PETSc.PC], LooseParts | None],
-        hasten: Callable[[PETSc.PC], Cycle | None],
+        loosen: Callable[[PETSc.PC], DeflatedPreconditioner | None],
+        hasten: Callable[[PETSc.PC], SinglePrecisionVCycle | None],
         bring: Callable[[], None],
         pattern: Callable[[], int],
         inertia: Callable[[], float],
@@ -139,9 +139,9 @@ class Preconditioner:
         self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
         self.serving, self._loosen, self._bring, self._pattern = self.pc, loosen, bring, pattern
         self._inertia, self._nodes = inertia, nodes
-        self._loose: LooseParts | None = None
+        self._loose: DeflatedPreconditioner | None = None
         self._hasten = hasten
-        self._cycle: Cycle | None = None
+        self._cycle: SinglePrecisionVCycle | None = None
         self._looks_for_parts = False  # before the next solve
         self._sweeps: bool | None = None  # of a body in pieces: whether sweeps do for it
         self._broke, self._extra = 0, 0.0  # edges and iterations since it was set up
@@ -213,16 +213,16 @@ class Preconditioner:
         """What serves is brought to a tangent that is solved with next."""
         self.serving = self._body
         if self._cycle is not None and self.serving is self._cycle.pc:
-            self._cycle.follow()
+            self._cycle.update_operator()
         if self._looks_for_parts and self._own and self.pc.getType() == "gamg":
             self.forget_parts()
             self._looks_for_parts = False
             if self._inertia() <= HELD:
                 self._loose = self._loosen(self.serving)
         loose = self._loose
-        if loose is None or loose.body is not self.serving:
+        if loose is None or loose.base_pc is not self.serving:
             return
-        if loose.follow(tangent):
+        if loose.update_operator(tangent):
             self.pc.setReusePreconditioner(True)
             self.serving = loose.pc
 
@@ -232,15 +232,15 @@ class Preconditioner:
         return self.pc if (quick := self._quick) is None else quick.pc
 
     @property
-    def finest(self) -> Finest | None:
+    def finest(self) -> FineLevel | None:
         """The tangent that is solved with next, in single precision; None: it is not kept so."""
-        return None if (quick := self._quick) is None else quick.finest
+        return None if (quick := self._quick) is None else quick.fine_level
 
     @property
-    def _quick(self) -> Cycle | None:
+    def _quick(self) -> SinglePrecisionVCycle | None:
         """The cycle that serves in place of `pc`."""
         cycle = self._cycle
-        return None if cycle is None or cycle.body is not self.pc else cycle
+        return None if cycle is None or cycle.gamg is not self.pc else cycle
 
     def forget(self) -> None:
         """Give the memory of what was made of `pc` back."""
@@ -249,13 +249,13 @@ class Preconditioner:
 
     def _forget_cycle(self) -> None:
         if self._cycle is not None:
-            self._cycle.forget()
+            self._cycle.destroy()
             self._cycle = None
 
     def forget_parts(self) -> None:
         """Give the memory of loose parts back."""
         if self._loose is not None:
-            self._loose.forget()
+            self._loose.destroy()
             self._loose = None
 
     def look(self) -> None:
@@ -281,7 +281,7 @@ class Preconditioner:
         if self._cycle is not None:
             if its > fresh > 0:
                 self._extra += int(self._ksp.its) * (1 - fresh / its)
-            enough = THOROUGHLY if self._cycle.thorough else 1.0
+            enough = THOROUGHLY if self._cycle.has_thorough_smoothing else 1.0
             if self._extra > enough * SET_UP:
                 self.due = Due.REBUILD
             elif not self._torn and self._extra > self._refreshed_at + enough * REFRESHED:
@@ -336,7 +336,7 @@ class Preconditioner:
         self._sweeps, self._fresh_its = not self._sweeps, 0
         self._become(SWEEPS if self._sweeps else LEVELS)
 
-    def _become(self, kind: Options) -> None:
+    def _become(self, kind: PetscOptions) -> None:
         self.due = Due.REBUILD
         self._options.change(kind)
         self.pc.reset()

@@ -10,10 +10,10 @@ from petsc4py import PETSc
 Values = npt.NDArray[np.float64]
 
 
-def rigid_modes(comm: MPI.Comm, places: Values) -> PETSc.NullSpace:
+def rigid_body_nullspace(comm: MPI.Comm, positions: Values) -> PETSc.NullSpace:
     """Translations and linearised rotations, orthonormal: 3 in 2D, 6 in 3D.
 
     `places`: (n, d) of this rank's nodes from where the rotations turn about, m (collective).
     """
-    coordinates = PETSc.Vec().createWithArray(places.reshape(-1), bsize=places.shape[1], comm=comm)
+    coordinates = PETSc.Vec().createWithArray(positions.reshape(-1), bsize=positions.shape[1], comm=comm)
     return PETSc.NullSpace().createRigidBody(coordinates)

@@ -18,7 +18,7 @@ OFTEN = 32  # scenes after which those that were dropped are freed: some 13 comm
 _scenes = itertools.count(1)
 
 
-def weakly[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+def weak_callback[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     """A function that calls a bound method for as long as another one keeps the object of the method."""
     reference, name = WeakMethod(method), getattr(method, "__qualname__", "a method")
 
@@ -31,15 +31,15 @@ def weakly[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-class AppliedBy:
+class ApplyContext:
     """The context of a preconditioner of PETSc that its owner applies."""
 
     def __init__(self, apply: Callable[[PETSc.PC, PETSc.Vec, PETSc.Vec], None]) -> None:
         """`apply`: a bound method of the owner."""
-        self.apply = weakly(apply)
+        self.apply = weak_callback(apply)
 
 
-def free_dropped(comm: MPI.Comm) -> None:
+def collect_dropped_scenes(comm: MPI.Comm) -> None:
     """A scene is built: every so often, free what was dropped without `destroy` (collective).
 
     Python looks for garbage when its own objects have piled up, and knows nothing of communicators; on several ranks

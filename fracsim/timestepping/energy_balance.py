@@ -28,7 +28,7 @@ from .state import State
 Values = npt.NDArray[np.float64]
 
 
-def acting(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
+def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
     """(loads and reactions, damping forces) at the level of the step where they balance; (owned dofs,), N.
 
     Without the inertia of prescribed dofs where mass is `lumped` (`work_done`).
@@ -41,7 +41,7 @@ def acting(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
     return forces, balance.damping_forces()
 
 
-def work_done(
+def step_work(
     balance: Balance, start: State, u: Values, v: Values, forces: Values, drag: Values | None, *, lumped: bool
 ) -> tuple[float, float]:
     """External work and viscous dissipation of a step from `start` to u, v on this rank, J.

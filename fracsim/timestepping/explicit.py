@@ -17,13 +17,13 @@ from ..mechanics.balance import Balance
 from ..mechanics.damping import Drag, Viscosity
 from ..mechanics.stability_limit import SAFETY, stable_step
 from .energy_balance import released_state
-from .protocols import Breaking, Flow, PassResult
+from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .stable_time_step import cell_frequencies, damaged_frequencies
 from .state import State
 from .stepper import BalanceStepper, SolveResult, StepReport, StepSizes
 
 if TYPE_CHECKING:
-    from .stable_time_step_damaged import EdgeFrequencies
+    from .stable_time_step_damaged import DamagedCellFrequencies
 
 Values = npt.NDArray[np.float64]
 
@@ -36,10 +36,12 @@ class ExplicitStepper(BalanceStepper):
 
     _arrival: tuple[Values, Values, Values]
 
-    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking) -> None:
+    def __init__(
+        self, balance: Balance, sizes: StepSizes, flow: PlasticFlowProtocol, breaking: FractureProtocol
+    ) -> None:
         super().__init__(balance, sizes, flow, breaking)
-        self._by_edges: EdgeFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
-        self._a, self._b = rayleigh(balance)
+        self._by_edges: DamagedCellFrequencies | None = None  # kept until edges break: a decomposition a damaged cell
+        self._a, self._b = rayleigh_coefficients(balance)
 
     def _size(self, state: State) -> float:
         """The study's step, the stable one or what is left to the end or a frame, whichever is least (collective)."""
@@ -50,11 +52,11 @@ class ExplicitStepper(BalanceStepper):
         highest = float(np.sqrt(max(fastest + added, KINK * added)))
         stable = SAFETY * stable_step(highest, self._a, self._b)
         # equal steps to the end or the next frame rather than a sliver: rounding up never exceeds the bound
-        dt = min(state.dt, stable, self.sizes.at(state.t))
-        left = min(self.sizes.end - state.t, self.sizes.to_frame(state.t, dt))
+        dt = min(state.dt, stable, self.sizes.largest_step_at(state.t))
+        left = min(self.sizes.end - state.t, self.sizes.time_to_frame(state.t, dt))
         return left / np.ceil(left / dt * (1 - 1e-9)) if left < 100 * dt else dt
 
-    def _of_edges(self) -> EdgeFrequencies | None:
+    def _of_edges(self) -> DamagedCellFrequencies | None:
         """What broken edges make of their cells; None where damage has no integrity."""
         if self._by_edges is None and self.balance.stress.integrity is not None:
             from .stable_time_step_damaged import edge_frequencies
@@ -62,10 +64,10 @@ class ExplicitStepper(BalanceStepper):
             self._by_edges = edge_frequencies(self.balance.stress)
         return self._by_edges
 
-    def settle(self, state: State) -> State:
+    def with_forces(self, state: State) -> State:
         """As any stepper; the body's damage may have been changed from outside before, as by a restart."""
         self._by_edges = None
-        return replace(super().settle(state), frequencies=cell_frequencies(self.balance.stress))
+        return replace(super().with_forces(state), frequencies=cell_frequencies(self.balance.stress))
 
     def _recalled(self) -> None:
         super()._recalled()
@@ -103,13 +105,13 @@ class ExplicitStepper(BalanceStepper):
             end = replace(end, frequencies=cell_frequencies(self.balance.stress))
         return super()._booked(end, dt, solve, began, broken, elastic, work, lost)
 
-    def _released(self, end: State, solved: Values, result: PassResult) -> State:
+    def _released(self, end: State, solved: Values, result: PassResultProtocol) -> State:
         """Edges broke: from here on other cells set the step, too."""
         self._by_edges = None
-        return released_state(self.balance, end, solved, result.before, None)
+        return released_state(self.balance, end, solved, result.previous_damage, None)
 
 
-def rayleigh(balance: Balance) -> tuple[float, float]:
+def rayleigh_coefficients(balance: Balance) -> tuple[float, float]:
     """(a in 1/s, b in s) of Rayleigh damping a M + b K."""
     a = sum(term.a for term in balance.terms if isinstance(term, Drag))
     return a, sum(term.b for term in balance.terms if isinstance(term, Viscosity))

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import total
-from ..solvers.nonlinear_solver import Solver
+from ..solvers.nonlinear_solver import NonlinearSolver
 from .energy_balance import released_state
-from .protocols import Breaking, Flow, PassResult
+from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
 from .stepper import BalanceStepper, SolveResult, StepSizes
 
@@ -22,17 +22,24 @@ Values = npt.NDArray[np.float64]
 class ImplicitStepper(BalanceStepper):
     """Steps of a scheme with inertia that solves for the displacement."""
 
-    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking, solver: Solver) -> None:
+    def __init__(
+        self,
+        balance: Balance,
+        sizes: StepSizes,
+        flow: PlasticFlowProtocol,
+        breaking: FractureProtocol,
+        solver: NonlinearSolver,
+    ) -> None:
         super().__init__(balance, sizes, flow, breaking)
         self.solver = solver
 
-    def heed(self, abandons: Callable[[], bool]) -> None:
+    def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Ask `abandons` (collective) between Newton iterations whether the step is to be abandoned."""
-        self.solver.heed(abandons)
+        self.solver.set_stop_request(stop_requested)
 
-    def troubles(self) -> dict[str, int]:
+    def failure_counts(self) -> dict[str, int]:
         """Counts by name of what failed on the way, over all ranks (collective)."""
-        return super().troubles() | {"linear_failures": self.solver.linear_failures}
+        return super().failure_counts() | {"linear_failures": self.solver.linear_failures}
 
     def _recalled(self) -> None:
         super()._recalled()
@@ -40,14 +47,14 @@ class ImplicitStepper(BalanceStepper):
 
     def _tell_solver(self) -> None:
         """Tell the solver of the damage that there is, whenever that came about."""
-        pattern = self.breaking.pattern
+        pattern = self.breaking.broken_edge_patterns
         torn = pattern is not None and total(self.comm, np.count_nonzero(pattern))[0] > 0
         self.solver.damage_changed(None if torn else 0)
 
-    def forget(self) -> None:
+    def discard_unsaved_data(self) -> None:
         """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
         self.balance.clear_search()
-        self.solver.renew()
+        self.solver.rebuild()
         self._tell_solver()
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
@@ -70,21 +77,26 @@ class ImplicitStepper(BalanceStepper):
         Where the weakened body has no solution the last one stands, and the next step takes up what is out of balance.
         """
         broken, released = 0, 0.0
-        for _ in range((self.breaking.passes or UNLIMITED) - 1):
+        for _ in range((self.breaking.max_passes or UNLIMITED) - 1):
             solved = self.balance.u.x.array[: self.balance.owned_dof_count].copy()
             _, v, a = self._arrive(state, dt)
             self._let_flow()
-            self.breaking.moving(v, a)
+            self.breaking.set_rates(v, a)
             result = self._broken_in(dt)
-            if not result.broken:
+            if not result.broken_edges:
                 self._return_to(solved, state, dt)
                 break
-            broken, released = broken + result.broken, released + result.released
+            broken, released = broken + result.broken_edges, released + result.released_energy
             self._damage_changed(result)
             again = self._attempt(state, dt)
-            solve = SolveResult(True, solve.newton + again.newton, solve.krylov + again.krylov, "")
+            solve = SolveResult(
+                True,
+                solve.newton_iterations + again.newton_iterations,
+                solve.krylov_iterations + again.krylov_iterations,
+                "",
+            )
             if not again.converged:
-                self.trouble.unbalanced_steps += 1
+                self.failures.unbalanced_steps += 1
                 self._return_to(solved, state, dt)
                 break
         return solve, broken, released
@@ -95,13 +107,13 @@ class ImplicitStepper(BalanceStepper):
         self.balance.set_displacement(solved)
         self.balance.update_reactions()
 
-    def _released(self, end: State, solved: Values, result: PassResult) -> State:
-        return released_state(self.balance, end, solved, result.before, self.solver.linear_response)
+    def _released(self, end: State, solved: Values, result: PassResultProtocol) -> State:
+        return released_state(self.balance, end, solved, result.previous_damage, self.solver.linear_response)
 
-    def _damage_changed(self, result: PassResult) -> None:
+    def _damage_changed(self, result: PassResultProtocol) -> None:
         super()._damage_changed(result)
-        if result.broken:
-            self.solver.damage_changed(result.broken)
+        if result.broken_edges:
+            self.solver.damage_changed(result.broken_edges)
 
 
 UNLIMITED = 10_000  # passes: there is no body with more left to break in one step

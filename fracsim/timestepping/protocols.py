@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
-from .state import Remembers
+from .state import HistoryVariables
 
 Values = npt.NDArray[np.float64]
 
 
-class PassResult(Protocol):
+class PassResultProtocol(Protocol):
     """What one pass did.
 
     Attributes:
@@ -25,79 +25,79 @@ class PassResult(Protocol):
     """
 
     @property
-    def broken(self) -> int: ...
+    def broken_edges(self) -> int: ...
     @property
-    def loss(self) -> float: ...
+    def largest_chi_loss(self) -> float: ...
     @property
-    def released(self) -> float: ...
+    def released_energy(self) -> float: ...
     @property
-    def elastic(self) -> float: ...
+    def elastic_energy(self) -> float: ...
     @property
-    def died(self) -> bool: ...
+    def cells_died(self) -> bool: ...
     @property
-    def before(self) -> list[Values]: ...
+    def previous_damage(self) -> list[Values]: ...
 
 
-class Breaking(Remembers, Protocol):
+class FractureProtocol(HistoryVariables, Protocol):
     """What breaks."""
 
-    passes: int | None  # most passes in a step; None: until nothing changes
+    max_passes: int | None  # most passes in a step; None: until nothing changes
     phase: str  # what its seconds are counted under
 
     @property
-    def not_finite(self) -> int:
+    def nonfinite_cells(self) -> int:
         """Cells whose stress was no number when it was looked at, summed over the passes of this rank."""
 
     @property
-    def pattern(self) -> npt.NDArray[np.uint8] | None:
+    def broken_edge_patterns(self) -> npt.NDArray[np.uint8] | None:
         """(cells,) broken edges of each cell (mesh.edge_graph); None where nothing can break."""
 
-    def begin(self, t: float, dt: float) -> None:
+    def begin_step(self, t: float, dt: float) -> None:
         """A step of dt (s) from t on is solved, for the first time or once more: its passes are of that time."""
 
-    def moving(self, v: Values, a: Values) -> None:
+    def set_rates(self, v: Values, a: Values) -> None:
         """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
 
-    def __call__(self) -> PassResult:
+    def __call__(self) -> PassResultProtocol:
         """A pass on the current displacement (collective)."""
 
-    def restored(self) -> None:
+    def damage_restored(self) -> None:
         """Damage was read from a checkpoint: what follows from it is brought to it."""
 
 
-class Flow(Remembers, Protocol):
+class PlasticFlowProtocol(HistoryVariables, Protocol):
     """What flows.
 
     Attributes:
         stored: elastic energy after the last flow, without damage, this rank's share, J; None where there is no flow.
     """
 
-    stored: float | None
+    elastic_energy: float | None
 
-    def begin(self, dt: float) -> None:
+    def begin_step(self, dt: float) -> None:
         """The flow to come is that of a step of dt (s)."""
 
     def __call__(self) -> float:
         """Let the body flow; returns the energy lost to it on this rank, J."""
 
 
-class NoFlow:
+class NoPlasticFlow:
     """A body that does not flow."""
 
-    stored: float | None = None
+    elastic_energy: float | None = None
 
-    def begin(self, dt: float) -> None:
+    def begin_step(self, dt: float) -> None:
         """Nothing."""
 
     def __call__(self) -> float:
         """Nothing is lost."""
         return 0.0
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """Nothing."""
         return False
 
@@ -106,43 +106,43 @@ class NoFlow:
 class _Whole:
     """The result of a pass over a body that does not break."""
 
-    elastic: float
-    broken: int = 0
-    loss: float = 0.0
-    released: float = 0.0
-    died: bool = False
-    before: list[Values] = field(default_factory=list)
+    elastic_energy: float
+    broken_edges: int = 0
+    largest_chi_loss: float = 0.0
+    released_energy: float = 0.0
+    cells_died: bool = False
+    previous_damage: list[Values] = field(default_factory=list)
 
 
-class Unbreakable:
+class NoFracture:
     """A body that does not break."""
 
-    passes: int | None = 1
-    not_finite = 0
+    max_passes: int | None = 1
+    nonfinite_cells = 0
     phase = "energies"
-    pattern = None
+    broken_edge_patterns = None
 
-    def __init__(self, balance: Balance, flow: Flow | None = None) -> None:
-        self._balance, self._flow = balance, flow or NoFlow()
+    def __init__(self, balance: Balance, flow: PlasticFlowProtocol | None = None) -> None:
+        self._balance, self._flow = balance, flow or NoPlasticFlow()
 
-    def begin(self, t: float, dt: float) -> None:
+    def begin_step(self, t: float, dt: float) -> None:
         """Nothing."""
 
-    def moving(self, v: Values, a: Values) -> None:
+    def set_rates(self, v: Values, a: Values) -> None:
         """Nothing."""
 
-    def __call__(self) -> PassResult:
+    def __call__(self) -> PassResultProtocol:
         """The elastic energy is all there is to tell."""
-        stored = self._flow.stored
+        stored = self._flow.elastic_energy
         return _Whole(self._balance.stress.stored_energy() if stored is None else stored)
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """None."""
         return None
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """Nothing."""
         return False
 
-    def restored(self) -> None:
+    def damage_restored(self) -> None:
         """Nothing."""

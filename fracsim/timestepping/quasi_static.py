@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .energy_balance import acting
+from .energy_balance import balanced_forces
 from .implicit import UNLIMITED, ImplicitStepper
-from .protocols import PassResult
+from .protocols import PassResultProtocol
 from .state import State
 from .stepper import SolveResult, StepReport
 
@@ -65,38 +65,49 @@ class QuasiStaticStepper(ImplicitStepper):
 
     def _guess(self, state: State, dt: float) -> Values:
         """The last increment once more."""
-        if state.before is None:
+        if state.previous_increment is None:
             return state.u
-        earlier, last = state.before
+        earlier, last = state.previous_increment
         return np.asarray(state.u + (state.u - earlier) * (dt / last))
 
     def _easier(self, state: State, dt: float, solve: SolveResult) -> State:
         """The extrapolated guess may be what failed: first try again from where the body is."""
-        return replace(state, before=None) if state.before is not None else super()._easier(state, dt, solve)
+        return (
+            replace(state, previous_increment=None)
+            if state.previous_increment is not None
+            else super()._easier(state, dt, solve)
+        )
 
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
         """Break and balance in turn, until a pass changes nothing, or nothing that the solver would correct."""
         path = _Path(state.u, state.forces, state.drag, state.out_of_balance)
-        broken, released, limit = 0, 0.0, self.breaking.passes or UNLIMITED
+        broken, released, limit = 0, 0.0, self.breaking.max_passes or UNLIMITED
         for number in range(limit):
             self.balance.accept_step()
-            path.to(self._solved(), *acting(self.balance, lumped=False))
+            path.to(self._solved(), *balanced_forces(self.balance, lumped=False))
             flowed = self._let_flow()
             result = self._pass(path, dt)
-            broken, released = broken + result.broken, released + result.released
+            broken, released = broken + result.broken_edges, released + result.released_energy
             if path.out_of_balance is None or number + 1 == limit:
                 break
             again = self._solve(state, dt, path.u)
-            solve = SolveResult(True, solve.newton + again.newton, solve.krylov + again.krylov, "")
-            if again.converged and (result.broken or again.newton):
+            solve = SolveResult(
+                True,
+                solve.newton_iterations + again.newton_iterations,
+                solve.krylov_iterations + again.krylov_iterations,
+                "",
+            )
+            if again.converged and (result.broken_edges or again.newton_iterations):
                 continue
             if not again.converged:
-                self.trouble.unbalanced_steps += 1
+                self.failures.unbalanced_steps += 1
                 self._return_to(path.u, state, dt)
             flowed = self._let_flow()
             break
         end = self._arrived(state, dt, path)
-        return self._booked(end, dt, solve, began, broken, result.elastic, path.work, path.lost + (released + flowed))
+        return self._booked(
+            end, dt, solve, began, broken, result.elastic_energy, path.work, path.lost + (released + flowed)
+        )
 
     def _solved(self) -> Values:
         return self.balance.u.x.array[: self.balance.owned_dof_count].copy()
@@ -106,14 +117,14 @@ class QuasiStaticStepper(ImplicitStepper):
         _, v, a = self.balance.scheme.finish(dt, path.u, state.u, state.v, state.a)
         return replace(
             state, u=path.u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=path.forces, drag=path.drag,
-            before=(state.u, dt), out_of_balance=path.out_of_balance,
+            previous_increment=(state.u, dt), out_of_balance=path.out_of_balance,
         )  # fmt: skip
 
-    def _pass(self, path: _Path, dt: float) -> PassResult:
+    def _pass(self, path: _Path, dt: float) -> PassResultProtocol:
         """A pass where the path has come to, and what it leaves out of balance there."""
-        began = self.now()
+        began = self.clock()
         result = self._broken_in(dt)
-        if result.broken or self.comm.allreduce(result.loss, op=MPI.MAX) > 0:
+        if result.broken_edges or self.comm.allreduce(result.largest_chi_loss, op=MPI.MAX) > 0:
             self._damage_changed(result)
             balance = self.balance
             residual = balance.update_forces().copy()
@@ -121,5 +132,5 @@ class QuasiStaticStepper(ImplicitStepper):
             path.forces = path.forces.copy()
             path.forces[own] = balance.applied_forces()[own] + residual[own]
             path.out_of_balance = np.where(free, residual, 0.0)
-        self.phases[self.breaking.phase] += self.now() - began
+        self.phases[self.breaking.phase] += self.clock() - began
         return result

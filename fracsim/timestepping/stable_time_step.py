@@ -14,7 +14,7 @@ from ..mechanics.stress import Stress
 from ..mesh.simplices import CELL, local_edges
 
 if TYPE_CHECKING:
-    from .stable_time_step_damaged import EdgeFrequencies
+    from .stable_time_step_damaged import DamagedCellFrequencies
 
 Values = npt.NDArray[np.float64]
 
@@ -26,12 +26,12 @@ def cell_frequencies(stress: Stress) -> Values:
     """
     domain, d, material = stress.domain, stress.domain.dim, stress.material
     corners = stress.cell_corners(np.arange(domain.cell_count))
-    factor = d + 1 if domain.order == 1 else gain(d)
+    factor = d + 1 if domain.order == 1 else quadratic_gain(d)
     return frequency_bounds(corners, material.mu, material.lmbda, material.density, factor)
 
 
 @cache
-def gain(dim: int) -> float:
+def quadratic_gain(dim: int) -> float:
     """Largest sum_q w_q |h_q|^2 of motions with sum_i s_i |u_i|^2 = 1, s the shares of nodes in the mass of a cell with
     quadratic displacement, w the weights of the points where its stress is integrated.
 
@@ -53,7 +53,7 @@ def gain(dim: int) -> float:
     return float(np.linalg.norm(np.hstack(rows) / np.sqrt(shares)[:, None], 2) ** 2)
 
 
-def damaged_frequencies(stress: Stress, whole: Values, edges: EdgeFrequencies | None) -> Values:
+def damaged_frequencies(stress: Stress, whole: Values, edges: DamagedCellFrequencies | None) -> Values:
     """(cells,) the bounds of `cell_frequencies`, `whole`, as damage leaves them, 1/s^2; `whole` itself without damage.
 
     chi, which may fall in any step, scales them. With the approach "edge" a cell can become *faster*: the projection on

@@ -18,7 +18,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class EdgeFrequencies:
+class DamagedCellFrequencies:
     """omega^2 in 1/s^2 of cells with broken edges. It belongs to the shape at rest and changes only as edges break.
 
     Attributes:
@@ -32,7 +32,7 @@ class EdgeFrequencies:
     springs: Values | None
 
 
-def edge_frequencies(stress: Stress) -> EdgeFrequencies:
+def edge_frequencies(stress: Stress) -> DamagedCellFrequencies:
     """The frequencies that belong to the current integrity of the edges."""
     domain, integrity = stress.domain, stress.integrity
     assert integrity is not None
@@ -41,7 +41,7 @@ def edge_frequencies(stress: Stress) -> EdgeFrequencies:
     intact = intact[cells]
     projected = projected_frequencies(stress, cells, intact) if stress.chi is None else None
     springs = spring_frequencies(stress, cells, ~intact) if stress.cracks_close else None
-    return EdgeFrequencies(cells, projected, springs)
+    return DamagedCellFrequencies(cells, projected, springs)
 
 
 def projected_frequencies(stress: Stress, cells: npt.NDArray[np.int64], intact: npt.NDArray[np.bool_]) -> Values:

@@ -48,19 +48,19 @@ class State:
     elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))
     drag: Values | None = None
-    memory: dict[str, object] = field(default_factory=dict)
+    history: dict[str, object] = field(default_factory=dict)
     out_of_balance: Values | None = None
-    before: tuple[Values, float] | None = None
+    previous_increment: tuple[Values, float] | None = None
     frequencies: Values | None = None
 
 
-class Remembers(Protocol):
+class HistoryVariables(Protocol):
     """A part with a past, such as damage or plastic flow."""
 
-    def memory(self) -> object:
+    def snapshot(self) -> object:
         """What it is now, never to be written to again; the same object as before where nothing has changed."""
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """Be again what `memory` gave, which costs nothing where that is what it is; whether it was anything else.
 
         Not collective, but the same on all ranks.

@@ -23,8 +23,8 @@ from ..errors import NotConverged
 from ..mechanics.balance import Balance
 from ..mechanics.time_functions import TabulatedFunction
 from ..mesh.parallel import total
-from .energy_balance import acting, work_done
-from .protocols import Breaking, Flow, PassResult
+from .energy_balance import balanced_forces, step_work
+from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
 
 Values = npt.NDArray[np.float64]
@@ -39,8 +39,8 @@ class SolveResult:
     """How a solve ended."""
 
     converged: bool
-    newton: int
-    krylov: int
+    newton_iterations: int
+    krylov_iterations: int
     reason: str  # a sentence where it did not converge
 
 
@@ -56,7 +56,7 @@ class StepReport:
     seconds: float
 
 
-def intervals(t: float, interval: float) -> int:
+def count_intervals(t: float, interval: float) -> int:
     """How many whole intervals (s) have passed at time t (s)."""
     return math.floor(t / interval + PASSED)
 
@@ -70,39 +70,39 @@ class StepSizes:
     step: float
     end: float
     smallest: float
-    adapt: bool = True
-    breaking: float = math.inf
-    course: TabulatedFunction | None = None
-    frames: float = 0.0
+    adaptive: bool = True
+    largest_fracture_step: float = math.inf
+    schedule: TabulatedFunction | None = None
+    frame_interval: float = 0.0
 
-    def to_frame(self, t: float, dt: float) -> float:
+    def time_to_frame(self, t: float, dt: float) -> float:
         """From time t (s) to the next frame; inf where steps of dt (s) need not end there."""
-        if self.frames < dt * (1 - SAME):
+        if self.frame_interval < dt * (1 - SAME):
             return math.inf
-        return (intervals(t, self.frames) + 1) * self.frames - t
+        return (count_intervals(t, self.frame_interval) + 1) * self.frame_interval - t
 
-    def at(self, t: float) -> float:
+    def largest_step_at(self, t: float) -> float:
         """The largest step from time t (s) on: steps end where the course has a corner, or one would leap over it."""
-        if self.course is None:
+        if self.schedule is None:
             return self.step
-        later = self.course.times[self.course.times > t * (1 + 1e-9) + 1e-9 * self.smallest]
-        return min(float(self.course(t)[0]), float(np.min(later - t, initial=math.inf)))
+        later = self.schedule.times[self.schedule.times > t * (1 + 1e-9) + 1e-9 * self.smallest]
+        return min(float(self.schedule(t)[0]), float(np.min(later - t, initial=math.inf)))
 
 
-class Abandoned(Exception):
+class StepAborted(Exception):
     """The step was given up since the run is to stop; the body is as at the start of the step (on all ranks)."""
 
 
-class TooLong(Exception):
+class StepTooLong(Exception):
     """Edges break in a step that is longer than such a step may be (on all ranks)."""
 
 
-class NotFinite(Exception):
+class NonFiniteState(Exception):
     """The state at the end of a step is not finite (on all ranks)."""
 
 
 @dataclass
-class Trouble:
+class FailureCounts:
     """What went wrong on the way without ending the run: counts over its steps.
 
     Attributes:
@@ -124,44 +124,46 @@ class Stepper(Protocol):
     """
 
     phases: dict[str, float]
-    trouble: Trouble
+    failures: FailureCounts
 
-    def troubles(self) -> dict[str, int]:
+    def failure_counts(self) -> dict[str, int]:
         """What went wrong on the way without ending the run: counts by name, over all ranks (collective)."""
 
     def start(self, velocity: Values | None = None) -> State:
         """The state at t = 0, at rest or with a velocity (owned dofs,) in m/s (collective)."""
 
-    def settle(self, state: State) -> State:
+    def with_forces(self, state: State) -> State:
         """The state with the forces and accelerations that belong to its displacement and velocity (collective)."""
 
-    def resume(self, state: State) -> State:
+    def from_checkpoint(self, state: State) -> State:
         """The state of a checkpoint, with a body whose damage and flow were read from it (collective)."""
 
-    def forget(self) -> None:
+    def discard_unsaved_data(self) -> None:
         """Forget what a checkpoint does not hold, as a run that resumes from the checkpoint has done (collective)."""
 
     def advance(self, state: State) -> tuple[State, StepReport]:
         """Take one step, as large as state.dt allows (collective). Raises NotConverged at the smallest step, Abandoned
         where the run is to stop."""
 
-    def heed(self, abandons: Callable[[], bool]) -> None:
+    def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Ask `abandons` (collective) inside long steps whether they are to be abandoned."""
 
 
 class BalanceStepper:
     """What explicit, implicit and quasi-static steps share."""
 
-    def __init__(self, balance: Balance, sizes: StepSizes, flow: Flow, breaking: Breaking) -> None:
+    def __init__(
+        self, balance: Balance, sizes: StepSizes, flow: PlasticFlowProtocol, breaking: FractureProtocol
+    ) -> None:
         self.balance, self.sizes, self.flow, self.breaking = balance, sizes, flow, breaking
         self.comm = balance.domain.comm
-        self.trouble = Trouble()
+        self.failures = FailureCounts()
         self.phases = {"solve": 0.0, "fracture": 0.0, "energies": 0.0}
 
-    def troubles(self) -> dict[str, int]:
+    def failure_counts(self) -> dict[str, int]:
         """Counts by name of what failed on the way, over all ranks (collective)."""
-        crushed = int(total(self.comm, self.breaking.not_finite)[0])
-        return asdict(self.trouble) | {"cells_not_finite": crushed}
+        crushed = int(total(self.comm, self.breaking.nonfinite_cells)[0])
+        return asdict(self.failures) | {"cells_not_finite": crushed}
 
     # --- the state at the start ---
 
@@ -169,9 +171,9 @@ class BalanceStepper:
         """The state at t = 0: at rest, or with a velocity, and in a dynamic study M a = f."""
         n = self.balance.owned_dof_count
         v = np.zeros(n) if velocity is None else velocity
-        return self.settle(State(np.zeros(n), v, np.zeros(n), dt=self.sizes.step))
+        return self.with_forces(State(np.zeros(n), v, np.zeros(n), dt=self.sizes.step))
 
-    def settle(self, state: State) -> State:
+    def with_forces(self, state: State) -> State:
         """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
         balance, free = self.balance, self.balance.motion.free_dofs
         balance.evaluate_at(state.t, state.u, state.v)
@@ -182,27 +184,27 @@ class BalanceStepper:
         if balance.scheme.carries_acceleration:
             a = balance.mass.solve(-unbalanced, free)
         forces = applied + np.where(free, 0.0, unbalanced)
-        return replace(state, a=a, forces=forces, drag=drag, memory=self._memory())
+        return replace(state, a=a, forces=forces, drag=drag, history=self._memory())
 
-    def resume(self, state: State) -> State:
+    def from_checkpoint(self, state: State) -> State:
         """The state of a checkpoint, with a body whose damage and flow were read from it."""
         balance = self.balance
-        self.breaking.restored()
+        self.breaking.damage_restored()
         balance.set_displacement(state.u)
         self._recalled()
-        balance.from_checkpoint(state.memory.get("saved", {}))
-        return self.remember(state)
+        balance.from_checkpoint(state.history.get("saved", {}))
+        return self.with_current_history(state)
 
-    def forget(self) -> None:
+    def discard_unsaved_data(self) -> None:
         """Forget what a checkpoint does not hold; here: nothing that a step depends on."""
 
-    def remember(self, state: State) -> State:
+    def with_current_history(self, state: State) -> State:
         """The state with the damage and the flow that the body has now, whoever brought them about."""
-        return replace(state, memory=self._memory())
+        return replace(state, history=self._memory())
 
     # --- a step ---
 
-    def heed(self, abandons: Callable[[], bool]) -> None:
+    def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Steps without a system are short: nothing is asked inside them."""
 
     def advance(self, state: State) -> tuple[State, StepReport]:
@@ -210,7 +212,7 @@ class BalanceStepper:
         is to stop."""
         try:
             return self._advance(state)
-        except Abandoned:
+        except StepAborted:
             self._go_back(state)
             raise
 
@@ -227,33 +229,33 @@ class BalanceStepper:
             dt = self._size(state)
             solve = self._attempt(state, dt)
             if not solve.converged:
-                self.trouble.steps_failed += 1
+                self.failures.steps_failed += 1
                 state = self._easier(state, dt, solve)
                 continue
             try:
                 return self._finish(state, dt, solve, began)
-            except TooLong:
-                self.trouble.steps_retaken += 1
-                state = replace(state, dt=max(dt / 2, self.sizes.breaking), easy=0)
+            except StepTooLong:
+                self.failures.steps_retaken += 1
+                state = replace(state, dt=max(dt / 2, self.sizes.largest_fracture_step), easy=0)
                 self._recall(state)
-            except NotFinite:
-                self.trouble.steps_failed += 1
+            except NonFiniteState:
+                self.failures.steps_failed += 1
                 self._recall(state)
                 self._begin(state, dt)  # what flowed and what terms did in the step is undone, too
                 state = self._easier(state, dt, SolveResult(False, 0, 0, "What the step ends with is not finite"))
 
-    def _broken_in(self, dt: float) -> PassResult:
+    def _broken_in(self, dt: float) -> PassResultProtocol:
         """A pass of a step of dt s. Raises TooLong where edges break in it and it is longer than it may be then."""
         result = self.breaking()
-        if result.broken and dt > self.sizes.breaking * (1 + 1e-9):
-            raise TooLong
+        if result.broken_edges and dt > self.sizes.largest_fracture_step * (1 + 1e-9):
+            raise StepTooLong
         return result
 
     def _memory(self) -> dict[str, object]:
-        return {"damage": self.breaking.memory(), "flow": self.flow.memory(), "terms": self.balance.snapshot()}
+        return {"damage": self.breaking.snapshot(), "flow": self.flow.snapshot(), "terms": self.balance.snapshot()}
 
     def _recall(self, state: State) -> None:
-        if "damage" in state.memory and self.breaking.recall(state.memory["damage"]):
+        if "damage" in state.history and self.breaking.restore(state.history["damage"]):
             self._recalled()
 
     def _recalled(self) -> None:
@@ -266,20 +268,20 @@ class BalanceStepper:
         they were there."""
         self._recall_flow_and_terms(state)
         self.balance.begin_step(state.t + dt, dt, state.u, state.v, state.a)
-        self.breaking.begin(state.t, dt)
+        self.breaking.begin_step(state.t, dt)
 
     def _recall_flow_and_terms(self, state: State) -> None:
-        if "flow" in state.memory:
-            self.flow.recall(state.memory["flow"])
-        if terms := state.memory.get("terms"):
+        if "flow" in state.history:
+            self.flow.restore(state.history["flow"])
+        if terms := state.history.get("terms"):
             self.balance.restore(terms)
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end or the next frame, and no sliver left over before it."""
-        left, dt = self.sizes.end - state.t, min(state.dt, self.sizes.at(state.t))
+        left, dt = self.sizes.end - state.t, min(state.dt, self.sizes.largest_step_at(state.t))
         if left < dt * (1 + 1e-9):
             return left
-        left = self.sizes.to_frame(state.t, dt)
+        left = self.sizes.time_to_frame(state.t, dt)
         if abs(left - dt) <= SAME * dt or left >= 2 * dt * (1 - SAME):
             return dt
         return left if left < dt else left / 2
@@ -291,8 +293,8 @@ class BalanceStepper:
     def _easier(self, state: State, dt: float, solve: SolveResult) -> State:
         """The state from which to try again: half the step, down to the smallest."""
         sizes = self.sizes
-        if not sizes.adapt or dt / 2 < sizes.smallest:
-            floor = "time.adapt is off" if not sizes.adapt else f"the smallest step is {sizes.smallest:g} s"
+        if not sizes.adaptive or dt / 2 < sizes.smallest:
+            floor = "time.adapt is off" if not sizes.adaptive else f"the smallest step is {sizes.smallest:g} s"
             raise NotConverged(
                 f"no solution at t = {state.t + dt:g} s with a step of {dt:g} s ({floor}). {solve.reason}. "
                 f"Last good time: {state.t:g} s"
@@ -301,7 +303,7 @@ class BalanceStepper:
 
     def _grown(self, state: State, broken: int) -> State:
         """After an easy step a halved one may double again."""
-        if broken and self.sizes.breaking < math.inf:
+        if broken and self.sizes.largest_fracture_step < math.inf:
             return replace(state, easy=0)
         if state.dt < self.sizes.step and state.easy + 1 >= EASY_STEPS:
             return replace(state, dt=min(2 * state.dt, self.sizes.step), easy=0)
@@ -310,7 +312,7 @@ class BalanceStepper:
     # --- its end ---
 
     @staticmethod
-    def now() -> float:
+    def clock() -> float:
         """s, of a clock that times phases."""
         return time.perf_counter()
 
@@ -318,15 +320,15 @@ class BalanceStepper:
         """Arrive at the end of the step, let the body flow and break, and book it."""
         solve, broken, released = self._passes(state, dt, solve)
         balance, lumped = self.balance, self.balance.mass.is_diagonal and self.balance.scheme.inertia
-        solved, acted = balance.u.x.array[: balance.owned_dof_count].copy(), acting(balance, lumped=lumped)
+        solved, acted = balance.u.x.array[: balance.owned_dof_count].copy(), balanced_forces(balance, lumped=lumped)
         u, v, a = self._arrive(state, dt)
-        work, viscous = work_done(balance, state, u, v, *acted, lumped=lumped)
+        work, viscous = step_work(balance, state, u, v, *acted, lumped=lumped)
         forces, drag = acted
         end = replace(state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag)
         flowed = self._let_flow()
         end, result = self._break(end, solved, dt)
-        lost = viscous + (result.released + released + flowed)
-        return self._booked(end, dt, solve, began, result.broken + broken, result.elastic, work, lost)
+        lost = viscous + (result.released_energy + released + flowed)
+        return self._booked(end, dt, solve, began, result.broken_edges + broken, result.elastic_energy, work, lost)
 
     def _passes(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
         """All passes of the step but its last: the solve with all iterations counted, the edges that broke, and the
@@ -347,7 +349,7 @@ class BalanceStepper:
         kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
         work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(
-            end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, memory=self._memory()
+            end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, history=self._memory()
         )
         return self._grown(end, broken), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
 
@@ -355,7 +357,7 @@ class BalanceStepper:
         """Raise NotFinite where the end of a step is not finite, or squares of it are not (collective)."""
         squares = sum(float(np.vdot(each, each)) for each in (end.u, end.v, end.a, end.forces))
         if not self.comm.allreduce(math.isfinite(squares + energies), op=MPI.LAND):
-            raise NotFinite
+            raise NonFiniteState
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
@@ -368,7 +370,7 @@ class BalanceStepper:
         if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:
             v[own], a[own] = led
         if scheme.alpha_f:
-            self.flow.begin(dt)
+            self.flow.begin_step(dt)
             balance.evaluate_at(state.t + dt, u, v, a)
             balance.update_reactions()
         return u, v, a
@@ -377,35 +379,35 @@ class BalanceStepper:
         """Let the body flow, once it has arrived; returns the energy lost to it on this rank, J."""
         began = time.perf_counter()
         lost = self.flow()
-        if self.flow.stored is not None:
+        if self.flow.elastic_energy is not None:
             self.phases["plasticity"] = self.phases.get("plasticity", 0.0) + time.perf_counter() - began
         return lost
 
-    def _break(self, end: State, solved: Values, dt: float) -> tuple[State, PassResult]:
+    def _break(self, end: State, solved: Values, dt: float) -> tuple[State, PassResultProtocol]:
         """A pass, and the state with the forces and the acceleration that it leaves.
 
         `solved`: (owned dofs,) displacement at which the forces of the step, of dt s, balance.
         """
         began = time.perf_counter()
-        self.breaking.moving(end.v, end.a)
+        self.breaking.set_rates(end.v, end.a)
         result = self._broken_in(dt)
-        if result.broken:
+        if result.broken_edges:
             end = self._released(end, solved, result)
         self._damage_changed(result)
         self.phases[self.breaking.phase] += time.perf_counter() - began
         return end, result
 
-    def _released(self, end: State, solved: Values, result: PassResult) -> State:
+    def _released(self, end: State, solved: Values, result: PassResultProtocol) -> State:
         """The state once what broke has let go."""
         raise NotImplementedError
 
-    def _damage_changed(self, result: PassResult) -> None:
+    def _damage_changed(self, result: PassResultProtocol) -> None:
         """Cells lost stiffness: forms are bound once to the cells that are left."""
-        if result.broken:
+        if result.broken_edges:
             self._tell_of_edges()
-        if result.died:
+        if result.cells_died:
             self.balance.damage_changed()
 
     def _tell_of_edges(self) -> None:
-        if (pattern := self.breaking.pattern) is not None:
+        if (pattern := self.breaking.broken_edge_patterns) is not None:
             self.balance.edges_broke(pattern)

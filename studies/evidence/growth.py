@@ -172,7 +172,7 @@ class VirtualNodes:
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
         from ...scene import make_stepper, material_of, scene_on
-        from ...timestepping.protocols import NoFlow, Unbreakable
+        from ...timestepping.protocols import NoFracture, NoPlasticFlow
         from .virtual_nodes import duplicate
 
         began = time.perf_counter()
@@ -184,7 +184,7 @@ class VirtualNodes:
         scene = scene_on(domain, study, replace(material, density=share * material.density))
         assert scene.balance.stress.chi is not None
         scene.balance.stress.chi.x.array[: len(share)] = share
-        self.stepper = make_stepper(scene.balance, study.time, NoFlow(), Unbreakable(scene.balance), scene.solver)
+        self.stepper = make_stepper(scene.balance, study.time, NoPlasticFlow(), NoFracture(scene.balance), scene.solver)
         self.state = scene.start()
         self._take_over(whole.state, domain)
         self.unknowns = 3 * len(self.new.node)
@@ -208,7 +208,7 @@ class VirtualNodes:
         """Displacement and velocity of the old nodes for all copies of them."""
         source = self.new.node[domain.node_input]
         u, v = (x.reshape(-1, 3)[source].ravel().copy() for x in (state.u, state.v))
-        self.state = self.stepper.settle(replace(self.state, u=u, v=v, t=state.t, step=state.step))
+        self.state = self.stepper.with_forces(replace(self.state, u=u, v=v, t=state.t, step=state.step))
 
     def step(self) -> Any:
         self.state, report = self.stepper.advance(self.state)

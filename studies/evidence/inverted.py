@@ -52,12 +52,12 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     domain, stepper = scene.domain, scene.stepper
     middle = (domain.lower + domain.upper) / 2
     u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
-    state = stepper.settle(replace(scene.start(), u=u))
+    state = stepper.with_forces(replace(scene.start(), u=u))
     energies, newton = [total(comm, scene.balance.stress.stored_energy())[0]], []
     while state.t < study["time"]["end"] * (1 - 1e-12):
         state, report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)
-        newton.append(report.solve.newton)
+        newton.append(report.solve.newton_iterations)
     watch = InvertedCells(scene.balance.stress)
     watch.look(state.t)
     if comm.rank == 0 and (note := watch.note(energy)):
@@ -66,7 +66,7 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
         "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.least, "error": abs(watch.least - 1),
         "steps": state.step, "newton_max": max(newton), "newton_mean": float(np.mean(newton)),
         "growth": float(np.max(np.diff(energies)).clip(0) / energies[0]) if energies[0] else 0.0,
-        "halved": stepper.trouble.steps_failed,
+        "halved": stepper.failures.steps_failed,
     }  # fmt: skip
 
 

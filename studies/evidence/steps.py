@@ -97,7 +97,7 @@ def collapsed(name: str) -> Data:
         while not run.scene.ended(run.state):
             spent, reports = _steps(run, 1)
             seconds.append(spent)
-            newton += sum(report.solve.newton for report in reports)
+            newton += sum(report.solve.newton_iterations for report in reports)
         cells, broken = run.scene.domain.cell_count, run.breaks.figures[0]
         run.scene.destroy()
     return {"cells": cells, "steps": len(seconds), "worst": max(seconds), "all": sum(seconds), "newton": newton,

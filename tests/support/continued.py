@@ -153,7 +153,11 @@ def differences(comm: MPI.Intracomm, name: str, folder: Path) -> list[str]:
 def numbers(run: Run) -> Numbers:
     """Copies of all that a run says of its body on this rank."""
     state, scene = run.state, run.scene
-    every = {each.name: getattr(state, each.name) for each in fields(state) if each.name not in ("memory", "before")}
+    every = {
+        each.name: getattr(state, each.name)
+        for each in fields(state)
+        if each.name not in ("history", "previous_increment")
+    }
     found = {key: np.array(value) for key, value in every.items() if value is not None and key != "elastic"}
     found |= {"probes": scene.probes(), "figures": np.array(run.breaks.figures)}
     found |= {f"term.{key}": np.array(value) for key, value in scene.balance.to_checkpoint().items()}

@@ -40,7 +40,7 @@ def nearly_incompressible(scheme: str) -> list[float]:
     scene, state, report = stepped(study, 12)
     broken = MPI.COMM_WORLD.allreduce(scene.fracture.graph.broken_count)
     gained = report.kinetic + report.elastic + state.dissipated - state.work
-    return [scene.stepper.trouble.steps_failed, broken, report.elastic, gained / state.work]
+    return [scene.stepper.failures.steps_failed, broken, report.elastic, gained / state.work]
 
 
 def crushed() -> list[float]:
@@ -54,7 +54,7 @@ def crushed() -> list[float]:
 def flown() -> list[float]:
     """(attempts that failed, kinetic energy in J) of a fast body in short steps."""
     scene, _, report = stepped(extremes.flying(1e3, 1e-6), 20)
-    return [scene.stepper.trouble.steps_failed, report.kinetic]
+    return [scene.stepper.failures.steps_failed, report.kinetic]
 
 
 def compared() -> Found:

@@ -61,11 +61,11 @@ class Walk:
         """The body was damaged by hand: go on from there."""
         scene = vars(self)["scene"]
         scene.fracture.changed()
-        self.state = scene.stepper.remember(self.state)
+        self.state = scene.stepper.with_current_history(self.state)
 
     def settle(self) -> None:
         """Forces and accelerations that belong to the displacement and the velocity."""
-        self.state = vars(self)["scene"].stepper.settle(self.state)
+        self.state = vars(self)["scene"].stepper.with_forces(self.state)
 
 
 def make_scene(**tables: Any) -> tuple[Scene, Walk]:
@@ -117,7 +117,7 @@ def break_across(scene: Scene, normal: list[float], at: float) -> None:
     graph = scene.fracture.graph
     height = scene.domain.nodes[graph.edge_nodes] @ np.array(normal)
     graph.break_edges((height.min(axis=1) < at) & (height.max(axis=1) > at))
-    scene.fracture.restored()
+    scene.fracture.damage_restored()
     scene.balance.damage_changed()
     scene.balance.edges_broke(graph.pattern)
 

@@ -35,7 +35,7 @@ def _held_back(scene: Scene) -> Values:
     domain, y = scene.domain, scene.balance.work_vector.duplicate()
     near = np.exp(-100 * np.sum((positions(scene) - 1.0) ** 2, axis=1))
     y.array_w[:] = np.repeat(100 * domain.mean_edge * near, 3)
-    line_search.hold_back(domain, y, y)
+    line_search.clip_correction(domain, y, y)
     return np.asarray(np.linalg.norm(y.array_r.reshape(-1, 3), axis=1)[:, None] / domain.mean_edge)
 
 
@@ -43,10 +43,12 @@ def compared() -> Found:
     """Where its nodes are after three steps, in the order of the input mesh; how often some came to rest; and how far,
     in edges, nodes go of a correction that would throw those near a corner."""
     few, nonlinear_elimination.FEW = nonlinear_elimination.FEW, 0.2
-    rest, rested = nonlinear_elimination.Patches.rest, []
-    nonlinear_elimination.Patches.rest = lambda self, little: rest(self, little) and not rested.append(1)  # type: ignore[method-assign]
+    rest, rested = nonlinear_elimination.NonlinearElimination.relax_nodes, []
+    nonlinear_elimination.NonlinearElimination.relax_nodes = lambda self, little: (
+        rest(self, little) and not rested.append(1)
+    )  # type: ignore[method-assign]
     scene, state = thrown()
-    nonlinear_elimination.FEW, nonlinear_elimination.Patches.rest = few, rest  # type: ignore[method-assign]
+    nonlinear_elimination.FEW, nonlinear_elimination.NonlinearElimination.relax_nodes = few, rest  # type: ignore[method-assign]
     return {
         "thrown-u": scene.domain.gather_nodes(state.u.reshape(-1, 3)),
         "thrown-rested": np.array([len(rested)]),

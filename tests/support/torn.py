@@ -22,7 +22,7 @@ from fracsim.mesh.facet_components import parts_of_nodes
 from fracsim.mesh.fragments import find_pieces
 from fracsim.mesh.parallel import total
 from fracsim.scene import Scene, build_scene
-from fracsim.solvers.deflation import loose_parts
+from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.multigrid import block_operator
 from fracsim.timestepping.state import State
 
@@ -224,8 +224,8 @@ def hanging() -> Found:
     jacobi.setType("jacobi")
     jacobi.setOperators(balance.tangent.matrix)
     count, part = parts_of_nodes(domain, whole)
-    loose = loose_parts(balance, jacobi)
-    assert loose is not None and loose.follow(balance.tangent.matrix)
+    loose = create_deflation(balance, jacobi)
+    assert loose is not None and loose.update_operator(balance.tangent.matrix)
     x = domain.nodes[: domain.node_count]
     turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
     turned[~balance.motion.free_dofs.reshape(-1, 3)] = 0.0

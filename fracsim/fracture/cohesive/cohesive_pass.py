@@ -30,10 +30,10 @@ class CohesiveBreaking(Breaking):
 
     def __init__(
         self, stress: Stress, graph: EdgeGraph, cuts: EdgeGraph, tips: CohesiveTips, softening: Softening, *,
-        passes: int | None = None, opened: Values | None = None,
+        max_passes: int | None = None, opened: Values | None = None,
     ) -> None:  # fmt: skip
         self.cuts, self._tips, self.softening = cuts, tips, softening
-        super().__init__(stress, graph, tips, passes=passes, opened=opened)
+        super().__init__(stress, graph, tips, max_passes=max_passes, opened=opened)
         self._follow()
 
     def __call__(self) -> PassResult:
@@ -76,14 +76,14 @@ class CohesiveBreaking(Breaking):
 
     # --- what it remembers ---
 
-    def restored(self) -> None:
+    def damage_restored(self) -> None:
         """Edges and chi were read from a checkpoint: cuts follow."""
         self._follow()
-        super().restored()
+        super().damage_restored()
 
-    def recall(self, memory: object) -> bool:
+    def restore(self, saved: object) -> bool:
         """Be damaged as `memory` says; whether that is anything else than now."""
-        differs = super().recall(memory)
+        differs = super().restore(saved)
         if differs:
             self._follow()
         return differs

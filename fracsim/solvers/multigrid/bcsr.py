@@ -19,7 +19,7 @@ from dolfinx.common import IndexMap
 from mpi4py import MPI
 
 from ...mesh.c_library import FAST_FLAGS, at, compile_on_all_ranks, unchecked_function
-from .hierarchy import Blocks
+from .hierarchy import BlockCSRData
 
 Single = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
@@ -28,7 +28,7 @@ BEHIND = 8  # numbers behind the last block, which are read and made nothing of
 PROLONGATION_SOURCE = Path(__file__).with_name("prolongation.c")
 
 
-class Vector:
+class GhostedVector:
     """Numbers of this rank, those of ghosts behind them.
 
     Attributes:
@@ -39,21 +39,21 @@ class Vector:
         """`size`: numbers of a node; `kind`: of number."""
         self._vector = la.vector(nodes, size, kind)
         self.array: npt.NDArray[Any] = self._vector.array
-        self.place = at(self.array)
+        self.pointer = at(self.array)
         self._alone = nodes.comm.size == 1
 
-    def fetch(self) -> None:
+    def update_ghosts(self) -> None:
         """Those of ghosts become their owners' (collective)."""
         if not self._alone:
             self._vector.scatter_forward()
 
-    def give_back(self) -> None:
+    def add_ghosts_to_owners(self) -> None:
         """Those of ghosts are added to their owners' (collective)."""
         if not self._alone:
             self._vector.scatter_reverse(la.InsertMode.add)
 
 
-class Rows:
+class BlockCSR:
     """Rows of this rank. Vectors to be multiplied with have their ghosts.
 
     Attributes:
@@ -70,34 +70,43 @@ class Rows:
             unchecked_function(made, name, *self._all) for name in ("residual", "smooth", "add")
         )  # fmt: skip
 
-    def take(self, blocks: Values, left: Values, right: Values) -> None:
+    def assign_scaled(self, blocks: Values, left: Values, right: Values) -> None:
         """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
         self._code.scale(*self._pattern, at(blocks), at(left), at(right), self._all[-1])
 
-    def lose(self, blocks: Values, left: Values, right: Values, lost: Single) -> None:
+    def compute_rounding_loss(self, blocks: Values, left: Values, right: Values, lost: Single) -> None:
         """What rounding has taken from each row of A's blocks, where left and right are undone (C tells)."""
         self._code.lose(*self._all, at(blocks), at(left), at(right), at(lost))
 
-    def multiply(self, lost: Single, left: Values, z: Vector, x: Values, y: Values) -> None:
+    def multiply(self, lost: Single, left: Values, z: GhostedVector, x: Values, y: Values) -> None:
         """y = diag(left) A z + lost x in double precision, z of ghosts as well."""
-        self._code.multiply(*self._all, at(lost), at(left), z.place, at(x), at(y))
+        self._code.multiply(*self._all, at(lost), at(left), z.pointer, at(x), at(y))
 
-    def residual(self, b: Vector, x: Vector, left: Vector) -> None:
+    def compute_residual(self, b: GhostedVector, x: GhostedVector, left: GhostedVector) -> None:
         """left = b - A x."""
-        self._residual(*self._all, b.place, x.place, left.place)
+        self._residual(*self._all, b.pointer, x.pointer, left.pointer)
 
-    def smooth(self, by: Diagonal, keep: float, take: float, b: Vector, x: Vector, d: Vector, to: Vector) -> None:
+    def smoothing_step(
+        self,
+        by: BlockDiagonal,
+        keep: float,
+        take: float,
+        b: GhostedVector,
+        x: GhostedVector,
+        d: GhostedVector,
+        to: GhostedVector,
+    ) -> None:
         """d = keep d + take B (b - A x), to = x + d."""
         self._smooth(
-            *self._all, by.place, c_float(keep), c_float(take), b.place, x.place, d.place, to.place
+            *self._all, by.pointer, c_float(keep), c_float(take), b.pointer, x.pointer, d.pointer, to.pointer
         )  # fmt: skip
 
-    def add(self, x: Vector, y: Vector) -> None:
+    def add_product(self, x: GhostedVector, y: GhostedVector) -> None:
         """y += A x."""
-        self._add(*self._all, x.place, y.place)
+        self._add(*self._all, x.pointer, y.pointer)
 
 
-class Diagonal:
+class BlockDiagonal:
     """Blocks of this rank's rows on the diagonal, B, symmetric.
 
     Attributes:
@@ -107,28 +116,28 @@ class Diagonal:
     def __init__(self, made: CDLL, size: int, rows: int) -> None:
         """`made`: `code` for blocks of size x size."""
         numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
-        self._code, self._rows, self.place = made, c_int64(rows), at(numbers)
+        self._code, self._rows, self.pointer = made, c_int64(rows), at(numbers)
         self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
 
-    def invert(self, D: Single) -> None:
+    def assign_inverse(self, D: Single) -> None:
         """B = D^-1 of blocks as these; where D is not positive, of the size of its diagonal."""
-        self._code.invert(self._rows, at(D), self.place)
+        self._code.invert(self._rows, at(D), self.pointer)
 
-    def begin(self, take: float, b: Vector, d: Vector, x: Vector) -> None:
+    def first_step(self, take: float, b: GhostedVector, d: GhostedVector, x: GhostedVector) -> None:
         """d = x = take B b."""
-        self._code.begin(self._rows, self.place, c_float(take), b.place, d.place, x.place)
+        self._code.begin(self._rows, self.pointer, c_float(take), b.pointer, d.pointer, x.pointer)
 
 
-def code(comm: MPI.Comm, size: int) -> CDLL | None:
+def compile_block_csr(comm: MPI.Comm, size: int) -> CDLL | None:
     """For blocks of size x size; None without a compiler (collective)."""
     lanes = next(n for n in (2, 4, 8) if n >= size)
     return compile_on_all_ranks(comm, "rows", SOURCE.read_text(), [*FAST_FLAGS, f"-DR={size}", f"-DLANES={lanes}"])
 
 
-class Between:
+class Prolongation:
     """diag(left) P diag(right), of P's blocks in the rows of this rank."""
 
-    def __init__(self, made: CDLL, P: Blocks, left: Values, right: Values) -> None:
+    def __init__(self, made: CDLL, P: BlockCSRData, left: Values, right: Values) -> None:
         """`made`: `code` for blocks of that size."""
         numbers = np.empty(P.values.size, np.float32)
         pattern = c_int64(len(P.starts) - 1), at(P.starts), at(P.columns)
@@ -138,16 +147,16 @@ class Between:
             unchecked_function(made, name, *self._all) for name in ("add", "add_transposed")
         )
 
-    def add(self, x: Vector, y: Vector) -> None:
+    def add_product(self, x: GhostedVector, y: GhostedVector) -> None:
         """y += P x, of x with its ghosts."""
-        self._add(*self._all, x.place, y.place)
+        self._add(*self._all, x.pointer, y.pointer)
 
-    def add_transposed(self, x: Vector, y: Vector) -> None:
+    def add_transposed_product(self, x: GhostedVector, y: GhostedVector) -> None:
         """y += P^T x, ghosts of y included."""
-        self._add_transposed(*self._all, x.place, y.place)
+        self._add_transposed(*self._all, x.pointer, y.pointer)
 
 
-def prolongation_code(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:
+def compile_prolongation(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:
     """For blocks of that size; None without a compiler (collective)."""
     return compile_on_all_ranks(
         comm, "between", PROLONGATION_SOURCE.read_text(), [*FAST_FLAGS, f"-DR={rows}", f"-DC={columns}"]

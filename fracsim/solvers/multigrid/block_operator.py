@@ -17,12 +17,12 @@ from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from ...mechanics.bcsr_matvec import BlockMatrix
-    from .fine_level import Finest
+    from .fine_level import FineLevel
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it
 
 
-class Blocks:
+class BlockOperator:
     """The context of a PETSc matrix that is multiplied with.
 
     Attributes:
@@ -35,16 +35,16 @@ class Blocks:
         """`pattern`: Stiffness.pattern."""
         self.tangent, self._pattern = tangent, pattern
         self.assembled = assembled
-        self.single: Finest | None = None
+        self.single: FineLevel | None = None
         self._copy: PETSc.Mat | None = None
         self._copied, self._state = -1, -1  # pattern and state of the tangent
 
-    def follow(self) -> None:
+    def update_copy(self) -> None:
         """Be the tangent as it is now (collective)."""
         if self.assembled is not None or self._state == (state := self.tangent.stateGet()):
             return
         if self._copied != (pattern := self._pattern()):
-            self.forget()
+            self.release_copy()
         self._copy = self.tangent.convert(PETSc.Mat.Type.BAIJ, self._copy or PETSc.Mat())
         self._copied, self._state = pattern, state
 
@@ -57,19 +57,19 @@ class Blocks:
         assert by is not None
         by.mult(x, y)
 
-    def matrix(self) -> PETSc.Mat:
+    def to_petsc(self) -> PETSc.Mat:
         """The matrix."""
         result: Any = PETSc.Mat().createPython(self.tangent.getSizes(), self, comm=self.tangent.comm)
         result.setUp()
         return result
 
-    def forget(self) -> None:
+    def release_copy(self) -> None:
         """Give the memory of PETSc's objects back."""
         if self._copy is not None:
             self._copy.destroy()
             self._copy = None
 
 
-def worth_it(tangent: PETSc.Mat) -> bool:
+def blocks_pay_off(tangent: PETSc.Mat) -> bool:
     """Whether products with blocks are quicker."""
     return tangent.getBlockSize() > 1 and tangent.getSize()[0] >= SMALL

@@ -19,35 +19,35 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from .bcsr import Vector
-from .hierarchy import Blocks, Copy
-from .smoother import Level
+from .bcsr import GhostedVector
+from .hierarchy import BlockCSRData, LevelData
+from .smoother import SmoothedLevel
 
 Values = npt.NDArray[np.float64]
 
 
-class Finest(Level):
+class FineLevel(SmoothedLevel):
     """The level of the tangent."""
 
-    def __init__(self, copy: Copy, own: Blocks, made: CDLL) -> None:
+    def __init__(self, copy: LevelData, own: BlockCSRData, made: CDLL) -> None:
         """As any level."""
         super().__init__(copy, own, made)
         nodes, size = copy.nodes, copy.size
         self._unscaled = 1 / self.scale
-        self._z = Vector(nodes, size, np.float64)
+        self._z = GhostedVector(nodes, size, np.float64)
         self._lost = np.zeros((nodes.size_local, size, size), np.float32)
 
-    def take(self, values: Values) -> None:
+    def assign_values(self, values: Values) -> None:
         """Those of the blocks of A, and what rounding takes from them (collective)."""
-        super().take(values)
-        self._rows.lose(values, self._unscaled, self._unscaled, self._lost)
+        super().assign_values(values)
+        self._rows.compute_rounding_loss(values, self._unscaled, self._unscaled, self._lost)
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = A x (collective)."""
         given, found, n = x.array_r, y.array_w, self._owned
         np.multiply(given, self._unscaled[:n], out=self._z.array[:n])
-        self._z.fetch()
+        self._z.update_ghosts()
         self._rows.multiply(self._lost, self._unscaled, self._z, given, found)
         to, by_nodes = (each.reshape(-1, self._size) for each in (found, given))
-        for each in self.beside:
+        for each in self.extra_terms:
             to[each.nodes] += each.multiply(by_nodes[each.nodes])

@@ -16,7 +16,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockCSRData:
     """Those in the rows of this rank.
 
     Attributes:
@@ -29,7 +29,7 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class Copy:
+class LevelData:
     """A level.
 
     Attributes:
@@ -40,11 +40,11 @@ class Copy:
     nodes: IndexMap
     size: int
     diagonal: Values
-    own: Blocks | None
-    between: Blocks | None
+    matrix: BlockCSRData | None
+    prolongation: BlockCSRData | None
 
 
-def copied(body: PETSc.PC, finest: IndexMap) -> list[Copy]:
+def copy_levels(body: PETSc.PC, finest: IndexMap) -> list[LevelData]:
     """Those of multigrid that is set up, from the coarsest on; `finest`: nodes of the finest, the matrix of which is
     not copied, nor is that of the coarsest (collective)."""
     count = body.getMGLevels()
@@ -52,7 +52,7 @@ def copied(body: PETSc.PC, finest: IndexMap) -> list[Copy]:
     matrices = [solver.getOperators()[1] for solver in solvers]
     sizes = [matrix.getBlockSize() for matrix in matrices]
     between = [None, *(_Entries(body.getMGInterpolation(level)) for level in range(1, count))]
-    result: list[Copy] = []
+    result: list[LevelData] = []
     for level, (matrix, size) in enumerate(zip(matrices, sizes, strict=True)):
         own = _Entries(matrix) if 0 < level < count - 1 else None
         read = [each.columns // size for each in (own, between[level + 1]) if each] if level < count - 1 else []
@@ -60,7 +60,7 @@ def copied(body: PETSc.PC, finest: IndexMap) -> list[Copy]:
         diagonal, to = la.vector(nodes, size), between[level]
         diagonal.array[: nodes.size_local * size] = matrix.getDiagonal().array_r
         diagonal.scatter_forward()
-        result.append(Copy(
+        result.append(LevelData(
             nodes, size, diagonal.array.copy(), own.in_blocks((size, size), nodes) if own else None,
             to.in_blocks((size, sizes[level - 1]), result[-1].nodes) if to else None,
         ))  # fmt: skip
@@ -77,12 +77,12 @@ class _Entries:
     def __init__(self, matrix: PETSc.Mat) -> None:
         self._starts, self.columns, self._values = matrix.getValuesCSR()
 
-    def in_blocks(self, size: tuple[int, int], nodes: IndexMap) -> Blocks:
+    def in_blocks(self, size: tuple[int, int], nodes: IndexMap) -> BlockCSRData:
         """The same in blocks; `nodes`: of the columns. What a block has no entry for is 0."""
         columns = size[1] * _local(self.columns // size[1], nodes) + self.columns % size[1]
         shape = len(self._starts) - 1, size[1] * (nodes.size_local + nodes.num_ghosts)
         blocks = csr_matrix((self._values, columns, self._starts), shape=shape).tobsr(size)
-        return Blocks(blocks.indptr.astype(np.int64), blocks.indices.astype(np.int32), blocks.data)
+        return BlockCSRData(blocks.indptr.astype(np.int64), blocks.indices.astype(np.int32), blocks.data)
 
 
 def _nodes(matrix: PETSc.Mat, size: int, read: list[Ints]) -> IndexMap:

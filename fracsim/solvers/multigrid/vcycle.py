@@ -39,12 +39,12 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..weak_callbacks import AppliedBy
+from ..weak_callbacks import ApplyContext
 from . import bcsr
-from .bcsr import Between, Vector
-from .fine_level import Finest
-from .hierarchy import Blocks, copied
-from .smoother import Effort, Level
+from .bcsr import GhostedVector, Prolongation
+from .fine_level import FineLevel
+from .hierarchy import BlockCSRData, copy_levels
+from .smoother import SmoothedLevel, SmoothingParameters
 
 if TYPE_CHECKING:
     from ...mechanics.bcsr_matvec import BlockMatrix
@@ -56,11 +56,11 @@ type Codes = dict[tuple[int, ...], CDLL]
 SMOOTHED = ("chebyshev", "jacobi", 2)  # how PETSc's levels are, which these replace
 # where coarser levels converge slowly: the effort of the first of them, of the next, and of all that follow, which have
 # so few numbers that calls are what they cost
-THOROUGH = Effort(2, 0.08, 2), Effort(4, 0.03, 2), Effort(8, 0.03)
+THOROUGH = SmoothingParameters(2, 0.08, 2), SmoothingParameters(4, 0.03, 2), SmoothingParameters(8, 0.03)
 TRIED, SLOWLY = 4, 0.8  # cycles of theirs; share that the last of them leaves where they do
 
 
-class Cycle:
+class SinglePrecisionVCycle:
     """The context of a PETSc preconditioner.
 
     Attributes:
@@ -71,48 +71,48 @@ class Cycle:
     def __init__(self, body: PETSc.PC, products: BlockMatrix, codes: Codes) -> None:
         """`body`: of the kind that `in_single` takes; `products`: with the tangent, which it has yet to `follow`;
         `codes`: for the sizes of its blocks (collective)."""
-        self.body, self._products, self._tangent = body, products, products.matrix
-        coarsest, *found = copied(body, self._tangent.index_map(1))
+        self.gamg, self._products, self._tangent = body, products, products.matrix
+        coarsest, *found = copy_levels(body, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
-        tangent = Blocks(starts, self._tangent.indices[: starts[-1]], self._values)
-        self._levels: list[Level] = []
-        self._between: list[Between] = []
+        tangent = BlockCSRData(starts, self._tangent.indices[: starts[-1]], self._values)
+        self._levels: list[SmoothedLevel] = []
+        self._between: list[Prolongation] = []
         below = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
         for here in found:
             square = codes[here.size,]
-            if here.own:
-                level = Level(here, here.own, square)
-                level.take(here.own.values)
+            if here.matrix:
+                level = SmoothedLevel(here, here.matrix, square)
+                level.assign_values(here.matrix.values)
             else:
-                level = self.finest = Finest(here, tangent, square)
+                level = self.fine_level = FineLevel(here, tangent, square)
             self._levels.append(level)
-            assert here.between is not None
+            assert here.prolongation is not None
             made = codes[here.size, below.size]
-            self._between.append(Between(made, here.between, 1 / level.scale, scale))
+            self._between.append(Prolongation(made, here.prolongation, 1 / level.scale, scale))
             below, scale = here, level.scale
         own = (len(starts) - 1) * self._tangent.block_size[0]
         self._scale = scale[:own].astype(np.float32)
-        self._b, self._x = (Vector(coarsest.nodes, coarsest.size) for _ in range(2))
+        self._b, self._x = (GhostedVector(coarsest.nodes, coarsest.size) for _ in range(2))
         self._solver = body.getMGCoarseSolve()
         self._ends = self._solver.getOperators()[1].createVecs()
-        self.pc = PETSc.PC().createPython(AppliedBy(self.apply), comm=body.comm)
+        self.pc = PETSc.PC().createPython(ApplyContext(self.apply), comm=body.comm)
         self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
-        self.thorough = len(self._levels) > 1 and self.converges_slowly()
-        if self.thorough:
+        self.has_thorough_smoothing = len(self._levels) > 1 and self.converges_slowly()
+        if self.has_thorough_smoothing:
             for level, effort in zip(self._levels[-2::-1], chain(THOROUGH, repeat(THOROUGH[-1])), strict=False):
-                level.exert(effort)
+                level.set_smoothing(effort)
 
     def converges_slowly(self) -> bool:
         """Whether cycles from the second finest level down do, of what is left of anything after a few of them; not
         where they diverge, of a tangent that is not positive (collective)."""
         at, level = len(self._levels) - 2, self._levels[-2]
-        level.set_at_random()
+        level.set_random_rhs()
         left = []
         for _ in range(TRIED):
             self._go_through(at)
-            level.set_out_again()
-            left.append(level.size_of_b())
+            level.restart_from_residual()
+            left.append(level.rhs_norm())
         return SLOWLY * left[-2] < left[-1] < left[-2]
 
     @property
@@ -120,14 +120,14 @@ class Cycle:
         """Of the tangent's blocks."""
         return np.asarray(self._tangent.data, np.float64)
 
-    def follow(self) -> None:
+    def update_operator(self) -> None:
         """Take the tangent as it is now for the finest level (collective)."""
-        self.finest.beside = self._products.ties
-        self.finest.take(self._values)
+        self.fine_level.extra_terms = self._products.ties
+        self.fine_level.assign_values(self._values)
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x (collective)."""
-        finest, n = self.finest, x.getLocalSize()
+        finest, n = self.fine_level, x.getLocalSize()
         b, found = finest.b.array[:n], y.array_w
         b[:] = x.array_r  # products of two kinds of numbers take three times as long
         b *= self._scale
@@ -138,28 +138,28 @@ class Cycle:
     def _go_through(self, at: int) -> None:
         """The cycle from a level down."""
         level = self._levels[at]
-        level.begin()
+        level.pre_smooth()
         b = self._levels[at - 1].b if at else self._b
         b.array[:] = 0.0
-        self._between[at].add_transposed(level.left, b)
-        b.give_back()
+        self._between[at].add_transposed_product(level.residual, b)
+        b.add_ghosts_to_owners()
         if at:
             self._correct(at - 1)
         else:
             self._solve_coarsest()
         x = self._levels[at - 1].x if at else self._x
-        x.fetch()
-        self._between[at].add(x, level.x)
-        level.end()
+        x.update_ghosts()
+        self._between[at].add_product(x, level.x)
+        level.post_smooth()
 
     def _correct(self, at: int) -> None:
         """Cycles from a coarser level down, each of what the one before has left."""
         level = self._levels[at]
         self._go_through(at)
-        for _ in range(level.effort.cycles - 1):
-            level.set_out_again()
+        for _ in range(level.smoothing.cycles - 1):
+            level.restart_from_residual()
             self._go_through(at)
-            level.add_up()
+            level.add_previous_cycle()
 
     def _solve_coarsest(self) -> None:
         b, x = self._ends
@@ -168,13 +168,13 @@ class Cycle:
         self._solver.solve(b, x)
         self._x.array[:n] = x.array_r
 
-    def forget(self) -> None:
+    def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
         for each in (*self._ends, self.pc):
             each.destroy()
 
 
-def in_single(body: PETSc.PC, products: BlockMatrix) -> Cycle | None:
+def create_vcycle(body: PETSc.PC, products: BlockMatrix) -> SinglePrecisionVCycle | None:
     """The cycle of multigrid that is set up from a tangent, of the products with this; None where it is of another kind
     than PETSc's own choice for smoothed aggregation, or there is no compiler (collective)."""
     if body.getType() != "gamg" or body.getMGLevels() < 2:
@@ -184,14 +184,16 @@ def in_single(body: PETSc.PC, products: BlockMatrix) -> Cycle | None:
         return None
     sizes = [each.getOperators()[1].getBlockSize() for each in solvers]
     codes = _compiled(body.comm.tompi4py(), sizes)
-    return None if codes is None else Cycle(body, products, codes)
+    return None if codes is None else SinglePrecisionVCycle(body, products, codes)
 
 
 def _compiled(comm: MPI.Comm, sizes: list[int]) -> Codes | None:
     """For levels with so many dofs of a node, from the coarsest on; None without a compiler (collective)."""
-    asked: dict[tuple[int, ...], CDLL | None] = {(size,): bcsr.code(comm, size) for size in sorted(set(sizes[1:]))}
+    asked: dict[tuple[int, ...], CDLL | None] = {
+        (size,): bcsr.compile_block_csr(comm, size) for size in sorted(set(sizes[1:]))
+    }
     asked |= {
-        (fine, coarse): bcsr.prolongation_code(comm, fine, coarse) for coarse, fine in sorted(set(pairwise(sizes)))
+        (fine, coarse): bcsr.compile_prolongation(comm, fine, coarse) for coarse, fine in sorted(set(pairwise(sizes)))
     }
     made = {key: each for key, each in asked.items() if each is not None}
     return made if len(made) == len(asked) else None

@@ -126,7 +126,7 @@ def _ours(n: int, pull: Pull) -> dict[str, float]:
         column, began = run.scene.probes.names.index(f"reaction_grip_{'xy'[pull.axis]}"), time.process_time()
         load, solves = [], 0
         for _ in range(pull.steps):
-            solves += run.step().solve.newton
+            solves += run.step().solve.newton_iterations
             load.append(abs(run.scene.probes()[column]))
         seconds = time.process_time() - began
         assert run.scene.fracture is not None
