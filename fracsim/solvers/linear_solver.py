@@ -153,7 +153,8 @@ class LinearSolver:
         self.preconditioner = Preconditioner(
             ksp, options, keep=self.iterative, may_change=_may_change(balance, given),
             large=self._blocks is not None, loosen=self._loosen, hasten=self._hasten,
-            bring=self._bring, pattern=lambda: self.stiffness.pattern_version, inertia=lambda: mass_stiffness_ratio(balance),
+            bring=self._bring, pattern=lambda: self.stiffness.pattern_version,
+            inertia=lambda: mass_stiffness_ratio(balance),
             nodes=balance.domain.space.dofmap.index_map.size_global,
         )  # fmt: skip
         self._asked = float(given.get("ksp_rtol", 0.0))
@@ -242,7 +243,9 @@ class LinearSolver:
             return
         self._assemble_tangent()
         self.ksp.setTolerances(
-            rtol=forcing.tolerance_for(norm, little) if self.stiffness.has_contact_coupling else forcing.tight_tolerance()
+            rtol=forcing.tolerance_for(norm, little)
+            if self.stiffness.has_contact_coupling
+            else forcing.tight_tolerance()
         )
 
     def _left_by_cg(self) -> float:
@@ -276,7 +279,8 @@ class LinearSolver:
         from .low_rank import WoodburyPreconditioner
 
         body.setReusePreconditioner(True)
-        pc = PETSc.PC().createPython(WoodburyPreconditioner(body, springs, self.balance.work_vector), comm=self.ksp.comm)
+        context = WoodburyPreconditioner(body, springs, self.balance.work_vector)
+        pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
 
