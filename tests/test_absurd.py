@@ -123,6 +123,12 @@ def test_a_spin_of_an_obstacle_is_bounded_as_well() -> None:
         validate(mutated(BASES["bar"], ("obstacle", 1, "spin", 0), 1e30), "test.toml")
 
 
+def test_the_initial_spin_of_a_body_is_bounded_as_well() -> None:
+    """Its path past obstacles was bounded for minutes, before the wall limit was looked at."""
+    with pytest.raises(InputError, match=r"initial\.spin turns it by 1e\+27 rad in a step of 0\.001 s; at most"):
+        validate(mutated(BASES["bar"], ("initial", "spin", 0), 1e30), "test.toml")
+
+
 def test_a_spin_beyond_what_is_followed_is_one_message() -> None:
     with pytest.raises(
         InputError, match=r"body\.0\.spin turns it by 2e\+06 rad in a step of 0\.002 s; at most 1000 rad"

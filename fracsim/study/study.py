@@ -243,6 +243,8 @@ class Study(StudyTable):
     def _check_spins(self) -> Study:
         spins = [(f"body.{number}", body.spin) for number, body in enumerate(self.body)]
         spins += [(f"obstacle.{i}", obstacle.spin) for i, obstacle in enumerate(self.obstacle) if obstacle.spin]
+        if self.initial is not None and self.initial.spin:
+            spins.append(("initial", self.initial.spin))
         for name, spin in spins:
             if (rotation := max(map(abs, spin)) * self.time.max_step) > MAX_ROTATION_PER_STEP:
                 raise ValueError(
