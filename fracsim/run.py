@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped, one_line
-from .mesh.parallel import end_unless_all_failed, from_root, on_root, total
+from .mesh.parallel import end_unless_all_failed, from_root, on_root, sum_over_ranks
 from .monitors import WATCHED, Watched, wants_surface
 from .output.atomic_write import written
 from .output.checkpoint import read_checkpoint, write_checkpoint
@@ -279,7 +279,7 @@ class Run:
     def _summary(self, outcome: str) -> dict[str, Any]:
         state, domain, thick = self.state, self.scene.domain, self.scene.study.thickness
         broken, split, pieces = self.breaks.figures
-        sizes = total(self.comm, np.array([domain.node_count, domain.cell_count]))
+        sizes = sum_over_ranks(self.comm, np.array([domain.node_count, domain.cell_count]))
         dust, dust_mass = self.breaks.dust(self.scene.balance.stress.material.density * domain.volumes * thick)
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,

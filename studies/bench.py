@@ -94,7 +94,7 @@ def break_now(run: Any, flags: Any) -> None:
     """Break the flagged edges, and what follows from it, as the fracture pass does (collective)."""
     fracture = run.scene.fracture
     fracture.graph.break_edges(flags)
-    fracture.graph.break_idle()
+    fracture.graph.break_unloaded_edges()
     fracture.degradation(True, *fracture.evaluate())
     fracture.changed()
     run.state = run.scene.stepper.with_current_history(run.state)

@@ -162,7 +162,7 @@ def every_run() -> Iterator[str]:
 @pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize("name", every_run())
 def test_a_run_ends_well_with_every_value(name: str, part: int, files: dict[str, Data], tmp_path: Path) -> None:
-    """Some 3,000 of them, which take ten minutes or so together; in parts, each of which has a time limit of its own."""
+    """Some 3,000 of them, which take ten minutes or so together; each part has a time limit of its own."""
     for what, data in islice(absurd((BASES | files)[name]), part, None, PARTS):
         if "ksp_rtol = 0.0" in what:
             continue

@@ -83,7 +83,7 @@ def test_crumbs_break_no_more() -> None:
     domain = body.graph.domain
     body.graph.break_edges((body.graph.edge_nodes == domain.cell_nodes[0, 0]).any(axis=1))
     body = Breakable(body._stiffness, body.graph, body._criterion, body._within)
-    crumb = int(body.pieces.of_node[domain.cell_nodes[0, 0]])
+    crumb = int(body.pieces.node_fragment[domain.cell_nodes[0, 0]])
     passes = body.passes
     loads = body.loads(crumb, domain.nodes[domain.cell_nodes[:1, 0]], np.array([[0.0, 0.0, 1e9]]))
     assert body.strike(crumb, loads) == 0 and body.passes == passes

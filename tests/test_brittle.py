@@ -74,7 +74,7 @@ def test_quadratic_cells_are_cut_as_linear_ones(dim: int) -> None:
         scene = strained(dim, stretched(dim, [1.0, 0.3, 0.2]), "neo-hookean", mesh=mesh)
         assert scene.fracture().broken_edges > 0
         found.append((*cuts(scene), scene.fracture.criterion.starts))
-        assert scene_surface(scene).pieces == 2
+        assert scene_surface(scene).fragment_count == 2
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-9)
     np.testing.assert_allclose(found[0][2], found[1][2], atol=1e-12)
@@ -106,7 +106,7 @@ def test_a_planar_cut_halves_a_cylinder(axis: list[float]) -> None:
     scene = strained(3, stretched(3, axis), mesh=mesh, fracture={"strength": 0.05, "approach": "edge"})
     assert scene.fracture().broken_edges > 0
     made, start = scene_surface(scene), scene.fracture.criterion.starts
-    assert made.pieces == 2 and start.shape == (1, 3)
+    assert made.fragment_count == 2 and start.shape == (1, 3)
     above = volume_above(mesh_of(scene), start[0], np.array(axis) / np.linalg.norm(axis))
     total = float(scene.domain.volumes.sum())
     assert sorted(enclosed(made)) == pytest.approx(sorted([above, total - above]), rel=ROUND_OFF)
@@ -124,7 +124,7 @@ def test_a_planar_cut_is_flat(dim: int, approach: str) -> None:
     at_node = np.minimum(cut, 1 - cut) <= 2 * NEAREST
     assert np.abs(height[~at_node]).max() < 1e-9
     assert at_node.mean() <= (0.1 if approach == "chi" else 0.0)
-    assert scene_surface(scene).pieces == 2
+    assert scene_surface(scene).fragment_count == 2
 
 
 def test_split_cells_carry_nothing_and_idle_edges_break() -> None:
@@ -144,7 +144,7 @@ def test_nodes_on_the_surface_are_decided_by_the_mesh() -> None:
         for sense in (1, -1):  # through the diagonals of the lattice
             made = open_at(mesh, [[0.5, 0.5]], [[sense * (1 + tilt), -sense]])
             found.append(made.opened.keys)
-            assert made.surface.pieces == 2
+            assert made.surface.fragment_count == 2
             assert sum(made.volumes) == pytest.approx(1.0, rel=ROUND_OFF)
     assert all(np.array_equal(keys, found[0]) for keys in found)
 
@@ -164,7 +164,7 @@ def test_a_surface_ends_at_an_older_crack(dim: int, settle: bool) -> None:
     alone = open_at(mesh, at[1:], normals[1:], settle)
     older = {tuple(key) for key in first.opened.keys.tolist()}
     new = np.array([tuple(key) not in older for key in both.opened.keys.tolist()])
-    assert both.surface.pieces == 3 and len(both.opened.starts) == 2
+    assert both.surface.fragment_count == 3 and len(both.opened.starts) == 2
     height = (both.places[new] - both.opened.starts[0]) @ np.array(normals[0]) / np.linalg.norm(normals[0])
     assert height.min() > -1e-8 and height.min() < 0.1  # beside the older crack, up to a cell of it
     assert alone.places[:, 0].min() < 0.1 and both.places[new, 0].max() > 0.95
@@ -183,14 +183,14 @@ def test_a_gap_is_not_jumped() -> None:
     legs = mesh.cells[(np.abs(centre[:, 0] - 0.5) > 0.15) | (centre[:, 1] < 0.2)]
     nodes, place = np.unique(legs, return_inverse=True)
     made = open_at(MeshData(mesh.points[nodes], place.reshape(legs.shape)), [[0.15, 0.5]], [[0.05, 1.0]])
-    assert made.surface.pieces == 2 and made.places[:, 0].max() < 0.4
+    assert made.surface.fragment_count == 2 and made.places[:, 0].max() < 0.4
 
 
 def test_a_shell_of_one_cell_is_cut_through() -> None:
     """A plate as thick as a cell: two pieces."""
     mesh = build_mesh(MeshSettings.model_validate({"builder": "box", "size": [1.0, 1.0, 0.1], "h": 0.1}))
     made = open_at(mesh, [[0.52, 0.47, 0.05]], [[1.0, 0.2, 0.1]], settle=True)
-    assert made.surface.pieces == 2 and made.volumes.min() > 0.3 * 0.1
+    assert made.surface.fragment_count == 2 and made.volumes.min() > 0.3 * 0.1
 
 
 # --- where surfaces start -------------------------------------------------------------------------------------------
@@ -311,7 +311,7 @@ def test_a_curved_surface_follows_its_field(dim: int) -> None:
         made = open_at(mesh, [start], [(np.array(start) - centre).tolist()], field=rays, curved=True)
         radius = np.linalg.norm(made.opened.starts[0] - centre)
         deviation.append(np.abs(np.linalg.norm(made.places - centre, axis=1) - radius).max())
-        assert made.surface.pieces == 2
+        assert made.surface.fragment_count == 2
     assert deviation[0] < 0.01 and deviation[1] < 0.4**halvings * deviation[0]
 
 
@@ -320,7 +320,7 @@ def test_without_tension_a_curved_surface_goes_straight_on() -> None:
     made = open_at(box(3), [[0.5, 0.4, 0.25]], [[1.0, 0.3, 0.2]], field=np.zeros_like, curved=True)
     normal = np.array([1.0, 0.3, 0.2]) / np.linalg.norm([1.0, 0.3, 0.2])
     assert np.abs((made.places - made.opened.starts[0]) @ normal).max() < 1e-12
-    assert made.surface.pieces == 2
+    assert made.surface.fragment_count == 2
 
 
 def test_weights_are_a_share_of_the_strength() -> None:
@@ -342,7 +342,7 @@ def test_moving_nodes_over_spares_a_curved_surface(dim: int) -> None:
         open_at(box(dim, 0.05), [at], [normal], settle, field=np.zeros_like, curved=True) for settle in (False, True)
     )
     common = {tuple(key) for key in plain.opened.keys.tolist()} & {tuple(key) for key in moved.opened.keys.tolist()}
-    assert len(common) > 0.9 * len(plain.opened.keys) and moved.surface.pieces == 2
+    assert len(common) > 0.9 * len(plain.opened.keys) and moved.surface.fragment_count == 2
 
 
 def test_a_scene_with_curved_surfaces_in_uniform_stress_cuts_planes() -> None:

@@ -41,7 +41,7 @@ def test_a_bar_swings_in_its_first_mode() -> None:
     domain = distribute(MPI.COMM_SELF, Box(size=(LENGTH, 0.1), h=0.05).build())
     assembler, u = VectorAssembler(domain), fem.Function(domain.space)
     material = material_fields(domain, "linear", young=YOUNG, poisson=0.0, density=DENSITY)
-    left, right = domain.nodes_of(Group("left")), domain.nodes_of(Group("right"))
+    left, right = domain.select_nodes(Group("left")), domain.select_nodes(Group("right"))
     motion = PrescribedMotion(domain, [(left, np.array([True, True]), constant_function([0.0, 0.0]))])
     mass = LumpedMass(assembler, coefficient(domain, DENSITY))
     terms = [Stress(assembler, u, material), Inertia(u, mass)]

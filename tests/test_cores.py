@@ -92,7 +92,7 @@ def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
     """The same by other means: nodes that are in whole cells, and how far from the faces that these share with torn
     ones."""
     body = stepper.copies.copy(0)
-    domain, of_node, found = body.graph.domain, body.pieces.of_node, Found()
+    domain, of_node, found = body.graph.domain, body.pieces.node_fragment, Found()
     nodes = as_placed(stepper, domain.nodes)
     of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)

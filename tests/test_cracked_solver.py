@@ -174,7 +174,7 @@ def cut(scene: Scene, planes: list[Any]) -> None:
     for normal, point in planes:
         side = (ends - point) @ normal >= 0
         graph.break_edges(side[:, 0] != side[:, 1])
-    graph.break_idle()
+    graph.break_unloaded_edges()
     assert scene.balance.stress.chi is not None and scene.solver is not None
     scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
     scene.solver.damage_changed()

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from fracsim.errors import InputError
 from fracsim.mesh.crack_planes import plane, polygon, segment
-from fracsim.mesh.fragments import find_pieces
+from fracsim.mesh.fragments import find_fragments
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study
@@ -95,7 +95,7 @@ def test_a_plane_along_nodes_cuts_one_row_of_edges() -> None:
     scene = cracked(
         [{"plane": {"point": [0.0, 0.5], "normal": [0.0, 2.0]}}], mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25}
     )
-    assert find_pieces(scene.fracture.graph).count == 2
+    assert find_fragments(scene.fracture.graph).count == 2
     np.testing.assert_allclose(np.abs(cut_points(scene)[:, 1] - 0.5), 0.02 * 0.25, rtol=1e-9)
 
 
@@ -186,10 +186,10 @@ def test_shapes_in_space() -> None:
     corners = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1], [1, 0.5, 1], [0, 2, 1]], float)
     crack = polygon("it", corners)
     points = np.array([[0.2, 0.5, 1], [1.0, 1.5, 1], [1.8, 0.5, 1], [2.1, 0.5, 1], [2.0, 1.0, 1]])
-    np.testing.assert_array_equal(crack.holds(points, 1e-9), [True, False, True, False, True])
-    assert crack.meets(np.zeros(3), np.full(3, 1.5)) and not crack.meets(np.zeros(3), np.full(3, 0.9))
+    np.testing.assert_array_equal(crack.contains(points, 1e-9), [True, False, True, False, True])
+    assert crack.intersects_box(np.zeros(3), np.full(3, 1.5)) and not crack.intersects_box(np.zeros(3), np.full(3, 0.9))
     corners[3, 2] = 1.5
     with pytest.raises(InputError, match="do not span a plane"):
         polygon("it", corners)
-    assert not plane("it", np.array([0.0, 3.0]), np.array([0.0, 1.0])).meets(np.zeros(2), np.ones(2))
-    assert segment("it", np.array([[-1.0, 0.5], [2.0, 0.6]])).meets(np.zeros(2), np.ones(2))
+    assert not plane("it", np.array([0.0, 3.0]), np.array([0.0, 1.0])).intersects_box(np.zeros(2), np.ones(2))
+    assert segment("it", np.array([[-1.0, 0.5], [2.0, 0.6]])).intersects_box(np.zeros(2), np.ones(2))

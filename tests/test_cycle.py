@@ -126,7 +126,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
     balance, free = scene.balance, scene.balance.motion.free_dofs
     for moved in (0.0, 0.2, 0.4):
-        wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge
+        wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge_length
         balance.set_displacement(balance.u.x.array[: len(free)] + np.where(free, wild, 0.0))
         preconditioner.due = Due.NOTHING
         assert linear.solve() or moved > 0.2  # where the tangent is not positive

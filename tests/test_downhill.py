@@ -67,7 +67,7 @@ def test_what_was_misled_twice_goes_downhill_at_once_for_a_while(monkeypatch: py
         ways_of(calls, scene.solver)
         walk, rng = Walk(scene), np.random.default_rng(3)
         for thrown in (0, 1, 1, 1, 0, 0):
-            away = rng.uniform(-0.6, 0.6, len(walk.u)) * scene.domain.mean_edge * scene.balance.motion.free_dofs
+            away = rng.uniform(-0.6, 0.6, len(walk.u)) * scene.domain.mean_edge_length * scene.balance.motion.free_dofs
             if thrown:
                 walk.v = away / 5e-3
             calls.append("|")

@@ -14,7 +14,7 @@ from fracsim.contact.penalty_law import Carried
 from fracsim.contact.penalty_obstacles import ExplicitObstacles
 from fracsim.contact.penalty_rigid_obstacles import ExplicitFreeObstacles
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.local_surface import Following, LocalSurface
+from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import each_step, make_scene, make_study, march, positions
@@ -45,8 +45,8 @@ def test_springs_at_points_are_no_faster_than_said() -> None:
     scene, _ = make_scene(mesh=mesh)
     surface, graph = LocalSurface(scene.domain), EdgeGraph(scene.domain)
     graph.break_edges(np.random.default_rng(1).random(len(graph.broken)) < 0.4)
-    surface.follow_damage(graph.pattern)
-    carried = Carried(surface.at, Following(scene.domain, surface), scene.balance.mass.lumped)
+    surface.update_damage(graph.pattern)
+    carried = Carried(surface.at, ParentMatrix(scene.domain, surface), scene.balance.mass.lumped)
     W, m = surface.at.weights.toarray(), masses(scene)[surface.columns, 0]
 
     def fastest(k: Values) -> float:

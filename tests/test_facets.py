@@ -327,7 +327,7 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     np.testing.assert_array_equal(skin._cut, left_out)
     # what is drawn: all of it, beside the ball
     at, (elements, _), u = skin.at, skin._surface.facets(), skin.follow.nodal(contact._at_end())
-    whole = at.drawn_in(np.ones(len(at.share)))
+    whole = at.with_arm_share(np.ones(len(at.share)))
     shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
     least = [
         placed.distance(np.einsum("sc,kcd->ksd", shares, each(u)[elements]).reshape(-1, 3)).min()

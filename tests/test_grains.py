@@ -119,8 +119,8 @@ def test_a_surface_frees_the_grain_that_it_starts_in(dim: int, spread: float) ->
     ends = role[body.edges]
     expected = body.edges[ends[:, 0] != ends[:, 1]]
     assert np.array_equal(made.opened.keys, expected)
-    for piece in range(made.surface.pieces):
-        assert len(np.unique(role[made.surface.piece_of_node == piece])) == 1
+    for piece in range(made.surface.fragment_count):
+        assert len(np.unique(role[made.surface.node_fragment == piece])) == 1
     assert made.volumes.min() > 0
     assert made.volumes.sum() == pytest.approx(np.prod([1.0, 0.8, 0.5][:dim]), rel=ROUND_OFF)
 
@@ -132,7 +132,7 @@ def test_a_free_grain_of_equal_weights_is_a_polygon() -> None:
     freed = least(made.opened.starts[:1], grains.seeds, grains.weights)[0][0]
     x, y = np.meshgrid((np.arange(500) + 0.5) / 500, (np.arange(400) + 0.5) / 500, indexing="ij")
     share = (least(np.column_stack([x.ravel(), y.ravel()]), grains.seeds, grains.weights)[0] == freed).mean()
-    piece = made.surface.piece_of_node[np.flatnonzero(grains.of_node == freed)[0]]
+    piece = made.surface.node_fragment[np.flatnonzero(grains.of_node == freed)[0]]
     assert made.volumes[piece] == pytest.approx(0.8 * share, rel=0.03)
 
 
@@ -156,8 +156,8 @@ def test_bias_runs_along_grain_boundaries(dim: int, shape: str) -> None:
     grains = Grains(body, GrainRules(**table), False)
     ends = grains.of_node[made.opened.keys]
     assert len(ends) > 5 and np.all(ends[:, 0] != ends[:, 1])
-    assert made.surface.pieces == 2
+    assert made.surface.fragment_count == 2
     for grain in range(40):
-        assert len(np.unique(made.surface.piece_of_node[grains.of_node == grain])) <= 1
+        assert len(np.unique(made.surface.node_fragment[grains.of_node == grain])) <= 1
     size = max(np.ptp(body.points[grains.of_node == grain] @ normal) for grain in np.unique(grains.of_node))
     assert np.abs((made.places - made.opened.starts[0]) @ normal).max() <= size

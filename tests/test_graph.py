@@ -15,9 +15,9 @@ from scipy.sparse.csgraph import connected_components
 
 from fracsim.mesh import incremental_fragments
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.fragments import find_pieces
+from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.incidence import Incidence
-from fracsim.mesh.incremental_fragments import Parting
+from fracsim.mesh.incremental_fragments import IncrementalFragments
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from fracsim.meshes.components import components
 from support.ranks import OnRanks
@@ -112,12 +112,12 @@ def test_idle_edges_break_and_part_the_graph() -> None:
     graph = scene.fracture.graph
     cells = np.bincount(graph.cell_edges.ravel())
     shared = np.flatnonzero(cells == 2)
-    assert graph.break_idle() == 0
+    assert graph.break_unloaded_edges() == 0
     graph.break_edges(cells == 1)
     assert graph.broken[shared].sum() == 0
-    assert graph.break_idle() == 1
+    assert graph.break_unloaded_edges() == 1
     assert graph.broken.all()
-    assert graph.break_idle() == 0
+    assert graph.break_unloaded_edges() == 0
 
 
 def test_keys_name_edges(graph: EdgeGraph) -> None:
@@ -134,16 +134,18 @@ def test_pieces_are_followed(dim: int) -> None:
     search of all nodes, which is seldom needed."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.34}, fracture={"strength": 1.0})
     graph = scene.fracture.graph
-    follow, counts = Parting(graph), []
-    with patch.object(incremental_fragments, "find_pieces", wraps=find_pieces) as searched:
+    follow, counts = IncrementalFragments(graph), []
+    with patch.object(incremental_fragments, "find_fragments", wraps=find_fragments) as searched:
         for edge in np.random.default_rng(6).permutation(len(graph.broken)):
             graph.break_edges(np.arange(len(graph.broken)) == edge)
-            pieces, expected = follow.look(), find_pieces(graph)
-            assert np.array_equal(pieces.of_node, expected.of_node) and np.array_equal(pieces.lowest, expected.lowest)
+            pieces, expected = follow.update(), find_fragments(graph)
+            assert np.array_equal(pieces.node_fragment, expected.node_fragment) and np.array_equal(
+                pieces.lowest_node, expected.lowest_node
+            )
             counts.append(pieces.count)
         assert searched.call_count == 0 and counts[0] == 1 and counts[-1] == 4**dim
         graph.set_integrity(np.ones(len(graph.broken)))
-        assert follow.look().count == 1 and searched.called
+        assert follow.update().count == 1 and searched.called
 
 
 def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
@@ -151,16 +153,19 @@ def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
     says so; then a node of one corner does, with all its edges."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.05}, fracture={"strength": 1.0})
     graph = scene.fracture.graph
-    follow, middle = Parting(graph), graph.domain.nodes[graph.edge_nodes].mean(axis=1)
+    follow, middle = IncrementalFragments(graph), graph.domain.nodes[graph.edge_nodes].mean(axis=1)
     near = [np.argsort(np.linalg.norm(middle - corner, axis=1))[:3] for corner in ([0.2, 0.2], [0.8, 0.8])]
-    with patch.object(incremental_fragments, "FAR", 3), patch.object(incremental_fragments, "find_pieces") as searched:
+    with (
+        patch.object(incremental_fragments, "FAR", 3),
+        patch.object(incremental_fragments, "find_fragments") as searched,
+    ):
         graph.break_edges(np.isin(np.arange(len(middle)), np.concatenate(near)))
-        assert follow.look().count == 1
+        assert follow.update().count == 1
         alone = graph.edge_nodes[near[0][0], 0]
         graph.break_edges((graph.edge_nodes == alone).any(axis=1) | (np.arange(len(middle)) == near[1][0]))
-        pieces = follow.look()
+        pieces = follow.update()
     assert not searched.called
-    assert pieces.count == 2 and np.array_equal(pieces.of_node, find_pieces(graph).of_node)
+    assert pieces.count == 2 and np.array_equal(pieces.node_fragment, find_fragments(graph).node_fragment)
 
 
 @pytest.mark.ranks
@@ -182,7 +187,7 @@ def test_rows_are_found_by_what_is_in_them(seed: int) -> None:
     table, wanted = random.integers(0, 30, (40, 3)), random.choice(30, random.integers(0, 5), replace=False)
     incidence = Incidence(table, 30)
     assert np.array_equal(incidence(wanted), np.flatnonzero(np.isin(table, wanted).any(axis=1)))
-    assert len(incidence.each(wanted)) == np.isin(table, wanted).sum()
+    assert len(incidence.entities_of(wanted)) == np.isin(table, wanted).sum()
 
 
 def test_components_are_numbered_by_their_lowest_node() -> None:

@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from fracsim.fracture.node_retention import Joining
 from fracsim.mechanics.node_ties import NodeTies
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.facet_components import parts_of_nodes
-from fracsim.mesh.fragments import find_pieces
+from fracsim.mesh.facet_components import node_components
+from fracsim.mesh.fragments import find_fragments
 from fracsim.scene import Scene
 from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.multigrid import block_operator
@@ -50,7 +50,7 @@ def one_pass(scene: Scene, graph: EdgeGraph, failing: Flags, own: Values, held: 
     flags = np.zeros(len(graph.broken), bool)
     flags[edges[fail]] = True
     graph.break_edges(flags)
-    graph.break_idle()
+    graph.break_unloaded_edges()
 
 
 def bodies(graph: EdgeGraph, *, cells: bool) -> npt.NDArray[np.integer]:
@@ -74,7 +74,7 @@ def test_a_node_stays_with_the_least_loaded_of_its_edges(scene: Scene) -> None:
     load = [own[(graph.cell_edges == edge).any(axis=1)].max() for edge in np.flatnonzero(at)]
     one_pass(scene, graph, at, own)
     assert np.flatnonzero(at & ~graph.broken).tolist() == [np.flatnonzero(at)[np.argmin(load)]]
-    assert find_pieces(graph).count == 1
+    assert find_fragments(graph).count == 1
 
 
 def test_random_breaks_leave_no_crumb_and_join_no_bodies(scene: Scene) -> None:
@@ -100,7 +100,7 @@ def test_what_is_left_on_a_grip_is_a_piece_of_its_own(scene: Scene) -> None:
     for held, wanted in ((side, 2), (np.zeros(len(side), bool), 1)):
         graph = EdgeGraph(scene.domain)
         one_pass(scene, graph, ends.any(axis=1) & ~ends.all(axis=1), np.full(scene.domain.cell_count, 2.0), held)
-        assert find_pieces(graph).count == wanted
+        assert find_fragments(graph).count == wanted
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -111,7 +111,7 @@ def test_cracks_that_take_an_energy_cut_no_node_off(dim: int) -> None:
     for single in (True, False):
         scene = burst(dim, single)
         graph = scene.fracture.graph
-        crumbs.append(np.count_nonzero(np.bincount(find_pieces(graph).of_node) == 1))
+        crumbs.append(np.count_nonzero(np.bincount(find_fragments(graph).node_fragment) == 1))
         split.append(np.count_nonzero(graph.split))
         assert np.isnan(scene.fracture.criterion.cut[~graph.broken]).all()  # what was spared is not cut
     assert crumbs[0] > 10 and crumbs[1] == 0 and split[1] == pytest.approx(split[0], rel=0.5)
@@ -370,7 +370,7 @@ def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
     jacobi = PETSc.PC().create(domain.comm)
     jacobi.setType("jacobi")
     jacobi.setOperators(balance.tangent.matrix)
-    _, part = parts_of_nodes(domain, balance.stress.chi.x.array[: domain.cell_count] > 0)
+    _, part = node_components(domain, balance.stress.chi.x.array[: domain.cell_count] > 0)
     own = int(part[domain.cell_nodes[cell]].max())
     node = np.flatnonzero(domain.node_input == tethers.ties.nodes[0, 0])
     assert own > 0 and part[node] == -1

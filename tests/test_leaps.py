@@ -27,9 +27,9 @@ def scene() -> Scene:
 def held(scene: Scene, moves: Values, forces: Values) -> Values:
     """(n, d) what is left of moves (n, d), in mean edges, where `forces` (n, d) act."""
     y, r = scene.balance.work_vector.duplicate(), scene.balance.work_vector.duplicate()
-    y.array_w[:], r.array_w[:] = scene.domain.mean_edge * moves.reshape(-1), forces.reshape(-1)
+    y.array_w[:], r.array_w[:] = scene.domain.mean_edge_length * moves.reshape(-1), forces.reshape(-1)
     line_search.clip_correction(scene.domain, y, r)
-    return np.asarray(y.array_r.reshape(moves.shape) / scene.domain.mean_edge)
+    return np.asarray(y.array_r.reshape(moves.shape) / scene.domain.mean_edge_length)
 
 
 def some_moves(scene: Scene) -> Values:

@@ -14,7 +14,7 @@ import pyvista
 from mpi4py import MPI
 
 from fracsim.errors import Stopped
-from fracsim.mesh.interpenetration import overlap
+from fracsim.mesh.interpenetration import find_interpenetration
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
@@ -129,7 +129,7 @@ def test_overlap_is_what_vtk_finds(dim: int) -> None:
         turn = np.linalg.qr(rng.normal(size=(dim, dim)))[0]
         x[piece == 1] = (x[piece == 1] - 0.5) @ turn + rng.uniform(-1, 2, dim)
         inner = np.append(np.zeros((piece == 0).sum(), bool), grid.find_containing_cell(in_space(x[piece == 1])) >= 0)
-        found = overlap(x, cells, piece)
+        found = find_interpenetration(x, cells, piece)
         if found is None:
             assert inner.sum() <= 2  # all in the rim of their cells
         else:
@@ -144,8 +144,8 @@ def test_blocks_that_touch_do_not_overlap(dim: int) -> None:
     points, cells, piece = two_blocks(dim)
     for shift, meets in ((1.0, False), (1.1, False), (0.88, True)):
         x = points + (np.eye(dim)[0] * shift + 0.07 * np.arange(dim)) * piece[:, None]
-        assert (overlap(x, cells, piece) is not None) == meets
-    assert overlap(points, cells, np.zeros_like(piece)) is None
+        assert (find_interpenetration(x, cells, piece) is not None) == meets
+    assert find_interpenetration(points, cells, np.zeros_like(piece)) is None
 
 
 PAIR: Tables = {

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fracsim.mesh.split_surface.closed_surface import split
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
-from fracsim.mesh.split_surface.polyhedron_moments import Moments, moments
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from fracsim.mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from fracsim.meshes.topology import signed_measures
 from support.solids import cloud, lattice, patterns, separated, torn
 
@@ -16,7 +16,7 @@ from support.solids import cloud, lattice, patterns, separated, torn
 def test_whole_bodies_have_the_moments_of_their_cells(dim: int) -> None:
     """Degree-2 quadrature on every cell: weights and points that integrate x x^T exactly, and nothing of cones."""
     mesh = cloud(dim, 3)
-    made = torn(mesh, np.zeros(len(Skeleton(mesh).edges), bool))
+    made = torn(mesh, np.zeros(len(EntityNumbering(mesh).edges), bool))
     found = moments(made.points + 5.0, made.elements, np.zeros(len(made.elements), int), 1)
     corners, volume = mesh.points[mesh.cells] + 5.0, signed_measures(mesh.points, mesh.cells)
     a = 1 / 6 if dim == 2 else (5 - 5**0.5) / 20
@@ -33,12 +33,12 @@ def test_whole_bodies_have_the_moments_of_their_cells(dim: int) -> None:
 def test_pieces_of_a_cut_block_are_boxes() -> None:
     """Cut across at x = 0.3 of 1: the inertia of a box of sides a, b, c per density is a b c (b^2 + c^2) / 12."""
     mesh, x = lattice(4, 2, 2, size=0.25), 0.3
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     low, high = mesh.points[skeleton.edges][:, :, 0].T
     broken = separated(skeleton, (mesh.points[:, 0] > x).astype(int))
     share = np.where(broken, (x - low) / np.where(broken, high - low, 1.0), np.nan)
-    made = split(skeleton, patterns(skeleton, broken), share)
-    found = moments(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)
+    made = build_split_surface(skeleton, patterns(skeleton, broken), share)
+    found = moments(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)
     for piece, length in enumerate((x, 1 - x)):
         sides = np.array([length, 0.5, 0.5])
         squares = sides**2
@@ -50,20 +50,20 @@ def test_pieces_of_a_cut_block_are_boxes() -> None:
 def test_parts_sum_to_the_whole(dim: int) -> None:
     """Random cuts: volumes, first and second moments about one point (Steiner) are those of the whole body."""
     mesh = cloud(dim, 5)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     rng = np.random.default_rng(2)
     broken = separated(skeleton, rng.integers(0, 4, len(mesh.points)))
     found = []
     for each in (broken, np.zeros_like(broken)):
         made = torn(mesh, each)
-        of = moments(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)
+        of = moments(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)
         found.append(about_origin(of))
-    assert made.pieces == 1
+    assert made.fragment_count == 1
     for parts, whole in zip(*found, strict=True):
         assert np.allclose(parts, whole, atol=1e-13)
 
 
-def about_origin(of: Moments) -> list[np.ndarray]:
+def about_origin(of: PolyhedronMoments) -> list[np.ndarray]:
     """Sums over bodies of volume, first and second moments about the origin."""
     carried = np.einsum("n,ni,nj->nij", of.volume, of.centre, of.centre)
     first = (of.volume[:, None] * of.centre).sum(axis=0)

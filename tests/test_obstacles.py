@@ -14,7 +14,7 @@ from mpi4py import MPI
 from fracsim.contact.obstacle_term import Obstacles
 from fracsim.errors import InputError
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.local_surface import Following, LocalSurface
+from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from support.resumed import assert_alike, going_stopped_resumed
@@ -58,14 +58,14 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int,
     assert surface.area.sum() == pytest.approx(2 * dim)
     ends = domain.nodes[graph.edge_nodes][:, :, 0]
     graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.5))
-    surface.follow_damage(graph.pattern)
+    surface.update_damage(graph.pattern)
     assert surface.area.sum() > 2 * dim + 1.5
-    follow, X = Following(domain, surface), positions(scene)
+    follow, X = ParentMatrix(domain, surface), positions(scene)
     A, b = np.random.default_rng(dim).normal(size=(dim, dim)), np.arange(dim) + 1.0
     x = follow((X @ A.T + b).reshape(-1))
     np.testing.assert_allclose(x, surface.at.rest @ A.T + b, atol=1e-13)
     f = np.sin(100 * surface.at.rest) * surface.area[:, None]
-    nodal = follow.handed_down(f).reshape(-1, dim)
+    nodal = follow.assemble_to_nodes(f).reshape(-1, dim)
     np.testing.assert_allclose(nodal.sum(axis=0), f.sum(axis=0), atol=1e-13)
     np.testing.assert_allclose(X.T @ nodal, surface.at.rest.T @ f, atol=1e-13)
 

@@ -74,7 +74,7 @@ def test_a_force_on_a_round_face_is_the_force_given() -> None:
 
 def test_a_body_that_breaks_has_straight_sides() -> None:
     scene, _ = disk(fracture={"strength": 1.0})
-    assert not scene.domain.is_bent
+    assert not scene.domain.has_curved_cells
     assert scene.balance.mass.lumped.sum() / 2 == pytest.approx(scene.domain.volumes.sum())
 
 
@@ -232,13 +232,13 @@ def test_cells_with_broken_edges_are_touched_by_their_corners() -> None:
         surface, graph = LocalSurface(domain), EdgeGraph(domain)
         ends = domain.nodes[graph.edge_nodes][:, :, 0]
         graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.4))
-        surface.follow_damage(graph.pattern)
+        surface.update_damage(graph.pattern)
         area[order] = surface.area.sum()
         if order == 2:
             touched = surface.columns[abs(surface.at.weights).max(axis=0).toarray().ravel() > 1e-12]
             cells = np.flatnonzero(graph.pattern)
-            of_whole = domain.cell_middles[np.flatnonzero(graph.pattern == 0)]
-            only_broken = np.setdiff1d(domain.cell_middles[cells], of_whole)
+            of_whole = domain.cell_midside_nodes[np.flatnonzero(graph.pattern == 0)]
+            only_broken = np.setdiff1d(domain.cell_midside_nodes[cells], of_whole)
             assert len(only_broken) and not np.isin(only_broken, touched).any()
             assert np.isin(of_whole, touched).any()
     assert area[2] == pytest.approx(area[1], rel=1e-12)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial import Delaunay
 
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.builders.cylinder import Cylinder, Disk
 from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
@@ -258,7 +258,7 @@ MESHES = {
 
 def cracks(mesh: MeshData) -> dict[str, npt.NDArray[np.bool_]]:
     """Broken edges (E,): a crack through the body, one that ends in it, one edge, a fifth and all of them."""
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     across, up = skeleton.points[skeleton.edges].mean(axis=1)[:, :2].T
     through = separated(skeleton, mesh.points[:, 0] > np.median(mesh.points[:, 0]) + 1e-3)
     some = np.random.default_rng(0).random(len(across))
@@ -284,12 +284,12 @@ def test_no_force_at_the_moment_of_breaking(name, dim):
 def test_closed_crack_carries_load(dim):
     """A body cut across, its halves pressed together by 0.3 to 0.9 of the reach: they push back, ever harder."""
     mesh = lattice(*[4] * dim, size=0.25)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     made = torn(mesh, separated(skeleton, mesh.points[:, 0] > 0.6))
     reach = 0.03 * 0.25
     x = receded(made, 1.1 * reach)
     pairs = Pairs(x, made.elements, distance=reach, stiffness=1.0)
-    right = mesh.points[made.follow.first_parent, 0] > 0.6
+    right = mesh.points[made.parents.first_parent, 0] > 0.6
     assert pairs.energy(x) == 0
     closed = [x - right[:, None] * np.eye(dim)[0] * share * reach for share in (0.3, 0.6, 0.9)]
     force = [-pairs.gradient(each)[right, 0].sum() for each in closed]
@@ -298,5 +298,5 @@ def test_closed_crack_carries_load(dim):
 
 
 def shortest(mesh: MeshData) -> float:
-    ends = mesh.points[Skeleton(mesh).edges]
+    ends = mesh.points[EntityNumbering(mesh).edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min())

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.mesh.small_matrices import barycentric_gradients
-from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
 from fracsim.scene.rigid_scene import build_rigid_scene
 from fracsim.study.reader import load_study
@@ -38,9 +38,9 @@ def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
     """Of pairs of pieces, how far corners of the drawn surface of one, crack faces as well, that are in a whole cell of
     the other are from its surface, m: they come free of one another by no shorter way."""
     body, bodies, found = stepper.copies.copy(0), state.bodies, dict[tuple[int, int], float]()
-    domain, of_node = body.graph.domain, body.pieces.of_node
-    made, nodes = split(stepper._geometry.skeleton, *body.damage()), as_placed(stepper, domain.nodes)
-    own, owner = made.piece_of_point, made.elements[:, 0]
+    domain, of_node = body.graph.domain, body.pieces.node_fragment
+    made, nodes = build_split_surface(stepper._geometry.skeleton, *body.damage()), as_placed(stepper, domain.nodes)
+    own, owner = made.point_fragment, made.elements[:, 0]
     x = bodies.to_space(as_placed(stepper, made.points), own)
     of_cell = of_node[domain.cell_nodes]
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
@@ -65,7 +65,7 @@ def in_cores(stepper: RigidStepper, state: RigidState) -> Depths:
     """Of pairs of pieces, how far nodes of one are in the cells that are wholly of the other, m: no crack goes through
     these, so that its roughness does not explain it."""
     body, bodies = stepper.copies.copy(0), state.bodies
-    domain, of_node, found = body.graph.domain, body.pieces.of_node, dict[tuple[int, int], float]()
+    domain, of_node, found = body.graph.domain, body.pieces.node_fragment, dict[tuple[int, int], float]()
     nodes = as_placed(stepper, domain.nodes)
     of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)

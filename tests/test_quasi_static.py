@@ -39,7 +39,7 @@ def torn_plate(**tables: Any) -> tuple[Scene, Walk]:
 
 def grip(scene: Scene) -> float:
     """Reaction of the upper edge along y, N."""
-    top = scene.domain.nodes_of(Group("top"))
+    top = scene.domain.select_nodes(Group("top"))
     return float(scene.balance.reactions.reshape(-1, 2)[top, 1].sum())
 
 

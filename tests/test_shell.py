@@ -181,7 +181,7 @@ def test_cracks_go_through_the_whole_thickness(grains: GrainRules | None) -> Non
     force = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     assert body.strike(0, body.loads(0, points, force, np.full(3, 0.01))) > 0
     of_input = np.empty(len(mesh.points), int)
-    of_input[body.graph.domain.node_input] = body.pieces.of_node
+    of_input[body.graph.domain.node_input] = body.pieces.node_fragment
     below, above = np.split(of_input, 2)
     assert body.pieces.count > 2 and np.array_equal(below, above)
     assert moments_of(body).volume.sum() == pytest.approx(0.2 * H, rel=1e-9)

@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.mesh.split_surface.closed_surface import split
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
-from fracsim.mesh.split_surface.fragment_surface import is_same_solid, laid, split_of_pieces
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from fracsim.mesh.split_surface.fragment_surface import (
+    build_fragment_surface,
+    has_same_fragments,
+    project_onto_fragments,
+)
 from fracsim.mesh.split_surface.surface_map import whole
 from fracsim.meshes.topology import signed_measures
 from support.solids import assert_closed, cloud, components, enclosed, lattice, patterns, separated, torn
@@ -19,12 +23,12 @@ from support.solids import assert_closed, cloud, components, enclosed, lattice, 
 def test_it_encloses_what_the_nodes_with_a_whole_cell_own(dim: int, seed: int, share: float) -> None:
     """A piece has of a cell what lies on its side of planes through the middles of edges; nothing else is there."""
     mesh = cloud(dim, seed)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     broken = np.random.default_rng(seed).random(len(skeleton.edges)) < share
     pattern = patterns(skeleton, broken)
     solid = np.zeros(len(mesh.points), bool)
     solid[mesh.cells[pattern == 0]] = True
-    made = split_of_pieces(skeleton, pattern)
+    made = build_fragment_surface(skeleton, pattern)
     assert_closed(made)
     inner = ~broken & solid[skeleton.edges].all(axis=1)
     count, piece = components(len(mesh.points), skeleton.edges[inner])
@@ -32,21 +36,21 @@ def test_it_encloses_what_the_nodes_with_a_whole_cell_own(dim: int, seed: int, s
     np.add.at(own, (np.arange(len(mesh.cells))[:, None], piece[mesh.cells]), solid[mesh.cells])
     share = {2: np.array([0.0, 1 / 4, 3 / 4, 1.0]), 3: np.array([0.0, 1 / 8, 1 / 2, 7 / 8, 1.0])}[dim]
     expected = signed_measures(mesh.points, mesh.cells) @ share[own]
-    label = piece[made.follow.first_parent[made.elements[:, 0]]]
+    label = piece[made.parents.first_parent[made.elements[:, 0]]]
     found, slack = enclosed(made.points, made.elements, label, count)
     assert np.all(np.abs(found - expected) <= slack)
 
 
 def test_a_crack_within_a_piece_is_not_there_and_one_between_pieces_is() -> None:
     mesh = lattice(6, 4)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     above = (mesh.points[:, 1] > 2.0).astype(int)
     through = separated(skeleton, above)
     notch = through & (mesh.points[skeleton.edges][:, :, 0].max(axis=1) < 3.5)
     whole = torn(mesh, np.zeros(len(through), bool))
-    assert np.array_equal(split_of_pieces(skeleton, patterns(skeleton, notch)).elements, whole.elements)
-    parted, all_walls = split_of_pieces(skeleton, patterns(skeleton, through)), torn(mesh, through)
-    assert parted.pieces == 2 and len(parted.elements) < len(all_walls.elements)
+    assert np.array_equal(build_fragment_surface(skeleton, patterns(skeleton, notch)).elements, whole.elements)
+    parted, all_walls = build_fragment_surface(skeleton, patterns(skeleton, through)), torn(mesh, through)
+    assert parted.fragment_count == 2 and len(parted.elements) < len(all_walls.elements)
     cut = all_walls.points[np.unique(all_walls.elements)]  # without the middles of cells, which the flat cut has not
     on_edges = ~(cut[:, None] == mesh.points[mesh.cells].mean(axis=1)).all(axis=2).any(axis=1)
     here = parted.points[np.unique(parted.elements)]
@@ -57,13 +61,13 @@ def test_a_crack_within_a_piece_is_not_there_and_one_between_pieces_is() -> None
 def test_a_plane_that_says_where_edges_are_cut_is_the_wall(dim: int) -> None:
     """What is above it and below it, to round-off; where it comes too near to a node it is not followed."""
     mesh = lattice(*(4,) * dim)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     y, ends = mesh.points[:, 1], mesh.points[skeleton.edges][:, :, 1]
     for height, wall in ((1.7, 1.7), (1.95, 1.85)):
         broken = separated(skeleton, (y > height).astype(int))
         cut = np.where(broken, (height - ends[:, 0]) / np.where(broken, ends[:, 1] - ends[:, 0], 1.0), np.nan)
-        made = split_of_pieces(skeleton, patterns(skeleton, broken), cut)
-        label = (y > height).astype(int)[made.follow.first_parent[made.elements[:, 0]]]
+        made = build_fragment_surface(skeleton, patterns(skeleton, broken), cut)
+        label = (y > height).astype(int)[made.parents.first_parent[made.elements[:, 0]]]
         found, slack = enclosed(made.points, made.elements, label, 2)
         assert np.all(np.abs(found - np.array([wall, 4 - wall]) * 4 ** (dim - 1)) <= 10 * slack)
 
@@ -72,31 +76,33 @@ def test_a_plane_that_says_where_edges_are_cut_is_the_wall(dim: int) -> None:
 def test_a_surface_that_is_said_to_be_the_same_is(dim: int, seed: int, share: float, more: int) -> None:
     """Points, elements, and where points are as the nodes move; edges that end in no wall change none."""
     mesh, rng = cloud(dim, seed), np.random.default_rng(seed)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     halves = separated(skeleton, (mesh.points[:, 0] > np.median(mesh.points[:, 0])).astype(int))
     then = halves | (rng.random(len(skeleton.edges)) < share)
     now = then.copy()
     now[rng.integers(0, len(now), more)] = True
     before, pattern = patterns(skeleton, then), patterns(skeleton, now)
-    one, other = split_of_pieces(skeleton, before), split_of_pieces(skeleton, pattern)
+    one, other = build_fragment_surface(skeleton, before), build_fragment_surface(skeleton, pattern)
     same = len(one.points) == len(other.points) and np.array_equal(one.elements, other.elements)
-    if is_same_solid(skeleton, pattern, before):
+    if has_same_fragments(skeleton, pattern, before):
         assert same
         u = rng.random(mesh.points.shape)
         places = [whole(made, skeleton, at, made.points)(u) for made, at in ((one, before), (other, pattern))]
         np.testing.assert_array_equal(*places)
-    assert is_same_solid(skeleton, before, before) and (same or not is_same_solid(skeleton, pattern, before))
+    assert has_same_fragments(skeleton, before, before) and (same or not has_same_fragments(skeleton, pattern, before))
 
 
 def test_a_crack_within_a_half_leaves_the_surface_of_the_halves() -> None:
     mesh = lattice(8, 6)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     x, y = mesh.points.T
     through = separated(skeleton, (y > 3.0).astype(int))
     notch = separated(skeleton, (x > 2.0).astype(int)) & (mesh.points[skeleton.edges][:, :, 1].max(axis=1) < 1.5)
     assert notch.any()
     halves, both = patterns(skeleton, through), patterns(skeleton, through | notch)
-    assert is_same_solid(skeleton, both, halves) and not is_same_solid(skeleton, patterns(skeleton, notch), both)
+    assert has_same_fragments(skeleton, both, halves) and not has_same_fragments(
+        skeleton, patterns(skeleton, notch), both
+    )
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -104,18 +110,18 @@ def test_walls_are_drawn_where_they_are_cut_flat(dim: int) -> None:
     """However nodes move, the surface of a piece inside a body that is drawn encloses what its flat one does, though it
     has other points; with a crack in it at rest, where the sides of that lie on each other."""
     mesh, rng = lattice(*(8,) * dim), np.random.default_rng(dim)
-    skeleton, x = Skeleton(mesh), mesh.points
+    skeleton, x = EntityNumbering(mesh), mesh.points
     inner = ((x >= 2) & (x <= 6)).all(axis=1).astype(int)
     around = separated(skeleton, inner)
     crack = separated(skeleton, x[:, 0] > 4) & ~around & (x[skeleton.edges].mean(axis=1)[:, 1] < 4)
     for broken, share in ((around, 0.2), (around | crack, 0.0)):
         pattern, u = patterns(skeleton, broken), share * rng.random(x.shape)
-        flat, drawn = split_of_pieces(skeleton, pattern), split(skeleton, pattern)
-        of_flat = whole(flat, skeleton, pattern, flat.points).drawn_in(rng.uniform(0.5, 1.0, len(flat.points)))
+        flat, drawn = build_fragment_surface(skeleton, pattern), build_split_surface(skeleton, pattern)
+        of_flat = whole(flat, skeleton, pattern, flat.points).with_arm_share(rng.uniform(0.5, 1.0, len(flat.points)))
         before = whole(drawn, skeleton, pattern, drawn.points)
-        after = laid(before, skeleton, pattern, of_flat)
+        after = project_onto_fragments(before, skeleton, pattern, of_flat)
         each = [
-            enclosed(places(u), made.elements, inner[made.follow.first_parent[made.elements[:, 0]]], 2)[0][1]
+            enclosed(places(u), made.elements, inner[made.parents.first_parent[made.elements[:, 0]]], 2)[0][1]
             for made, places in ((flat, of_flat), (drawn, after), (drawn, before))
         ]
         assert each[1] == pytest.approx(each[0], rel=1e-12) and abs(each[2] - each[0]) > 1e-2 * each[0]

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.contact.obstacle import Obstacle
 from fracsim.contact.shapes import Sphere
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.convex_decomposition import Solid, convex_parts
 from fracsim.rigid.engine import Engine
@@ -275,7 +275,7 @@ def test_flat_parts_are_made_a_little_thick() -> None:
 def test_shapes_of_pieces_lie_where_the_split_surface_is() -> None:
     """A block cut across: hulls of each piece end at the cut; what has not changed is not made again."""
     mesh = lattice(4, 2, 2)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     broken = separated(skeleton, (mesh.points[:, 0] > 2.5).astype(int))
     geometry = Geometry(mesh)
     whole = geometry.shapes({})
@@ -293,7 +293,7 @@ def test_shapes_are_the_same_to_the_last_digit_however_the_cracks_got_there() ->
     """A block in halves of which one edge more breaks, cut a hair elsewhere: hulls, outermost points and moments are
     those of a geometry that has not seen the halves before, as after a restart."""
     mesh = lattice(4, 2, 2)
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     broken = separated(skeleton, (mesh.points[:, 0] > 1.5).astype(int))
     geometry = Geometry(mesh)
     geometry.shapes({0: (patterns(skeleton, broken), np.where(broken, 0.5, np.nan))})

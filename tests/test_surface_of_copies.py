@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.output.surface.body_surface import Surface
 from fracsim.output.surface.instance_surface import SurfaceOfCopies
 from fracsim.rigid.instance_placement import Place, Poses, placed
@@ -21,7 +21,7 @@ def test_it_is_that_of_the_mesh_of_all_copies() -> None:
     mesh, still = lattice(3, 2, 2), np.zeros(3)
     places = [Place(np.array([5.0 * k, 0, 0]), np.array([0.1 * k, 0.2, 0]), still, still) for k in range(3)]
     whole, copies = placed(mesh, places), SurfaceOfCopies(mesh, Poses.of(places), DENSITY)
-    expected, skeleton = Surface(whole, DENSITY), Skeleton(whole)
+    expected, skeleton = Surface(whole, DENSITY), EntityNumbering(whole)
     assert copies.edge_count == len(skeleton.edges)
     label = np.zeros(len(whole.points), int)
     pattern, broken = np.zeros(len(whole.cells), np.uint8), np.zeros(len(skeleton.edges), bool)
@@ -36,7 +36,7 @@ def test_it_is_that_of_the_mesh_of_all_copies() -> None:
         assert np.array_equal(copies.names, expected.names)
         assert copies.volume == pytest.approx(expected.volume)
         assert copies.mass == pytest.approx(expected.mass)
-        assert np.array_equal(copies.split.piece_of_node, expected.split.piece_of_node)
+        assert np.array_equal(copies.split.node_fragment, expected.split.node_fragment)
         for mine_rows, rows in zip(rows_of(copies), rows_of(expected), strict=True):
             assert np.allclose(mine_rows, rows)
 
@@ -45,7 +45,7 @@ def rows_of(surface: Surface) -> list[Values]:
     """Middles (m, 3) of the triangles, in some order of places, and (m, 4) their pieces, cells, edges and origins."""
     made = surface.split
     middle = made.points[made.elements].mean(axis=1)
-    piece = surface.names[made.piece_of_point[made.elements[:, 0]]]
+    piece = surface.names[made.point_fragment[made.elements[:, 0]]]
     order = np.lexsort((piece, *np.round(middle, 9).T))
     return [middle[order], np.column_stack([piece, made.cell, made.edge, made.origin])[order]]
 
@@ -55,7 +55,7 @@ def test_pieces_of_earlier_frames_have_their_names_again() -> None:
     mesh, still = lattice(3, 1, 1), np.zeros(3)
     places = [Place(np.array([5.0 * k, 0, 0]), still, still, still) for k in range(2)]
     seen, again = (SurfaceOfCopies(mesh, Poses.of(places), DENSITY) for _ in range(2))
-    skeleton = Skeleton(placed(mesh, places))
+    skeleton = EntityNumbering(placed(mesh, places))
     x = np.tile(mesh.points[:, 0], 2)
     first, second = ((x > 1.5) & (np.arange(len(x)) >= len(x) // 2)), x > 0.5
     early = separated(skeleton, first.astype(int))

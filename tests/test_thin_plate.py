@@ -11,7 +11,7 @@ import trimesh
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.mesh.split_surface.closed_surface import split
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.contact_records import Touches
 from fracsim.rigid.contact_solver import HARD
@@ -48,9 +48,9 @@ def scene_of(thick: float, speed: float, step: float) -> RigidScene:
 def surfaces(stepper: RigidStepper, bodies: Bodies) -> Values:
     """(m, 3, 3) triangles of the split surface of the pieces, where they are."""
     copy, skeleton = stepper.copies.copy(0), stepper._geometry.skeleton
-    made = split(skeleton, *copy.damage())
+    made = build_split_surface(skeleton, *copy.damage())
     at_rest = made.points + stepper._geometry.poses.place[0]
-    return bodies.to_space(at_rest, made.piece_of_point)[made.elements]
+    return bodies.to_space(at_rest, made.point_fragment)[made.elements]
 
 
 class Watch:

@@ -192,7 +192,7 @@ class Touching:
         forces = np.zeros_like(self.skin.rest)
         for each in self.touching():
             forces[each.points] += each.normal + each.friction
-        return self.skin.follow.handed_down(forces)
+        return self.skin.follow.assemble_to_nodes(forces)
 
     def rubbed(self, number: int) -> tuple[float, float]:
         """Work of friction on the body in the step, and what of it an obstacle does by its own way, this rank's share,

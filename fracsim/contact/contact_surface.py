@@ -24,9 +24,9 @@ from scipy.sparse import bsr_matrix, csr_matrix, kron
 
 from ..mesh.domain import Domain
 from ..mesh.parallel import gather
-from ..mesh.split_surface.local_surface import Following, LocalSurface
-from ..mesh.split_surface.point_matching import found_again
-from ..mesh.split_surface.surface_map import Places
+from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
+from ..mesh.split_surface.point_matching import match_points
+from ..mesh.split_surface.surface_map import SurfaceMap
 from .facet_contact import SOFTEN, Facets
 
 Values = npt.NDArray[np.float64]
@@ -56,14 +56,14 @@ class Known:
     def again(self, rows: Values, width: float) -> tuple[Values, Values]:
         """(n,) shares that the copies `rows` begin with, and gaps that they must keep: all of `width`, if new."""
         share, gap = np.ones(len(rows)), np.full(len(rows), width)
-        at = found_again(self.rows, rows)
+        at = match_points(self.rows, rows)
         share[at[at >= 0]], gap[at[at >= 0]] = self.share[at >= 0], self.gap[at >= 0]
         return share, np.where(np.isnan(gap), width, np.minimum(gap, width))
 
 
 def drawn_in(
-    at: Places, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
-) -> tuple[Places, Ints]:
+    at: SurfaceMap, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
+) -> tuple[SurfaceMap, Ints]:
     """Points `which` (k,) drawn in from `share` (k,) until gaps(x) reach `wanted` (k,), m; and those that have no room,
     whose shares stay. `u`: (nodes, d) displacements, m."""
     found, left = at.share.copy(), np.arange(len(which))
@@ -71,15 +71,15 @@ def drawn_in(
     for part in SHARES:
         trial = part * share[left]
         # of what does not move: round-off
-        fits = gaps(at.some(u, which[left], trial)) >= wanted[left] - 1e-9 * abs(wanted[left])
+        fits = gaps(at.evaluate_points(u, which[left], trial)) >= wanted[left] - 1e-9 * abs(wanted[left])
         found[which[left[fits]]] = trial[fits]
         left = left[~fits]
         if not len(left):
             break
-    return at if np.array_equal(found, at.share) else at.drawn_in(found), which[left]
+    return at if np.array_equal(found, at.share) else at.with_arm_share(found), which[left]
 
 
-def uncut(at: Places, u: Values, elements: Ints, cut: Callable[[Values], Flags]) -> Places:
+def uncut(at: SurfaceMap, u: Values, elements: Ints, cut: Callable[[Values], Flags]) -> SurfaceMap:
     """Copies of elements (m, d) that are `cut` drawn in until none is, or they are at their nodes. `cut`: of points at
     x (n, d), m, (m,) flags. `u`: (nodes, d) displacements, m."""
     for part in NEARER:
@@ -89,19 +89,19 @@ def uncut(at: Places, u: Values, elements: Ints, cut: Callable[[Values], Flags])
             break
         share = at.share.copy()
         share[tight] *= part
-        at = at.drawn_in(share)
+        at = at.with_arm_share(share)
     return at
 
 
-def let_out(at: Places, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> Places:
+def let_out(at: SurfaceMap, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> SurfaceMap:
     """Points that were drawn in go out by OUT where gaps stay `wanted`, m."""
     inside = np.flatnonzero(at.share < 1)
     if not len(inside):
         return at
     trial, share = np.minimum(at.share[inside] + OUT, 1.0), at.share.copy()
-    fits = gaps(at.some(u, inside, trial)) >= wanted
+    fits = gaps(at.evaluate_points(u, inside, trial)) >= wanted
     share[inside[fits]] = trial[fits]
-    return at.drawn_in(share)
+    return at.with_arm_share(share)
 
 
 type Gaps = Callable[[Values], Values]  # (n,) distances of places (n, d) to what is nearest, m
@@ -121,7 +121,7 @@ class Skin:
         """`width`: of the barrier, m (collective)."""
         self._domain, self._width, self.comm = domain, width, domain.comm
         self._surface = LocalSurface(domain)
-        self.follow = Following(domain, self._surface)
+        self.follow = ParentMatrix(domain, self._surface)
         self.area: Values = self._surface.area
         self._every: Facets | None = None
         self._kept: tuple[Values, Ints, Facets] | None = None  # of which areas, and facets left out
@@ -153,7 +153,7 @@ class Skin:
         self._cut = np.flatnonzero(cuts(every, x) <= 0)
 
     @property
-    def at(self) -> Places:
+    def at(self) -> SurfaceMap:
         """Where the points are."""
         return self._surface.at
 
@@ -174,7 +174,7 @@ class Skin:
     @property
     def edge(self) -> float:
         """Of the body's mesh in the mean, m (collective)."""
-        return self._domain.mean_edge
+        return self._domain.mean_edge_length
 
     def places(self, u: Values) -> Values:
         """(n, d) x of the points at the owned displacements u, m (collective)."""
@@ -219,9 +219,9 @@ class Skin:
         old, rows, cut = self._surface.at, self._surface.identity(), self._named(self._cut)
         gap = np.where(self.area > 0, gaps(self.places(u)), np.nan)
         known = Known.of(rows, old.share[old.copies], gap[old.copies], self._width)
-        self._surface.follow_damage(pattern)
+        self._surface.update_damage(pattern)
         self.follow.destroy()
-        self.follow, self._every, self._kept = Following(self._domain, self._surface), None, None
+        self.follow, self._every, self._kept = ParentMatrix(self._domain, self._surface), None, None
         at, nodal = self._surface.at, self.follow.nodal(u)
         share, gap = known.again(self._surface.identity(), self._width)
         self._surface.at, out = drawn_in(at, nodal, at.copies, share, gap, gaps)
@@ -229,7 +229,7 @@ class Skin:
         if cuts is not None:
             new = np.zeros(len(at.share), bool)
             new[at.copies] = True
-            again = found_again(rows, self._surface.identity())
+            again = match_points(rows, self._surface.identity())
             new[at.copies[again[again >= 0]]] = False
             self._cut = self._known_again(cut)
             self._spare_new(new, nodal, gaps, cuts)
@@ -246,7 +246,7 @@ class Skin:
                 break
             share = at.share.copy()
             share[tight] *= IN
-            self._surface.at = at.drawn_in(share)
+            self._surface.at = at.with_arm_share(share)
         lost = np.flatnonzero(new & (self.area > 0))
         lost = lost[gaps(self._surface.at(u)[lost]) <= 0]
         if len(lost):
@@ -275,7 +275,7 @@ class Skin:
         if cuts is not None and (at is not before or len(out) or len(self._cut)):
             self._make_room_for_facets(before, none, nodal, cuts)
 
-    def _make_room_for_facets(self, before: Places, none: npt.NDArray[np.bool_], u: Values, cuts: Cuts) -> None:
+    def _make_room_for_facets(self, before: SurfaceMap, none: npt.NDArray[np.bool_], u: Values, cuts: Cuts) -> None:
         """Points that went out go back where a facet would feel it; facets come back that feel nothing."""
         at = self._surface.at
         moved = (at.share != before.share) | none
@@ -285,7 +285,7 @@ class Skin:
         if len(back):
             share = at.share.copy()
             share[back] = before.share[back]
-            self._surface.at = at.drawn_in(share)
+            self._surface.at = at.with_arm_share(share)
         if len(self._cut):
             gap = cuts(self._all_facets(), self._surface.at(u))[self._cut]
             if (gap >= self._width).any():
@@ -303,7 +303,7 @@ class Skin:
         if not len(rows):
             return np.empty(0, np.int64)
         every = np.sort(self._all_facets().corners, axis=1)
-        at = found_again(rows, self._surface.identity(np.arange(len(self.area)))).reshape(-1, every.shape[1])
+        at = match_points(rows, self._surface.identity(np.arange(len(self.area)))).reshape(-1, every.shape[1])
         at = np.sort(at[(at >= 0).all(axis=1)], axis=1)
         _, where = np.unique(np.concatenate([at, every]), axis=0, return_inverse=True)
         return np.flatnonzero(np.isin(where.reshape(-1)[len(at) :], where.reshape(-1)[: len(at)]))
@@ -324,7 +324,7 @@ class Skin:
             return
         self._cut = cut
         if share is not self._surface.at.share:
-            self._surface.at = self._surface.at.drawn_in(share)
+            self._surface.at = self._surface.at.with_arm_share(share)
         self.area = area
 
     def saved(self) -> Values:
@@ -340,10 +340,10 @@ class Skin:
     def restore(self, rows: Values) -> None:
         """Be again what `saved` gave."""
         at = self._surface.at
-        place = found_again(rows[:, :-2], self._surface.identity())
+        place = match_points(rows[:, :-2], self._surface.identity())
         which, share = at.copies[place[place >= 0]], np.ones(len(at.share))
         share[which] = rows[place >= 0, -2]
-        self._surface.at = at.drawn_in(share)
+        self._surface.at = at.with_arm_share(share)
         self._leave_out(which[rows[place >= 0, -1] > 0])
 
     def saved_cut(self) -> Values:
@@ -364,7 +364,7 @@ class Skin:
         self.follow.destroy()
 
 
-def clear_of(at: Places, u: Values, gaps: Gaps) -> Places:
+def clear_of(at: SurfaceMap, u: Values, gaps: Gaps) -> SurfaceMap:
     """Places whose copies are drawn in where they would lie in an obstacle, as the points are that touch."""
     inside = at.copies[gaps(at(u))[at.copies] <= 0]
     return drawn_in(at, u, inside, at.share[inside], np.full(len(inside), TINY), gaps)[0] if len(inside) else at

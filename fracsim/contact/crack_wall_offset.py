@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.split_surface.closed_surface import Split
+from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import CRACK
 
 Values = npt.NDArray[np.float64]
@@ -25,10 +25,10 @@ Flags = npt.NDArray[np.bool_]
 MOST = 0.4  # of the way to the nodes: what slivers allow
 
 
-def receded(made: Split, gap: float) -> Values:
+def receded(made: SplitSurface, gap: float) -> Values:
     """(n, d) reference places, m, whose opposite walls are `gap` m apart, where the shape of the cells allows it."""
-    start = made.follow.start
-    arm = np.add.reduceat(made.follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
+    start = made.parents.start
+    arm = np.add.reduceat(made.parents.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     length = np.linalg.norm(arm, axis=1)
     outward = arm / np.where(length > 0, length, 1.0)[:, None]
     cosine = _least_cosine(made, outward)
@@ -38,7 +38,7 @@ def receded(made: Split, gap: float) -> Values:
     return result
 
 
-def _least_cosine(made: Split, outward: Values) -> Values:
+def _least_cosine(made: SplitSurface, outward: Values) -> Values:
     """(n,) the least cosine between `outward` (n, d) and the normals of the crack's walls at each point; inf: none."""
     corners = made.elements[made.origin == CRACK]
     cosine = np.einsum("ekj,ej->ek", outward[corners], normals(made.points[corners]))

@@ -18,11 +18,11 @@ from scipy.sparse import csr_matrix, kron
 
 from ..errors import InputError
 from ..mechanics.low_rank_springs import stiff_directions
-from ..mesh.split_surface.closed_surface import split
-from ..mesh.split_surface.entity_numbering import Skeleton
-from ..mesh.split_surface.fragment_surface import is_same_solid, laid, split_of_pieces
-from ..mesh.split_surface.point_matching import found_again, identity
-from ..mesh.split_surface.surface_map import Places, whole
+from ..mesh.split_surface.closed_surface import build_split_surface
+from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
+from ..mesh.split_surface.point_matching import match_points, point_identity
+from ..mesh.split_surface.surface_map import SurfaceMap, whole
 from ..meshes.text import format_point
 from .crack_wall_offset import receded
 from .ipc_pairs import Pairs, longest
@@ -75,7 +75,7 @@ class Surface:
 
     def __init__(
         self,
-        skeleton: Skeleton,
+        skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
         law: Law,
         u: Values,
@@ -85,7 +85,9 @@ class Surface:
         """`u`: (nodes, d) where the body is, m; `before`: the surface until now. `cut`: (E,) where edges are cut, for
         contact between pieces (split.build); all others are cut in the middle, which leaves both sides most room."""
         self._skeleton, self._pattern, self._of_pieces = skeleton, pattern, law.pieces
-        self.made = split_of_pieces(skeleton, pattern, cut) if law.pieces else split(skeleton, pattern)
+        self.made = (
+            build_fragment_surface(skeleton, pattern, cut) if law.pieces else build_split_surface(skeleton, pattern)
+        )
         self._rest = receded(self.made, self.gap * law.distance)
         self.at = whole(self.made, skeleton, pattern, self._rest)
         self._how = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
@@ -100,18 +102,18 @@ class Surface:
             self._check_apart()
         else:
             share, load = self._known(before, u)
-            self.at = self.at.drawn_in(share)
+            self.at = self.at.with_arm_share(share)
             self._settle(u, load)
 
     def serves(self, pattern: npt.NDArray[np.uint8]) -> bool:
         """Whether it is the surface of these patterns (C,) too: most edges break within pieces."""
-        if same := self._of_pieces and is_same_solid(self._skeleton, pattern, self._pattern):
+        if same := self._of_pieces and has_same_fragments(self._skeleton, pattern, self._pattern):
             self._pattern = pattern
         return same
 
-    def laid(self, at: Places) -> Places:
+    def laid(self, at: SurfaceMap) -> SurfaceMap:
         """All walls of the body, those between pieces where they are here."""
-        return laid(at, self._skeleton, self._pattern, self.at)
+        return project_onto_fragments(at, self._skeleton, self._pattern, self.at)
 
     def _check_apart(self) -> None:
         """InputError where a body at rest cuts or touches itself."""
@@ -151,7 +153,7 @@ class Surface:
             return
         self._pause = pause
         if share is not self.at.share:
-            self.at = self.at.drawn_in(share)
+            self.at = self.at.with_arm_share(share)
         if out is not self._out:
             self.pairs = self._all_pairs()
             self._leave_out(out)
@@ -159,14 +161,16 @@ class Surface:
     # --- what is crowded ---
 
     def _identity(self, points: Ints | None = None) -> Values:
-        return identity(self.made, self.at.copies if points is None else points, np.arange(self._nodes), self._size)
+        return point_identity(
+            self.made, self.at.copies if points is None else points, np.arange(self._nodes), self._size
+        )
 
     def _known(self, before: Surface, u: Values) -> tuple[Values, Values]:
         """(n,) shares and pressures, Pa, that points had before; of new ones 1 and 0. Nodes have kept their numbers."""
         share, load = np.ones(len(self.made.points)), np.zeros(len(self.made.points))
         pressure, old = before.pairs.pressure(before.at(u)), before.at.copies
         which = np.flatnonzero((pressure[old] > 0) | (before.at.share[old] < 1))
-        again = found_again(before._identity()[which], self._identity())
+        again = match_points(before._identity()[which], self._identity())
         at = self.at.copies[again[again >= 0]]
         share[at], load[at] = before.at.share[old[which]][again >= 0], pressure[old[which]][again >= 0]
         nodes = min(old.min(initial=len(pressure)), self.at.copies.min(initial=len(load)))
@@ -193,9 +197,9 @@ class Surface:
         if changed:
             may = np.unique(self.made.elements[self._walls]) if self.at_once else tight
             end = (x := self.at(u)).copy()
-            end[may] = self.at.some(u, may, np.minimum(LEAST, self.at.share[may]))
+            end[may] = self.at.evaluate_points(u, may, np.minimum(LEAST, self.at.share[may]))
             self.pairs.look_along(x, end)  # once for all the shares that follow
-            self.at = self.at.drawn_in(share)
+            self.at = self.at.with_arm_share(share)
         return changed
 
     def _settle(self, u: Values, load: Values) -> None:
@@ -210,7 +214,7 @@ class Surface:
         if len(crowded):  # what is out is to come back as it was, not smaller each time
             gone = np.ones(len(start), bool)
             gone[np.delete(self.made.elements, crowded, axis=0)] = False
-            self.at = self.at.drawn_in(np.where(gone, start, self.at.share))
+            self.at = self.at.with_arm_share(np.where(gone, start, self.at.share))
 
     def make_room(self, u: Values) -> None:
         """A step begins at u (nodes, d), m: what was drawn in or left out comes back where there is room.
@@ -236,16 +240,16 @@ class Surface:
 
     def _let_out(self, u: Values, load: Values) -> None:
         before = self.at.share
-        self.at = self.at.drawn_in(np.minimum(before / IN, 1.0))
+        self.at = self.at.with_arm_share(np.minimum(before / IN, 1.0))
         for _ in range(2):  # what stays in may be in the way of its neighbours
             crowded = self._crowded(u, load)
             if not len(crowded):
                 return
             share, tight = self.at.share.copy(), np.unique(self.made.elements[crowded])
             share[tight] = before[tight]
-            self.at = self.at.drawn_in(share)
+            self.at = self.at.with_arm_share(share)
         if len(self._crowded(u, load)):
-            self.at = self.at.drawn_in(before)
+            self.at = self.at.with_arm_share(before)
 
     def is_near(self, x: Values, other: Values | None, *, again: bool) -> bool:
         """Whether x (n, d) is so near to the place of the last tangent that Newton's method is at its end; `again`: it

@@ -27,7 +27,7 @@ from ..mechanics.surface_data import SurfaceData
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
-from ..mesh.split_surface.surface_map import Places
+from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.text import AXES
 from .drawing import Drawings
 from .ipc_pairs import KEPT, longest
@@ -143,7 +143,7 @@ class Solids(SelfContact):
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: dict[int, Obstacle], law: Law) -> None:
         """`obstacles`: by their number in the study. InputError where one overlaps the body at rest (collective)."""
-        self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge
+        self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge_length
         self._drawings = Drawings(self.obstacles, domain.lower, domain.upper)
         self._solids = on_root(domain.comm, lambda: [_standing(*each, edge) for each in obstacles.items()]) or []
         self._from = [each.placed(0.0).pose for each in self.obstacles]
@@ -160,7 +160,7 @@ class Solids(SelfContact):
     @property
     def edge(self) -> float:
         """Of the body's mesh in the mean, m."""
-        return self._domain.mean_edge
+        return self._domain.mean_edge_length
 
     @property
     def width(self) -> float:
@@ -184,10 +184,10 @@ class Solids(SelfContact):
         self._x = self._start = self._tangent_at = self._rubbing = None
         self._moved = True
 
-    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Drawn in as the walls are that touch."""
         assert self._surface is not None
-        return at.drawn_in(np.minimum(self._surface.at.share, at.share))
+        return at.with_arm_share(np.minimum(self._surface.at.share, at.share))
 
     def where(self, t: float) -> list[Placed]:
         """Each solid at time t, s (not collective)."""
@@ -338,7 +338,7 @@ class Solids(SelfContact):
         if not self.comm.bcast(aside is not None):
             return u
         by = np.asarray(self._gather.scatter(aside)).reshape(-1)
-        return np.asarray(u + level.fraction * (self._domain.straight(by) if self.law.straight else by))
+        return np.asarray(u + level.fraction * (self._domain.with_straight_edges(by) if self.law.straight else by))
 
     def _guided(self, front: Front, start: Values, end: Values) -> Values:
         """(nodes, 3) where the body gets to on its way from the `start` to the `end` of the step, on rank 0."""

@@ -19,7 +19,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
-from ..mesh.split_surface.entity_numbering import Skeleton
+from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .ipc_friction import Friction
 from .ipc_pairs import KEPT, NONE, Pairs
 from .ipc_surface import Law, Surface
@@ -274,7 +274,7 @@ class Front(Surface):
 
     def __init__(
         self,
-        skeleton: Skeleton,
+        skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
         solids: Sequence[Standing],
         law: Law,

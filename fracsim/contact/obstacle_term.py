@@ -21,7 +21,7 @@ from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.surface_data import SurfaceData
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
-from ..mesh.split_surface.surface_map import Places
+from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.text import AXES
 from .contact_state import Touching
 from .contact_surface import clear_of, uncut
@@ -195,7 +195,7 @@ class Obstacles(Touching, Term):
         """Each obstacle at the time t of the state, s (not collective)."""
         return [each.placed(t) for each in self.obstacles]
 
-    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Drawn in where it would lie in an obstacle, or be cut by one that facets feel, as what touches is."""
         placed = self.where(t)
         at = clear_of(at, u, partial(least_distance, placed))

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.split_surface.local_surface import Following
-from ..mesh.split_surface.surface_map import Places
+from ..mesh.split_surface.local_surface import ParentMatrix
+from ..mesh.split_surface.surface_map import SurfaceMap
 
 Values = npt.NDArray[np.float64]
 SOME = 1e-6  # weights below this share of all of a point are round-off of arms that cancel
@@ -67,7 +67,7 @@ class Penalty:
 class Carried:
     """What points carry of the nodes that they follow."""
 
-    def __init__(self, at: Places, follow: Following, mass: Values) -> None:
+    def __init__(self, at: SurfaceMap, follow: ParentMatrix, mass: Values) -> None:
         """`mass`: (owned dofs,) lumped, kg (collective)."""
         self._follow, self._size = follow, abs(at.weights)
         self._sum = np.asarray(self._size.sum(axis=1)).ravel()

@@ -31,7 +31,7 @@ from dolfinx import fem
 
 from ..mesh.domain import Domain
 from ..mesh.parallel import gather
-from ..mesh.split_surface.point_matching import found_again
+from ..mesh.split_surface.point_matching import match_points
 from .friction import tangential
 from .laws import Law
 from .node_contact import Touch
@@ -204,7 +204,7 @@ class ExplicitObstacles(Obstacles):
 
     def _again(self, spring: Springs, rows: Values) -> Springs:
         """Springs of the points with the identity `rows`, as the surface is now."""
-        at = found_again(rows, self.skin.identity(np.arange(len(self.skin.area)))) if len(rows) else spring.points
+        at = match_points(rows, self.skin.identity(np.arange(len(self.skin.area)))) if len(rows) else spring.points
         kept = np.flatnonzero(at >= 0)
         kept = kept[np.argsort(at[kept])]
         return Springs(at[kept], spring.slip[kept], spring.stiffness[kept])
@@ -247,7 +247,7 @@ class ExplicitObstacles(Obstacles):
         """Springs of the points of this rank, from rows of all ranks as `saved` has them. Where several had a spring at
         the same point that of this rank counts, or of the lowest, for the share that this rank has now."""
         rank, area, known, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
-        at = found_again(known, self.skin.identity(np.arange(len(self.skin.area))))
+        at = match_points(known, self.skin.identity(np.arange(len(self.skin.area))))
         order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, at))
         order = order[at[order] >= 0]
         points, first = np.unique(at[order], return_index=True)

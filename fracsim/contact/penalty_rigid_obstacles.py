@@ -17,7 +17,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .laws import Law
 from .obstacle import Flight, FreeObstacle, Obstacle
 from .penalty_obstacles import ExplicitObstacles
@@ -108,7 +108,7 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
         placed = self._course.placed[number]
         near = np.flatnonzero(placed.distance(self.x) < NEAR * self.law.barrier.width)
         resistance = each.resistance(self.x[near], self.stiffness[near], placed)
-        return each.fastest(total(self.comm, resistance.reshape(-1)).reshape(resistance.shape), placed)
+        return each.fastest(sum_over_ranks(self.comm, resistance.reshape(-1)).reshape(resistance.shape), placed)
 
     # --- a step ---
 
@@ -127,7 +127,7 @@ class ExplicitFreeObstacles(Flights, ExplicitObstacles):
         super().accept_step()
         for number, each in self.free.items():
             placed, found = self._course.placed[number], self.touching()[number]
-            worked = each.arrive(placed, total(self.comm, on_obstacle(found, self.x, placed.pose)))
+            worked = each.arrive(placed, sum_over_ranks(self.comm, on_obstacle(found, self.x, placed.pose)))
             self._worked[number] = 0.0 if self.comm.rank else -worked
 
     def step_work(self) -> tuple[float, float]:

@@ -28,8 +28,8 @@ from mpi4py import MPI
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
-from ..mesh.split_surface.entity_numbering import Skeleton
-from ..mesh.split_surface.point_matching import found_again
+from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.point_matching import match_points
 from .friction import tangential
 from .ipc_pairs import areas
 from .ipc_surface import Law, Surface
@@ -105,7 +105,7 @@ class Pushes(Surface):
 
     def __init__(
         self,
-        skeleton: Skeleton,
+        skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
         law: Law,
         u: Values,
@@ -139,7 +139,7 @@ class Pushes(Surface):
         nodes = min(old.min(initial=len(pairs.by)), new.min(initial=len(most)))  # have kept their numbers
         now = np.full(len(pairs.by), NONE)
         now[:nodes] = np.arange(nodes)
-        again = found_again(before._identity(), self._identity())
+        again = match_points(before._identity(), self._identity())
         now[old[again >= 0]] = new[again[again >= 0]]
         held, by = np.zeros(len(most)), np.full((len(most), pairs.by.shape[1]), NONE)
         slip = np.zeros(by.shape)

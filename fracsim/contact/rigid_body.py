@@ -40,7 +40,7 @@ from scipy.sparse import csr_matrix
 
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .node_contact import Grip, Jointly, Touch
 from .obstacle import Flight, FreeObstacle
 from .pose import Pose, bend, jacobian, second_order_turn, turning
@@ -209,7 +209,9 @@ class Taken:
     def share(self, x: Values, comm: MPI.Comm = MPI.COMM_SELF) -> float:
         """Of the way, where the points of all ranks of `comm` are at x (n, d) now: the nearest place on it
         (collective)."""
-        gone, length = total(comm, [float(np.vdot(x - self.x, self.moved)), float(np.vdot(self.moved, self.moved))])
+        gone, length = sum_over_ranks(
+            comm, [float(np.vdot(x - self.x, self.moved)), float(np.vdot(self.moved, self.moved))]
+        )
         return float(np.clip(gone / length, 0.0, 1.0)) if length > 0 else 0.0
 
     def at(self, share: float) -> Values:

@@ -26,7 +26,7 @@ from mpi4py import MPI
 
 from ..forms.schemes import Scheme
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .laws import Law
 from .node_contact import Touch
 from .obstacle import FreeObstacle, Obstacle
@@ -186,7 +186,7 @@ class FreeObstacles(Flights):
         """Phi_xz and Phi_zz^-1 of each obstacle that is touched and under way (collective)."""
         if not self._is_under_way() or not (touches := self.touching()) or self._waits:
             return []
-        counts = total(self.comm, np.array([len(touches[number].points) for number in self.free]))
+        counts = sum_over_ranks(self.comm, np.array([len(touches[number].points) for number in self.free]))
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
         if self._mutual is not None and touched:
             U = np.concatenate([self._mixed(number, touches[number]) for number in self.free], axis=1)
@@ -198,7 +198,7 @@ class FreeObstacles(Flights):
         by_z = self.free[number].by_z(found, self.x, exact=self._exact)
         forces = np.zeros((len(self.x), *by_z.shape[1:]))
         forces[found.points] = by_z
-        return np.stack([self.skin.follow.handed_down(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
+        return np.stack([self.skin.follow.assemble_to_nodes(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
 
     def _compliance(self, number: int) -> Values:
         """(k, k) Phi_zz^-1 (collective)."""

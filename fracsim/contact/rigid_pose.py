@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .contact_surface import Skin
 from .facet_contact import Facets
 from .laws import Repulsion
@@ -111,7 +111,9 @@ class FreePose:
         moment (p,), gave it (collective)."""
         pose = self.placed.pose
         pushed = (
-            others + total(around.skin.comm, on_obstacle(found, around.x, pose)) + self.stops.force(pose, around.placed)
+            others
+            + sum_over_ranks(around.skin.comm, on_obstacle(found, around.x, pose))
+            + self.stops.force(pose, around.placed)
         )
         self.flight = self.step.arrived(self.z, pushed)
         self._found = self.z
@@ -197,7 +199,7 @@ class FreePose:
     def pulled(self, found: Touch, around: Around, moved: Values, *, exact: bool) -> Values:
         """(k,) change of the gradient of Phi by z with the points, which go by `moved` (n, d), m (collective)."""
         mixed = self.by_z(found, around.x, exact=exact)
-        return total(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
+        return sum_over_ranks(around.skin.comm, np.einsum("kdz,kd->z", mixed, moved[found.points]))
 
     def goes(self, around: Around, moved: Values, dz: Values) -> Values:
         """(p,) increment of its pose as Newton's method moves it by dz (k,) and the points by `moved` (n, d), m."""
@@ -230,7 +232,7 @@ def _summed(mine: Push, comm: MPI.Comm) -> Push:
     """Of the points of all ranks (collective)."""
     parts = [np.atleast_1d(mine.energy), mine.gradient, mine.hessian.reshape(-1), mine.stiffness.reshape(-1)]
     p = len(mine.gradient)
-    energy, gradient, *both = np.split(total(comm, np.concatenate(parts)), [1, 1 + p, 1 + p + p * p])
+    energy, gradient, *both = np.split(sum_over_ranks(comm, np.concatenate(parts)), [1, 1 + p, 1 + p + p * p])
     return Push(float(energy[0]), gradient, *(each.reshape(p, p) for each in both))
 
 

@@ -21,9 +21,9 @@ from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.low_rank_springs import StiffCoupling
 from ..mechanics.term import Cuts, Term, TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, from_root, on_root, total
-from ..mesh.split_surface.entity_numbering import Skeleton
-from ..mesh.split_surface.surface_map import Places
+from ..mesh.parallel import Gather, from_root, on_root, sum_over_ranks
+from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_friction import Friction
 from .ipc_surface import Law, Surface
 from .laws import stiffening
@@ -51,9 +51,9 @@ class SelfContact(Term):
         self.law, self._domain, self._u = law, domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
-        self._wall = STIFF * domain.mean_edge ** (domain.dim - 2)  # m^(d-2), times a stiffness in Pa
+        self._wall = STIFF * domain.mean_edge_length ** (domain.dim - 2)  # m^(d-2), times a stiffness in Pa
         mesh = _refined(domain) if self._is_refined(law) else domain.source
-        self._skeleton = None if mesh is None else Skeleton(mesh)
+        self._skeleton = None if mesh is None else EntityNumbering(mesh)
         self._gather = gathering(domain, law)
         first = domain.space.dofmap.index_map.local_range[0]
         self._numbers = self._gather(first + np.arange(domain.node_count))  # of input nodes, on rank 0
@@ -102,13 +102,13 @@ class SelfContact(Term):
         """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
         return self._gather(np.asarray(u).reshape(-1, self._domain.dim))
 
-    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Where contact sees the walls: what would be drawn otherwise may overlap by as much as they recede."""
         assert self._surface is not None
         own = self._surface.at
         if self.law.pieces:
             return self._surface.laid(at)
-        return own.drawn_in(np.minimum(own.share, at.share))
+        return own.with_arm_share(np.minimum(own.share, at.share))
 
     def set_cuts(self, cuts: Cuts) -> None:
         """Walls between pieces are where edges are cut."""
@@ -159,7 +159,7 @@ class SelfContact(Term):
 
     def _speed(self, v: Values) -> float:
         """Root mean square of the nodes' speeds, m/s (collective)."""
-        squares, count = total(self.comm, np.array([v @ v, len(v) / self._domain.dim]))
+        squares, count = sum_over_ranks(self.comm, np.array([v @ v, len(v) / self._domain.dim]))
         return float(np.sqrt(squares / count))
 
     def update_displacement(self) -> None:

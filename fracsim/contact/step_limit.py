@@ -198,8 +198,8 @@ def within_reach(skin: Skin, ways: Sequence[Way], start: Values, end: Values) ->
         back, stopped = _brought_back(skin.area, ways, x, follow(end - start))
         if not skin.comm.allreduce(int(stopped.any())):
             return end
-        weight = follow.handed_down(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
-        change = follow.handed_down(back)
+        weight = follow.assemble_to_nodes(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
+        change = follow.assemble_to_nodes(back)
         end = end + np.where(np.abs(weight) > 1e-3, change / np.where(np.abs(weight) > 1e-3, weight, 1.0), 0.0)
     return end
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from ..mesh.parallel import allgather, total
+from ..mesh.parallel import allgather, sum_over_ranks
 from .edge_stress import Simplices, greatest_pull
 from .strength import Strength
 
@@ -73,7 +73,7 @@ class CarriedStress:
     def __call__(self, stress: Values) -> tuple[Values, Flags | None]:
         """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
         graph = self._graph
-        if not total(self._comm, int(graph.damaged.any()))[0]:
+        if not sum_over_ranks(self._comm, int(graph.damaged.any()))[0]:
             return stress, None
         if self._leaves_out:
             return self._cells.carried(stress, graph), ~graph.split

@@ -41,8 +41,8 @@ class EdgeRecord:
         self.cut[held] = cut[held]
         if carried is not None:
             ago = -np.nan_to_num(carried[:, -1], nan=-np.inf)
-            newest = ago <= self.graph.least(ago)
-            columns = [self.graph.least(np.where(newest, each, np.inf)) for each in carried.T]
+            newest = ago <= self.graph.min_over_ranks(ago)
+            columns = [self.graph.min_over_ranks(np.where(newest, each, np.inf)) for each in carried.T]
             self.carried = np.column_stack(columns)
 
     def gathered(self) -> tuple[Ints, Values] | None:

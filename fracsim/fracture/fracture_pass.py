@@ -117,7 +117,7 @@ class Breaking:
         stress, psi = self.evaluate()
         broken, weakened = self._broken(stress, psi) if self._due else (0, 0)
         if broken and self.degradation.idle:
-            broken += self.graph.break_idle()
+            broken += self.graph.break_unloaded_edges()
         before = [each.x.array.copy() for each in self.stress.damage_fields] if broken else []
         lost = self.degradation(weakened > 0, stress, psi)
         if weakened or lost.loss or self._restless:

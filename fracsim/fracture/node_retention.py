@@ -32,8 +32,8 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from ..mesh.node_cells import CellsAround
-from ..mesh.parallel import allgather, total
+from ..mesh.node_cells import NodeCellCount
+from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
 from ..meshes.components import components
 from .criterion import OverloadedEdges
@@ -63,7 +63,7 @@ class Holding:
         self.strength = failing.strength
         domain = graph.domain
         self._map = domain.space.dofmap.index_map
-        self._around = CellsAround(domain)
+        self._around = NodeCellCount(domain)
         pairs = local_edges(domain.dim)
         self._of_node = np.array([(pairs == node).any(axis=1) for node in range(domain.dim + 1)])  # (d + 1, edges)
 
@@ -73,7 +73,7 @@ class Holding:
         edges, load = self._failing(stress, psi)
         fails = np.zeros(len(graph.broken), bool)
         fails[edges] = True
-        fails = graph.on_any_rank(fails) & ~graph.broken
+        fails = graph.any_over_ranks(fails) & ~graph.broken
         if graph.domain.comm.allreduce(int(fails.any())):
             for _ in range(ROUNDS):
                 fails &= ~self._spared(fails, stress)
@@ -103,7 +103,7 @@ class Holding:
         cells, own = cells[own < self._limit], own[own < self._limit]
         spared = np.zeros(len(fails), bool)
         spared[graph.cell_edges[self._chosen(cells, own, of_cell[cells], endangered)]] = True
-        return graph.on_any_rank(spared)
+        return graph.any_over_ranks(spared)
 
     def _own_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
         """(n,) the greatest load over strength of the failing edges (n, edges) of cells, by what these feel
@@ -126,7 +126,7 @@ class Holding:
         """(nodes,) the least of `values` (n, d + 1) at `nodes` on all ranks."""
         result = np.full(self._map.size_local + self._map.num_ghosts, np.inf)
         np.minimum.at(result, nodes, values)
-        return self._graph.least(result, self._map)
+        return self._graph.min_over_ranks(result, self._map)
 
 
 class Joining:
@@ -139,7 +139,7 @@ class Joining:
         self._cells, self._graph, self._strength, self._held = Simplices.of(stress), graph, strength, held
         self._cracks = cracks
         self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
-        self._around = CellsAround(graph.domain)
+        self._around = NodeCellCount(graph.domain)
 
     def __call__(self, edges: npt.NDArray[np.integer], stress: Values) -> Flags:
         """(n,) which of the edges (n,) that fail do so, and which idle ones the graph keeps, under the stress (cells,
@@ -147,13 +147,13 @@ class Joining:
         graph = self._graph
         fails = np.zeros(len(graph.broken), bool)
         fails[edges] = True
-        fails = graph.on_any_rank(fails) & ~graph.broken
-        if total(graph.domain.comm, np.count_nonzero(fails))[0]:
+        fails = graph.any_over_ranks(fails) & ~graph.broken
+        if sum_over_ranks(graph.domain.comm, np.count_nonzero(fails))[0]:
             whole = np.zeros(len(fails), bool)
             whole[graph.cell_edges[~graph.split]] = True
-            joined = ~graph.broken & ~graph.on_any_rank(whole)
+            joined = ~graph.broken & ~graph.any_over_ranks(whole)
             kept = (self._both & ~fails) | joined | self._found(fails, joined, stress)
-            graph.kept, fails = kept, fails & ~kept
+            graph.retained, fails = kept, fails & ~kept
         return np.asarray(fails[edges])
 
     def _found(self, fails: Flags, joined: Flags, stress: Values) -> Flags:
@@ -162,7 +162,7 @@ class Joining:
         bits = 1 << np.arange(graph.cell_edges.shape[1])
         after = ~is_split(graph.domain.dim)[graph.pattern | (fails[graph.cell_edges] @ bits).astype(np.uint8)]
         without = self._around(after) == 0
-        if not total(graph.domain.comm, np.count_nonzero(without & (self._around(~graph.split) > 0)))[0]:
+        if not sum_over_ranks(graph.domain.comm, np.count_nonzero(without & (self._around(~graph.split) > 0)))[0]:
             return np.zeros(len(fails), bool)
         at = np.flatnonzero(~graph.broken & without[graph.edge_nodes].any(axis=1))
         load = self._loads(at, without, stress)

@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 
 from ..mesh.c_library import Float64, Int32, at, load_library, struct_pointer
 from ..mesh.domain import Domain
-from ..mesh.halo import Halo
-from ..mesh.parallel import largest
+from ..mesh.halo import RankHalo
+from ..mesh.parallel import max_over_ranks
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -50,7 +50,7 @@ class NonlocalAverage:
     def __init__(self, domain: Domain, radius: float, kernel: str) -> None:
         self._comm = domain.comm
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
-        self._exchange = Halo(domain.comm, centroids, radius)
+        self._exchange = RankHalo(domain.comm, centroids, radius)
         near = self._exchange(centroids)
         volumes = self._exchange(domain.volumes[:, None])[:, 0]
         order = np.argsort(self._exchange(domain.cell_input[:, None].astype(float))[:, 0], kind="stable")
@@ -77,7 +77,7 @@ class NonlocalAverage:
         column where the values have six. `values` and `size` are 0 on cells that are not active.
         """
         n = values.shape[1]
-        if largest(self._comm, float(np.max(size, initial=0.0))) < bound:
+        if max_over_ranks(self._comm, float(np.max(size, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
         near, pull = self._exchange(values), self._exchange(size[:, None])[:, 0]
         hot = pull >= bound * (1 - 1e-9)  # hairs below the bound: the sums are rounded

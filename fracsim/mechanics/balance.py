@@ -20,7 +20,7 @@ from ufl.core.expr import Expr
 from ..forms.schemes import Scheme
 from ..mesh.dolfinx_compat import apply_lifting
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .contact_time_weights import ContactTimeWeights, acceleration_change
 from .inertia import MassMatrix
 from .jit import CellForm, cell_measure
@@ -252,7 +252,7 @@ class Balance:
     @cached_property
     def _is_held(self) -> bool:
         """Whether the motion of any dof is prescribed (collective the first time)."""
-        return bool(total(self.domain.comm, len(self.motion.owned_dofs))[0])
+        return bool(sum_over_ranks(self.domain.comm, len(self.motion.owned_dofs))[0])
 
     @cached_property
     def limits_newton_steps(self) -> bool:
@@ -262,7 +262,7 @@ class Balance:
     def is_in_contact(self) -> bool:
         """Whether a term that limits steps has a potential at the current u (collective)."""
         limiting = (term for term in self.terms if term.limits_newton_steps)
-        return bool(total(self.domain.comm, sum(abs(term.potential() or 0.0) for term in limiting))[0] > 0)
+        return bool(sum_over_ranks(self.domain.comm, sum(abs(term.potential() or 0.0) for term in limiting))[0] > 0)
 
     def begin_solve(self) -> None:
         """Newton's method sets out on the step, once more where it has failed before."""
@@ -308,14 +308,14 @@ class Balance:
 
         psi is a difference of terms as large as the moduli: 4 eps Y V of it is round-off, with ROUND_OFF of descent.
         """
-        parts = total(self.domain.comm, np.array([term.potential() or 0.0 for term in self.terms]))
+        parts = sum_over_ranks(self.domain.comm, np.array([term.potential() or 0.0 for term in self.terms]))
         return float(parts.sum()), float(np.abs(parts).sum()) + 4e-4 * self._stored_at_strain_one
 
     @cached_property
     def _stored_at_strain_one(self) -> float:
         """Y V, J (collective)."""
         domain = self.domain
-        return float(total(domain.comm, np.sum(self.stress.material.young * domain.volumes))[0])
+        return float(sum_over_ranks(domain.comm, np.sum(self.stress.material.young * domain.volumes))[0])
 
     @cached_property
     def linear(self) -> bool:
@@ -420,7 +420,9 @@ class Balance:
         u = self.u.x.array[: self.owned_dof_count]
         scales = [scale for term in self.terms if (scale := term.reference_forces()) is not None]
         parts = (*scales, self.reactions[self.motion.owned_dofs], u, self.mass.lumped * u if self.c_a else 0.0)
-        *loads, moved, carried = np.sqrt(total(self.domain.comm, np.array([np.sum(np.square(part)) for part in parts])))
+        *loads, moved, carried = np.sqrt(
+            sum_over_ranks(self.domain.comm, np.array([np.sum(np.square(part)) for part in parts]))
+        )
         (stiffness, extent), eps = self._stiffest, np.finfo(float).eps
         return float(max(loads)), float(eps * (stiffness * extent + 8 * (stiffness * moved + self.c_a * carried)))
 
@@ -430,7 +432,7 @@ class Balance:
         domain = self.domain
         dofs = domain.space.dofmap.index_map.size_global * domain.dim
         young = domain.comm.allreduce(float(np.max(self.stress.material.young, initial=0.0)), op=MPI.MAX)
-        return float(young * domain.mean_edge ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
+        return float(young * domain.mean_edge_length ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back; nothing may be asked any more."""

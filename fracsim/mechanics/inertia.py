@@ -230,6 +230,6 @@ def _shared_by_diagonal(assembler: VectorAssembler, density: Expr) -> Values:
     result = fem.Function(domain.space)
     nodes = result.x.array.reshape(-1, domain.dim)
     np.add.at(nodes, domain.cell_nodes, (corner * of_cells)[:, :, None])
-    np.add.at(nodes, domain.cell_middles, (middle * of_cells)[:, :, None])
+    np.add.at(nodes, domain.cell_midside_nodes, (middle * of_cells)[:, :, None])
     result.x.scatter_reverse(la.InsertMode.add)
     return np.asarray(result.x.array[: assembler.owned_dof_count])

@@ -14,7 +14,7 @@ from ufl.core.expr import Expr
 from ..forms.balance import pressure_work, traction_work
 from ..mesh.dolfinx_compat import exterior_facets
 from ..mesh.domain import Domain, Ints
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .jit import compile_form
 from .matrix_assembly import VectorAssembler
 from .term import Term, TimeLevel
@@ -144,11 +144,11 @@ class Pressure(Term):
 
 def surface_area(domain: Domain, facets: Ints) -> float:
     """Of local exterior facets in the body at rest, on all ranks, m^2; in 2D their length, m (collective)."""
-    if domain.is_bent:
+    if domain.has_curved_cells:
         (ds,) = surface_measures(domain, [facets])
         along_x: Any = fem.Constant(domain.mesh, np.eye(domain.dim)[0])
         shares = fem.assemble_vector(compile_form(traction_work(along_x, ufl.TestFunction(domain.space), ds)))
-        return float(total(domain.comm, np.sum(shares.array))[0])
+        return float(sum_over_ranks(domain.comm, np.sum(shares.array))[0])
     cell, opposite = exterior_facets(domain.mesh, facets).reshape(-1, 2).T
     nodes = domain.cell_nodes[cell]
     corners = nodes[np.arange(nodes.shape[1]) != opposite[:, None]].reshape(len(nodes), domain.dim)
@@ -156,7 +156,7 @@ def surface_area(domain: Domain, facets: Ints) -> float:
     sides = x[:, 1:] - x[:, :1]
     gram = np.einsum("nik,njk->nij", sides, sides)
     own = np.sqrt(np.linalg.det(gram)) / (domain.dim - 1)  # of a segment its length, of a triangle half the product
-    return float(total(domain.comm, np.sum(own))[0])
+    return float(sum_over_ranks(domain.comm, np.sum(own))[0])
 
 
 def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:

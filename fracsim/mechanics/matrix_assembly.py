@@ -25,7 +25,7 @@ from petsc4py import PETSc
 
 from ..mesh.dolfinx_compat import assemble_into, block_csr, create_matrix, create_vector, expanded_csr, pattern_of
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .jit import CellForm, SimdKernelCache
 
 if TYPE_CHECKING:
@@ -103,7 +103,9 @@ class TangentAssembler:
         `dead`: (owned cells,) flags of what is left out now.
         """
         had = np.zeros_like(dead) if self._dead is None else self._dead
-        alive, room, back = total(self.form.mesh.comm, np.array([np.sum(~dead), np.sum(~had), np.sum(had & ~dead)]))
+        alive, room, back = sum_over_ranks(
+            self.form.mesh.comm, np.array([np.sum(~dead), np.sum(~had), np.sum(had & ~dead)])
+        )
         if not back and (alive == room or alive > share * room):
             return False
         self._dead = dead.copy()

@@ -26,8 +26,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from ..mesh.node_cells import CellsAround
-from ..mesh.parallel import allgather, total
+from ..mesh.node_cells import NodeCellCount
+from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
 from ..meshes.components import components
 from .extra_couplings import CouplingBuilder
@@ -89,9 +89,9 @@ class NodeTies(Term):
         """`young`: Pa; `mass`: (owned dofs,) lumped, kg; `held`: (nodes,) whose motion is prescribed, ghosts too: they
         are not tied."""
         self._domain, self._u, self._mass, self._held = domain, u, mass, held
-        self.stiffness = TIE_STIFFNESS_FACTOR * young * domain.mean_edge ** (domain.dim - 2)
+        self.stiffness = TIE_STIFFNESS_FACTOR * young * domain.mean_edge_length ** (domain.dim - 2)
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
-        self._coupling, self._around = CouplingBuilder(domain), CellsAround(domain)
+        self._coupling, self._around = CouplingBuilder(domain), NodeCellCount(domain)
         self._lost = 0.0
         input_of = domain.node_input[: domain.node_count]
         self._order = np.argsort(input_of)
@@ -121,7 +121,7 @@ class NodeTies(Term):
         self._pattern, domain = pattern.copy(), self._domain
         without = self._around(~is_split(domain.dim)[pattern]) == 0
         links, own = self._links(pattern, without)
-        if not total(domain.comm, len(own) + len(self.ties.cell))[0]:
+        if not sum_over_ranks(domain.comm, len(own) + len(self.ties.cell))[0]:
             return
         links, nodes = (np.unique(np.concatenate(allgather(domain.comm, each)), axis=0) for each in (links, own))
         stays = np.isin(self.ties.nodes[:, 0], nodes) & self._is_whole(self.ties.cell)
@@ -170,7 +170,9 @@ class NodeTies(Term):
     def _is_whole(self, cells: Ints) -> Flags:
         """(n,) whether cells of the input mesh are (collective)."""
         whole = self._domain.cell_input[~is_split(self._domain.dim)[self._pattern]] if len(cells) else cells
-        return total(self._domain.comm, np.isin(cells, whole).astype(np.int64)) > 0 if len(cells) else cells > 0
+        return (
+            sum_over_ranks(self._domain.comm, np.isin(cells, whole).astype(np.int64)) > 0 if len(cells) else cells > 0
+        )
 
     # --- what it adds to the balance ---
 
@@ -183,7 +185,7 @@ class NodeTies(Term):
         d = self._domain.dim
         x = np.zeros((len(numbers), d))
         x[here] = self._domain.nodes[local] + self._u.x.array.reshape(-1, d)[local]
-        return np.asarray(total(self._domain.comm, x)) if len(x) else x
+        return np.asarray(sum_over_ranks(self._domain.comm, x)) if len(x) else x
 
     def _apart(self) -> Values:
         """(n, d) d of each tie, m (collective)."""
@@ -230,7 +232,7 @@ class NodeTies(Term):
             first = self._domain.space.dofmap.index_map.local_range[0]
             own = np.zeros(n, np.int64)
             own[self._here] = first + self._local
-            numbers: Ints = total(self._domain.comm, own)
+            numbers: Ints = sum_over_ranks(self._domain.comm, own)
             if self._domain.comm.rank:
                 K, numbers = csr_matrix((0, 0)), np.empty(0, np.int64)
             self._matrix = self._coupling(K, numbers)
@@ -265,7 +267,7 @@ class NodeTies(Term):
             mass[self._here] = self._mass[:: self._domain.dim][self._local]
             size = np.abs(self.ties.weights)
             rows = np.bincount(self._place.reshape(-1), (size * size.sum(axis=1, keepdims=True)).reshape(-1), len(mass))
-            every = total(self._domain.comm, mass) if len(mass) else mass
+            every = sum_over_ranks(self._domain.comm, mass) if len(mass) else mass
             self._fastest = self.stiffness * float(np.max(rows / every, initial=0.0))
         return self._fastest
 

@@ -85,7 +85,7 @@ class PrescribedMotion:
         if not self.bcs:
             return 0.0
         gap = np.max(np.abs(u[self.owned_dofs] - self.values), initial=0.0)
-        return float(self._domain.comm.allreduce(gap, op=MPI.MAX)) / self._domain.mean_edge
+        return float(self._domain.comm.allreduce(gap, op=MPI.MAX)) / self._domain.mean_edge_length
 
 
 def check_supports(domain: Domain, motion: PrescribedMotion) -> None:

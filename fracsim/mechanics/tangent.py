@@ -18,7 +18,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .inertia import MassMatrix
 from .jit import CellForm, cell_measure
 from .low_rank_springs import StiffCoupling
@@ -219,7 +219,7 @@ class Tangent:
         if self._went < MAX_FRACTION_FOR_REUSE:
             return True
         moved = float(np.abs(self._displacement - self._body_at[1]).max(initial=0.0))
-        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= MAX_MOVE_FOR_REUSE * self.domain.mean_edge)
+        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= MAX_MOVE_FOR_REUSE * self.domain.mean_edge_length)
 
     @cached_property
     def _alone(self) -> bool:
@@ -270,7 +270,7 @@ class Tangent:
         K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         part.destroy()
         self._coupled, self._mixed = True, self._mixed or not constant
-        self.pattern_version += bool(total(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+        self.pattern_version += bool(sum_over_ranks(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
 
     @cached_property
     def _prescribed_rows(self) -> npt.NDArray[np.int32]:

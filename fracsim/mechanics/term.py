@@ -24,7 +24,7 @@ from .low_rank_springs import StiffCoupling
 from .surface_data import SurfaceData
 
 if TYPE_CHECKING:
-    from ..mesh.split_surface.surface_map import Places
+    from ..mesh.split_surface.surface_map import SurfaceMap
     from .tie_matrix import TieMatrix
 
 Values = npt.NDArray[np.float64]
@@ -219,7 +219,7 @@ class Term:
         what energy it stores for that at the same u, this rank's share, J (collective)."""
         return 0.0
 
-    def separate_surface(self, at: Places, elements: Ints, u: Values, t: float) -> Places:
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Where the split surface is at the time t of the state, s, with nodal displacements u (N, d), m, so that what
         it keeps apart is apart; `at`: where it is without, `elements` (m, d) the points of its segments or triangles.
         Asked of rank 0, for what is drawn (not collective)."""

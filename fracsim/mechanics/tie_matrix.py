@@ -10,7 +10,7 @@ from dolfinx.common import IndexMap
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ class TieMatrix:
         """(m, d) K x at the nodes of this rank, of x there (collective)."""
         every = np.zeros((self.K.shape[0], x.shape[1]))
         every[self.indices] = x * self._free
-        return np.asarray((self.K @ total(self._comm, every))[self.indices] * self._free)
+        return np.asarray((self.K @ sum_over_ranks(self._comm, every))[self.indices] * self._free)
 
     def owned_rows(self, nodes: Ints, every: IndexMap) -> csr_matrix:
         """(d n, dofs of all ranks) those of owned nodes (n,); `every`: the nodes of the body (collective)."""
@@ -46,7 +46,7 @@ class TieMatrix:
         names = every.local_to_global(self.nodes.astype(np.int32))
         told = np.zeros((self.K.shape[0], d + 1))
         told[self.indices] = np.concatenate([names[:, None], self._free], axis=1)
-        told = total(self._comm, told)
+        told = sum_over_ranks(self._comm, told)
         place = np.full(every.size_local, -1)
         place[nodes] = np.arange(len(nodes))
         row_of = np.full(len(told), -1)

@@ -16,7 +16,7 @@ FLAT = 1e-6  # of a polygon's size: how far its corners may lie off their plane
 
 
 @dataclass(frozen=True)
-class Crack:
+class CrackPlane:
     """A flat crack.
 
     Attributes:
@@ -30,7 +30,7 @@ class Crack:
     normal: Values
     corners: Values | None = None
 
-    def meets(self, lower: Values, upper: Values) -> bool:
+    def intersects_box(self, lower: Values, upper: Values) -> bool:
         """Whether it may reach into a bounding box: no face of the box, nor the crack's own plane, keeps them apart."""
         corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(len(lower), -1).T
         heights = (corners - self.point) @ self.normal
@@ -40,7 +40,7 @@ class Crack:
             np.all(self.corners.min(axis=0) <= upper) and np.all(self.corners.max(axis=0) >= lower)
         )
 
-    def holds(self, points: Values, slack: float) -> Flags:
+    def contains(self, points: Values, slack: float) -> Flags:
         """Whether points (n, d) of its plane lie within its corners, or no farther than `slack` (m) outside."""
         if self.corners is None:
             return np.ones(len(points), bool)
@@ -52,28 +52,28 @@ class Crack:
         return _in_polygon(self.corners, self.normal, points, slack)
 
 
-def plane(name: str, point: Values, normal: Values) -> Crack:
+def plane(name: str, point: Values, normal: Values) -> CrackPlane:
     """A crack over all of the body's section with a plane (2D: a line). InputError where the normal is zero."""
     if not (length := float(np.linalg.norm(normal))):
         raise InputError(f"{name}.plane: the normal must not be zero")
-    return Crack(name, point, np.asarray(normal / length))
+    return CrackPlane(name, point, np.asarray(normal / length))
 
 
-def segment(name: str, corners: Values) -> Crack:
+def segment(name: str, corners: Values) -> CrackPlane:
     """A crack along the segment between two points (2, 2) of a 2D body. InputError where they are one."""
     along = corners[1] - corners[0]
     if not (length := float(np.linalg.norm(along))):
         raise InputError(f"{name}.segment: both ends are {corners[0].tolist()}; give two different points (m)")
-    return Crack(name, corners[0], np.array([-along[1], along[0]]) / length, corners)
+    return CrackPlane(name, corners[0], np.array([-along[1], along[0]]) / length, corners)
 
 
-def polygon(name: str, corners: Values) -> Crack:
+def polygon(name: str, corners: Values) -> CrackPlane:
     """A crack over a flat polygon (k, 3). InputError where its corners do not lie in one plane."""
     centre = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - centre)
     if sizes[1] <= FLAT * sizes[0] or sizes[2] > FLAT * sizes[0]:
         raise InputError(f"{name}.polygon: its {len(corners)} corners do not span a plane; give a flat polygon (m)")
-    return Crack(name, centre, axes[2], corners)
+    return CrackPlane(name, centre, axes[2], corners)
 
 
 def _in_polygon(corners: Values, normal: Values, points: Values, slack: float) -> Flags:

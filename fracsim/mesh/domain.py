@@ -17,12 +17,12 @@ from ..meshes.data import MeshData
 from ..meshes.text import format_point
 from ..meshes.topology import distinct_rows, signed_measures
 from .dolfinx_compat import KeptCell, coordinate_element, create_mesh, facets_of_nodes
-from .parallel import Gather, GatherSome, bcast, total
-from .selectors import Group, InBox, OnPlane, Place, check_group
+from .parallel import Gather, GatherSubset, bcast, sum_over_ranks
+from .selectors import Group, PointsInBox, PointsOnPlane, Selector, check_group
 from .simplices import local_edges
 
 if TYPE_CHECKING:
-    from .midside_nodes import Middles
+    from .midside_nodes import MidsideNodes
 
 Ints = npt.NDArray[np.int32]
 Values = npt.NDArray[np.float64]
@@ -51,7 +51,7 @@ class Domain:
     lower: npt.NDArray[np.float64]
     upper: npt.NDArray[np.float64]
     source: MeshData | None = None
-    middles: Middles | None = None
+    midside_nodes: MidsideNodes | None = None
 
     @property
     def comm(self) -> MPI.Intracomm:
@@ -75,7 +75,7 @@ class Domain:
     @property
     def order(self) -> int:
         """Of the displacement: 1 or 2."""
-        return 1 if self.middles is None else 2
+        return 1 if self.midside_nodes is None else 2
 
     @cached_property
     def space(self) -> fem.FunctionSpace:
@@ -94,7 +94,7 @@ class Domain:
     @property
     def cell_nodes(self) -> Ints:
         """(cells, d + 1) node (blocked dof) indices of the corners of the owned cells."""
-        return self.space.dofmap.list if self.middles is None else self._parts_of_cells[0]
+        return self.space.dofmap.list if self.midside_nodes is None else self._parts_of_cells[0]
 
     @property
     def all_cell_nodes(self) -> Ints:
@@ -102,7 +102,7 @@ class Domain:
         return self.space.dofmap.list
 
     @property
-    def cell_middles(self) -> Ints:
+    def cell_midside_nodes(self) -> Ints:
         """(cells, 3 or 6) node indices of the middles of local edges; none where displacement is linear."""
         return self._parts_of_cells[1]
 
@@ -112,9 +112,9 @@ class Domain:
         return np.ascontiguousarray(corners), np.ascontiguousarray(middles)
 
     @cached_property
-    def middle_ends(self) -> tuple[Ints, Ints]:
+    def midside_edges(self) -> tuple[Ints, Ints]:
         """(m,) nodes of this rank that are middles, ghosts too, and (m, 2) the ends of their edges."""
-        nodes, first = np.unique(self.cell_middles, return_index=True)
+        nodes, first = np.unique(self.cell_midside_nodes, return_index=True)
         return nodes, self.cell_nodes[:, local_edges(self.dim)].reshape(-1, 2)[first]
 
     @cached_property
@@ -128,19 +128,19 @@ class Domain:
         # the bits of the input: tabulated dof coordinates depend in the last digit on the cell, and so on the partition
         count = self.node_count + self.space.dofmap.index_map.num_ghosts
         result = np.empty((count, self.dim))
-        if self.is_bent:
+        if self.has_curved_cells:
             result[self.all_cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
             return result
         result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
-        if self.middles is not None:
-            between, ends = self.middle_ends
+        if self.midside_nodes is not None:
+            between, ends = self.midside_edges
             result[between] = result[ends].mean(axis=1)
         return result
 
     @property
-    def is_bent(self) -> bool:
+    def has_curved_cells(self) -> bool:
         """Whether cells have round sides."""
-        return self.middles is not None and self.middles.bent
+        return self.midside_nodes is not None and self.midside_nodes.curved
 
     @property
     def corner_geometry(self) -> Ints:
@@ -152,17 +152,17 @@ class Domain:
         """Index in the input mesh of every owned and ghost node; middles of edges come after its points."""
         result = np.full(len(self.nodes), -1, np.int64)
         result[self.cell_nodes] = self.mesh.geometry.input_global_indices[self.corner_geometry]
-        if self.middles is not None:
-            between, ends = self.middle_ends
-            result[between] = self.middles.named(result[ends])
+        if self.midside_nodes is not None:
+            between, ends = self.midside_edges
+            result[between] = self.midside_nodes.index_between(result[ends])
         return result
 
     @property
-    def corners(self) -> slice | npt.NDArray[np.bool_]:
+    def owned_corners(self) -> slice | npt.NDArray[np.bool_]:
         """Which nodes are corners of cells and owned."""
-        if self.middles is None:
+        if self.midside_nodes is None:
             return slice(self.node_count)
-        return (self.node_input < self.middles.points) & (np.arange(len(self.nodes)) < self.node_count)
+        return (self.node_input < self.midside_nodes.points) & (np.arange(len(self.nodes)) < self.node_count)
 
     @cached_property
     def cell_input(self) -> npt.NDArray[np.int64]:
@@ -171,11 +171,11 @@ class Domain:
 
     def mesh_of_nodes(self) -> MeshData | None:
         """`source`, in cells of 6 or 10 nodes where displacement is quadratic (rank 0; None elsewhere)."""
-        if self.middles is None or self.source is None:
+        if self.midside_nodes is None or self.source is None:
             return self.source
-        from .midside_nodes import with_middles
+        from .midside_nodes import with_midside_nodes
 
-        return with_middles(self.source, self.middles, written=True)
+        return with_midside_nodes(self.source, self.midside_nodes, written=True)
 
     def with_ghosts(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned and ghost dofs,) values from those of the owned dofs of the displacement space, not to be written to
@@ -194,16 +194,16 @@ class Domain:
     @cached_property
     def gather_corners(self) -> Gather:
         """The same of corners alone: the points of the input mesh."""
-        if self.middles is None:
+        if self.midside_nodes is None:
             return self.gather_nodes
-        return GatherSome(self.comm, self.node_input[: self.node_count], self.corners[: self.node_count])  # type: ignore[index]
+        return GatherSubset(self.comm, self.node_input[: self.node_count], self.owned_corners[: self.node_count])  # type: ignore[index]
 
-    def straight(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def with_straight_edges(self, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(owned dofs,) with those of middles half-way between those of the ends of their edges (collective)."""
-        if self.middles is None:
+        if self.midside_nodes is None:
             return owned
         nodal = self.with_ghosts(owned).reshape(-1, self.dim).copy()
-        between, ends = self.middle_ends
+        between, ends = self.midside_edges
         nodal[between] = nodal[ends].mean(axis=1)
         return nodal.reshape(-1)[: len(owned)]
 
@@ -218,7 +218,7 @@ class Domain:
         return np.asarray(array.reshape(-1, self.dim + 1)[: self.cell_count])
 
     @cached_property
-    def neighbours(self) -> Ints:
+    def facet_neighbours(self) -> Ints:
         """(n, 2) owned cells that share a facet."""
         facets = self.cell_facets
         order = np.argsort(facets, axis=None, kind="stable")
@@ -232,25 +232,25 @@ class Domain:
         return np.abs(signed_measures(self.nodes, self.cell_nodes))
 
     @cached_property
-    def mean_edge(self) -> float:
+    def mean_edge_length(self) -> float:
         """Edge length of a cube or square as large as the mean cell, m."""
-        volume, cells = total(self.comm, np.array([self.volumes.sum(), self.cell_count]))
+        volume, cells = sum_over_ranks(self.comm, np.array([self.volumes.sum(), self.cell_count]))
         return float((volume / cells) ** (1 / self.dim))
 
-    def nodes_of(self, place: Place, key: str = "on") -> Ints:
+    def select_nodes(self, place: Selector, key: str = "on") -> Ints:
         """Local nodes (owned and ghost) of a place; InputError, naming the key, where there are none (collective)."""
         nodes = self._group_nodes(place, key) if isinstance(place, Group) else self._selected(place)
-        if total(self.comm, len(nodes))[0] == 0:
+        if sum_over_ranks(self.comm, len(nodes))[0] == 0:
             raise InputError(f"{key}: {place} selects no node; the body lies in {self.extent()}")
         return nodes
 
-    def facets_of(self, place: Place, key: str = "on") -> Ints:
+    def select_facets(self, place: Selector, key: str = "on") -> Ints:
         """Local boundary facets of a group, or those with all nodes in a box or on a plane (collective)."""
         if isinstance(place, Group):
-            facets = np.intersect1d(self.group(place.name, key), self._exterior)
+            facets = np.intersect1d(self.facet_group(place.name, key), self._exterior)
         else:
             facets = self._facets_within(self._selected(place))
-        if total(self.comm, len(facets))[0] == 0:
+        if sum_over_ranks(self.comm, len(facets))[0] == 0:
             raise InputError(f"{key}: {place} selects no boundary facet; the body lies in {self.extent()}")
         return facets
 
@@ -271,15 +271,15 @@ class Domain:
         winner = min(self.comm.allgather(best[:2]))
         return np.array([best[2]] if best[:2] == winner else [], np.int32)
 
-    def group(self, name: str, key: str) -> Ints:
+    def facet_group(self, name: str, key: str) -> Ints:
         """Facets of a named group; InputError lists the groups that exist."""
         check_group(name, self.facets, key)
         return self.facets[name]
 
     def _group_nodes(self, place: Group, key: str) -> Ints:
-        return fem.locate_dofs_topological(self.space, self.dim - 1, self.group(place.name, key))
+        return fem.locate_dofs_topological(self.space, self.dim - 1, self.facet_group(place.name, key))
 
-    def _selected(self, place: InBox | OnPlane) -> Ints:
+    def _selected(self, place: PointsInBox | PointsOnPlane) -> Ints:
         return np.flatnonzero(place.selects(self.nodes, self.size)).astype(np.int32)
 
     def _facets_within(self, nodes: Ints) -> Ints:
@@ -292,7 +292,7 @@ class Domain:
         return exterior[of_geometry[geometry[:, : self.dim]].all(axis=1)]
 
     @cached_property
-    def sides_outside(self) -> npt.NDArray[np.bool_]:
+    def boundary_sides(self) -> npt.NDArray[np.bool_]:
         """(cells, d + 1) whether the facet opposite to each node of owned cells lies in the body's surface."""
         topology = self.mesh.topology
         flags = np.zeros(
@@ -329,23 +329,25 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
     return Domain(mesh, facets, region_names, local, lower, upper, data, middles)
 
 
-def _drawn(data: MeshData | None, middles: Middles | None, dim: int) -> tuple[npt.NDArray[np.int64], Values, KeptCell]:
+def _drawn(
+    data: MeshData | None, middles: MidsideNodes | None, dim: int
+) -> tuple[npt.NDArray[np.int64], Values, KeptCell]:
     """Cells, points and the coordinate element: of straight cells where none are bent."""
     element, nodes = coordinate_element(dim), dim + 1
-    if middles is not None and middles.bent:
-        from .midside_nodes import with_middles
+    if middles is not None and middles.curved:
+        from .midside_nodes import with_midside_nodes
 
         element, nodes = coordinate_element(dim, 2), (dim + 1) * (dim + 2) // 2
-        data = data and with_middles(data, middles, written=False)
+        data = data and with_midside_nodes(data, middles, written=False)
     if data is None:
         return np.empty((0, nodes), np.int64), np.empty((0, dim)), element
     return data.cells, data.points, element
 
 
-def _middles(comm: MPI.Comm, data: MeshData | None) -> Middles:
-    from .midside_nodes import middles_of
+def _middles(comm: MPI.Comm, data: MeshData | None) -> MidsideNodes:
+    from .midside_nodes import find_midside_nodes
 
-    return middles_of(comm, data)
+    return find_midside_nodes(comm, data)
 
 
 def _region_index(data: MeshData) -> npt.NDArray[np.int32] | None:

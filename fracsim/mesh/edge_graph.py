@@ -16,7 +16,7 @@ from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
 from .incidence import Incidence
-from .parallel import allgather, gather, total
+from .parallel import allgather, gather, sum_over_ranks
 from .simplices import intact_edges, is_split, local_edges
 
 
@@ -35,7 +35,7 @@ class EdgeGraph:
         kept: (edges,) bool, those that join their ends though all their cells have come apart; None: there are none.
     """
 
-    kept: npt.NDArray[np.bool_] | None = None
+    retained: npt.NDArray[np.bool_] | None = None
 
     def __init__(self, domain: Domain) -> None:
         topology = domain.mesh.topology
@@ -64,16 +64,16 @@ class EdgeGraph:
         return result
 
     @cached_property
-    def cells_at(self) -> Incidence:
+    def edge_cells(self) -> Incidence:
         """Cells that have any of some edges."""
         return Incidence(self.cell_edges, len(self.broken))
 
     @cached_property
-    def edges_at(self) -> Incidence:
+    def node_edges(self) -> Incidence:
         """Edges, owned and ghost, that have any of some nodes as an end."""
         return Incidence(self.edge_nodes, len(self.domain.nodes))
 
-    def on_any_rank(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    def any_over_ranks(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """(edges,) flags raised on any rank that has the edge (collective)."""
         if self.domain.comm.size == 1:
             return flags
@@ -84,8 +84,8 @@ class EdgeGraph:
 
     def break_edges(self, flags: npt.NDArray[np.bool_]) -> int:
         """Break the intact edges flagged on any rank; returns how many broke in all (collective)."""
-        new = self.on_any_rank(flags) & ~self.broken
-        count = int(total(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
+        new = self.any_over_ranks(flags) & ~self.broken
+        count = int(sum_over_ranks(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
         if count:
             self.integrity[new] = 0.0
             self._note_broken(new)
@@ -96,13 +96,13 @@ class EdgeGraph:
 
         Returns how many edges broke, and how many lost anything.
         """
-        least = np.minimum(self.integrity, self.least(integrity))
+        least = np.minimum(self.integrity, self.min_over_ranks(integrity))
         less, new = least < self.integrity, (least == 0) & ~self.broken
         self.integrity[:] = least
         self._note_broken(new)
         self.damaged |= less[self.cell_edges].any(axis=1)
         counts = [np.count_nonzero(flags[: self.edge_count]) for flags in (new, less)]
-        broken, weakened = total(self.domain.comm, np.array(counts))
+        broken, weakened = sum_over_ranks(self.domain.comm, np.array(counts))
         return int(broken), int(weakened)
 
     def set_integrity(self, integrity: npt.NDArray[np.float64]) -> None:
@@ -116,14 +116,14 @@ class EdgeGraph:
     def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
         """Edges (edges,) are broken from here on."""
         self.broken |= new
-        touched = self.cells_at(np.flatnonzero(new))
+        touched = self.edge_cells(np.flatnonzero(new))
         bits = 1 << np.arange(self.cell_edges.shape[1])
         self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
         self.damaged[touched] = True
         self.split = self.split.copy()  # whoever has asked for it has what was
         self.split[touched] = is_split(self.domain.dim)[self.pattern[touched]]
 
-    def least(self, values: npt.NDArray[np.float64], of: IndexMap | None = None) -> npt.NDArray[np.float64]:
+    def min_over_ranks(self, values: npt.NDArray[np.float64], of: IndexMap | None = None) -> npt.NDArray[np.float64]:
         """(n,) the least value that any rank gives an edge, or an entity of another index map (collective)."""
         if self.domain.comm.size == 1:
             return values
@@ -137,21 +137,21 @@ class EdgeGraph:
         result.scatter_forward()
         return np.asarray(result.array)
 
-    def break_idle(self) -> int:
+    def break_unloaded_edges(self) -> int:
         """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
 
         Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
         apart. Mechanics do not change: chi of its cells is 0 and they enter no average. What is `kept` is not broken.
         """
-        looked_for = self._idle_looked_for if self.kept is None else np.zeros(len(self.split), bool)
+        looked_for = self._idle_looked_for if self.retained is None else np.zeros(len(self.split), bool)
         self._idle_looked_for = self.split
         apart = np.zeros(len(self.broken), bool)
         apart[self.cell_edges[self.split & ~looked_for]] = True
-        may = self.on_any_rank(apart & ~self.broken)
-        carried = np.zeros(len(self.broken), bool) if self.kept is None else self.kept.copy()
-        cells = self.cells_at(np.flatnonzero(may))
+        may = self.any_over_ranks(apart & ~self.broken)
+        carried = np.zeros(len(self.broken), bool) if self.retained is None else self.retained.copy()
+        cells = self.edge_cells(np.flatnonzero(may))
         carried[self.cell_edges[cells[~self.split[cells]]]] = True
-        return self.break_edges(may & ~self.on_any_rank(carried))
+        return self.break_edges(may & ~self.any_over_ranks(carried))
 
     @property
     def broken_count(self) -> int:
@@ -186,7 +186,7 @@ class EdgeGraph:
         rows, or their (n, 1) integrity; None on the other ranks (collective)."""
         return self._gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
 
-    def restore(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
+    def restore_integrity(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
         """Be as `gather_weakened` said, given on every rank."""
         values = np.ones(len(self.integrity))
         local, place = self.find_keys(keys)

@@ -14,7 +14,7 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-def parts_of_nodes(domain: Domain, whole: Flags) -> tuple[int, Ints]:
+def node_components(domain: Domain, whole: Flags) -> tuple[int, Ints]:
     """How many parts the cells flagged (owned cells,) make, and for each owned node the largest around it; -1: none
     (collective).
 
@@ -35,7 +35,7 @@ def _parts(domain: Domain, cells: Ints) -> tuple[int, Ints]:
     """How many parts there are on this rank, and that of each cell (n,)."""
     number = np.full(domain.cell_count, -1)
     number[cells] = np.arange(len(cells))
-    links = number[domain.neighbours]
+    links = number[domain.facet_neighbours]
     return components(links[(links >= 0).all(axis=1)], len(cells))
 
 

@@ -15,7 +15,7 @@ from .parallel import allgather, offset
 
 
 @dataclass(frozen=True)
-class Pieces:
+class Fragments:
     """Bodies of a graph.
 
     Attributes:
@@ -25,11 +25,11 @@ class Pieces:
     """
 
     count: int
-    of_node: npt.NDArray[np.int64]
-    lowest: npt.NDArray[np.int64]
+    node_fragment: npt.NDArray[np.int64]
+    lowest_node: npt.NDArray[np.int64]
 
 
-def find_pieces(graph: EdgeGraph) -> Pieces:
+def find_fragments(graph: EdgeGraph) -> Fragments:
     """Components within each rank, joined where ranks share nodes: one exchange, however they wind (collective)."""
     domain = graph.domain
     local_count, local = components(_joined(graph), len(domain.nodes))
@@ -47,20 +47,22 @@ def find_pieces(graph: EdgeGraph) -> Pieces:
     order = np.argsort(least)
     rank = np.empty(count, np.int64)
     rank[order] = np.arange(count)
-    return Pieces(count, rank[joined][label], least[order])
+    return Fragments(count, rank[joined][label], least[order])
 
 
-def followed(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     """(m,) middles of edges and (m,) the ends that they go with, those that come first in the input mesh: where an edge
     is broken its middle is anywhere between its ends, and a piece is known by its corners."""
-    between, ends = domain.middle_ends
+    between, ends = domain.midside_edges
     return between, ends[np.arange(len(ends)), np.argmin(domain.node_input[ends], axis=1)]
 
 
 def _joined(graph: EdgeGraph) -> npt.NDArray[np.int32]:
     """(n, 2) nodes of intact edges, and middles with what they follow."""
     edges = graph.edge_nodes[~graph.broken]
-    return edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(followed(graph.domain), axis=1)])
+    return (
+        edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(midside_parents(graph.domain), axis=1)])
+    )
 
 
 def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

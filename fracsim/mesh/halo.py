@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .parallel import allgather, exchanged
+from .parallel import allgather, exchange_rows
 
 Values = npt.NDArray[np.float64]
 
 
-class Halo:
+class RankHalo:
     """Brings rows of the cells within a distance of this rank's cells: first its own, then those of other ranks."""
 
     def __init__(self, comm: MPI.Comm, centroids: Values, distance: float) -> None:
@@ -38,4 +38,4 @@ class Halo:
         if self.comm.size == 1:
             return values
         send = np.ascontiguousarray(values[self._rows], float)
-        return np.concatenate([values, exchanged(self.comm, send, self._sent, self._received)])
+        return np.concatenate([values, exchange_rows(self.comm, send, self._sent, self._received)])

@@ -23,9 +23,9 @@ class Incidence:
 
     def __call__(self, numbers: npt.NDArray[np.integer]) -> Ints:
         """(m,) rows that have any of the numbers (n,), rising, each once."""
-        return np.unique(self.each(numbers))
+        return np.unique(self.entities_of(numbers))
 
-    def each(self, numbers: npt.NDArray[np.integer]) -> Ints:
+    def entities_of(self, numbers: npt.NDArray[np.integer]) -> Ints:
         """(m,) the same for one number after the other: rows that have several of them as often."""
         end = self.end[numbers]
         many = end - self.end[numbers - 1]

@@ -21,8 +21,8 @@ from mpi4py import MPI
 from .c_library import Int32, Int64, Uint8, at, load_library, struct_pointer
 from .domain import Domain
 from .edge_graph import EdgeGraph
-from .fragments import Pieces, find_pieces, followed
-from .parallel import joined, largest, offset, total
+from .fragments import Fragments, find_fragments, midside_parents
+from .parallel import concatenate_over_ranks, max_over_ranks, offset, sum_over_ranks
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -30,13 +30,13 @@ FAR = 48  # edges that one goes at most
 SOURCE = Path(__file__).with_suffix(".c")
 
 
-class _Given(Structure):
+class _GraphArrays(Structure):
     """As incremental_fragments.c has it."""
 
     _fields_ = (("nodes", Int32), ("broken", Uint8), ("edges", Int64), ("end", Int64), ("shared", Uint8))
 
 
-class _Room(Structure):
+class _WorkArrays(Structure):
     """For what is reached of so many nodes, as incremental_fragments.c has it, and its arrays."""
 
     _fields_ = (
@@ -54,7 +54,7 @@ class _Room(Structure):
 
 
 @dataclass(frozen=True)
-class _Found:
+class _SearchResult:
     """Nodes (n,), the part of each, whether parts (parts,) go on or may do so on another rank, and the piece of before
     that each is of; `settled`: those that do not go on are all that has come off on this rank."""
 
@@ -65,7 +65,7 @@ class _Found:
     settled: bool
 
 
-class Parting:
+class IncrementalFragments:
     """Follows the pieces of a graph as its edges break.
 
     Attributes:
@@ -75,18 +75,20 @@ class Parting:
     def __init__(self, graph: EdgeGraph) -> None:
         self._graph, self._domain = graph, graph.domain
         self._shared = _on_other_ranks(graph.domain)
-        self._room = _Room(len(self._shared))
-        edges = graph.edges_at
+        self._room = _WorkArrays(len(self._shared))
+        edges = graph.node_edges
         self._kept = graph.edge_nodes, graph.broken, edges.rows, edges.end, self._shared
-        self._given = _Given(*map(struct_pointer, self._kept))
+        self._given = _GraphArrays(*map(struct_pointer, self._kept))
         self._code = load_library(SOURCE).reached
         self._look_everywhere()
 
-    def look(self) -> Pieces:
+    def update(self) -> Fragments:
         """The pieces of now (collective)."""
         graph = self._graph
         changed = np.flatnonzero(graph.broken != self._broken)
-        count, healed = total(graph.domain.comm, np.array([len(changed), np.count_nonzero(self._broken[changed])]))
+        count, healed = sum_over_ranks(
+            graph.domain.comm, np.array([len(changed), np.count_nonzero(self._broken[changed])])
+        )
         if healed:
             self._look_everywhere()
         elif count:
@@ -94,30 +96,37 @@ class Parting:
         return self.pieces
 
     def _look_everywhere(self) -> None:
-        self.pieces, self._broken = find_pieces(self._graph), self._graph.broken.copy()
+        self.pieces, self._broken = find_fragments(self._graph), self._graph.broken.copy()
 
     def _look_around(self, edges: Ints) -> None:
         """The pieces once edges (n,) have broken (collective)."""
         found = self._reached(edges)
-        if largest(self._domain.comm, int(not found.settled)):
+        if max_over_ranks(self._domain.comm, int(not found.settled)):
             self._look_everywhere()
         else:
             self._part(found)
             self._broken[edges] = True
 
-    def _reached(self, edges: Ints) -> _Found:
+    def _reached(self, edges: Ints) -> _SearchResult:
         """What is around the ends of edges (n,), as far as need be."""
         room, parts, settled = self._room, c_int64(), c_int64()
-        given = byref(self._given), byref(room), c_int64(len(edges)), at(edges), c_int64(FAR), at(self.pieces.of_node)
+        given = (
+            byref(self._given),
+            byref(room),
+            c_int64(len(edges)),
+            at(edges),
+            c_int64(FAR),
+            at(self.pieces.node_fragment),
+        )
         count = self._code(*given, byref(parts), byref(settled))
         of_parts = room.open[: parts.value], room.of_parts[: parts.value]
-        return _Found(room.reached[:count], room.parts[:count], *of_parts, bool(settled.value))
+        return _SearchResult(room.reached[:count], room.parts[:count], *of_parts, bool(settled.value))
 
-    def _part(self, found: _Found) -> None:
+    def _part(self, found: _SearchResult) -> None:
         """Parts that do not go on are pieces of their own (collective)."""
         before, domain, comm = self.pieces, self._domain, self._domain.comm
         off = np.flatnonzero(~found.goes_on)
-        if not total(comm, len(off))[0]:
+        if not sum_over_ranks(comm, len(off))[0]:
             return
         numbers = np.full(len(found.goes_on), -1)
         numbers[off] = np.arange(len(off))
@@ -125,31 +134,31 @@ class Parting:
         nodes, number = found.nodes[of_node >= 0], of_node[of_node >= 0]
         low = np.full(len(off), np.iinfo(np.int64).max)
         np.minimum.at(low, number, domain.node_input[nodes])
-        label = before.of_node.copy()
+        label = before.node_fragment.copy()
         label[nodes] = before.count + offset(comm, len(off)) + number
-        rest, gone = before.lowest, np.count_nonzero(low == before.lowest[found.piece[off]])
-        if total(comm, gone)[0]:
+        rest, gone = before.lowest_node, np.count_nonzero(low == before.lowest_node[found.piece[off]])
+        if sum_over_ranks(comm, gone)[0]:
             rest = self._lowest_of_rest(found.piece[off], label)
-        lowest = np.concatenate([rest, joined(comm, low)])
+        lowest = np.concatenate([rest, concatenate_over_ranks(comm, low)])
         count = int(np.count_nonzero(lowest < np.iinfo(np.int64).max))
         order = np.argsort(lowest, kind="stable")
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order))
         of_node = rank[label]
         if domain.order == 2:
-            between, end = followed(domain)
+            between, end = midside_parents(domain)
             of_node[between] = of_node[end]
-        self.pieces = Pieces(count, of_node, lowest[order][:count])
+        self.pieces = Fragments(count, of_node, lowest[order][:count])
 
     def _lowest_of_rest(self, parted: Ints, label: Ints) -> Ints:
         """(pieces,) the lowest input node that is left of each piece of before, where nodes of the pieces `parted` have
         other labels now (collective)."""
-        domain, lowest = self._domain, self.pieces.lowest.copy()
-        changed = np.unique(joined(domain.comm, np.unique(parted)))
+        domain, lowest = self._domain, self.pieces.lowest_node.copy()
+        changed = np.unique(concatenate_over_ranks(domain.comm, np.unique(parted)))
         left = np.full(len(lowest), np.iinfo(np.int64).max)
         of_changed = np.zeros(label.max(initial=len(lowest)) + 1, bool)
         of_changed[changed] = True
-        corners = np.arange(len(label))[domain.corners]
+        corners = np.arange(len(label))[domain.owned_corners]
         corners = corners[of_changed[label[corners]]]
         np.minimum.at(left, label[corners], domain.node_input[corners])
         lowest[changed] = left[changed]

@@ -18,7 +18,7 @@ LONG = 4.0  # a cell of so many times the median radius is torn or crushed, and 
 ROWS = 1 << 22  # of a table of boxes that are compared at a time
 
 
-def overlap(x: Values, cells: Ints, piece: Ints) -> tuple[int, int] | None:
+def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int] | None:
     """The node that is deepest inside a cell of another piece, and that cell; None where there is none.
 
     `x`: (N, d) places, m.    `cells`: (C, d + 1) the whole cells.    `piece`: (N,) of each node.

@@ -25,7 +25,7 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Middles:
+class MidsideNodes:
     """The edges of an input mesh.
 
     Attributes:
@@ -35,36 +35,36 @@ class Middles:
 
     points: int
     keys: Ints
-    bent: bool = False
+    curved: bool = False
 
     @property
     def ends(self) -> Ints:
         """(m, 2) input points that each middle lies between, the lower first."""
         return np.stack([self.keys // self.points, self.keys % self.points], axis=1)
 
-    def named(self, ends: Ints) -> Ints:
+    def index_between(self, ends: Ints) -> Ints:
         """Index after all input points of the middles between (..., 2) input points."""
         return self.points + np.searchsorted(self.keys, ends.min(axis=-1) * self.points + ends.max(axis=-1))
 
 
 # local edges in the order in which VTK and XDMF have their middles: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
-WRITTEN = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}
+FILE_EDGE_ORDER = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}
 
 
-def with_middles(data: MeshData, middles: Middles, *, written: bool) -> MeshData:
+def with_midside_nodes(data: MeshData, middles: MidsideNodes, *, written: bool) -> MeshData:
     """The mesh with the middles as points, and cells of 6 (2D) or 10 nodes, `written` as files have them, or in the
     order of local edges."""
     between = data.points[middles.ends].mean(axis=1) if data.middles is None else data.middles
-    ends = data.cells[:, local_edges(data.dim)[WRITTEN[data.dim] if written else slice(None)]]
-    cells = np.hstack([data.cells, middles.named(ends)])
+    ends = data.cells[:, local_edges(data.dim)[FILE_EDGE_ORDER[data.dim] if written else slice(None)]]
+    cells = np.hstack([data.cells, middles.index_between(ends)])
     return replace(data, points=np.concatenate([data.points, between]), cells=cells)
 
 
-def middles_of(comm: MPI.Comm, data: MeshData | None) -> Middles:
+def find_midside_nodes(comm: MPI.Comm, data: MeshData | None) -> MidsideNodes:
     """Of a mesh that rank 0 holds, on every rank (collective)."""
     made = None
     if data is not None:
         low, high = edges_of(data.cells).T
-        made = Middles(len(data.points), low * len(data.points) + high, data.middles is not None)
-    result: Middles = bcast(comm, made)
+        made = MidsideNodes(len(data.points), low * len(data.points) + high, data.middles is not None)
+    result: MidsideNodes = bcast(comm, made)
     return result

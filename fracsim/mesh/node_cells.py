@@ -11,7 +11,7 @@ from .domain import Domain
 Values = npt.NDArray[np.float64]
 
 
-class CellsAround:
+class NodeCellCount:
     """Counts the cells around each node."""
 
     def __init__(self, domain: Domain) -> None:

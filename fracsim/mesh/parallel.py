@@ -117,7 +117,7 @@ def _name_and_parent(process: int) -> tuple[str, int]:
         return "", 0
 
 
-def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
+def sum_over_ranks(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
     """Sum over the ranks, element by element."""
     if comm.size == 1:
         return np.array(values, ndmin=1)
@@ -127,13 +127,13 @@ def total(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
     return result
 
 
-def largest[Number: (int, float)](comm: MPI.Intracomm, value: Number) -> Number:
+def max_over_ranks[Number: (int, float)](comm: MPI.Intracomm, value: Number) -> Number:
     """The greatest over the ranks."""
     result: Number = value if comm.size == 1 else comm.allreduce(value, op=MPI.MAX)
     return result
 
 
-def joined(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def concatenate_over_ranks(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Rows of all ranks, those of the lowest first."""
     return rows if comm.size == 1 else np.concatenate(allgather(comm, rows))
 
@@ -176,7 +176,7 @@ def _received(rows: npt.NDArray[Any], counts: Sequence[int] | npt.NDArray[np.int
     return _flat(rows), (list(counts) if rows.size else [0] * len(counts), None), _bytes(_width(rows))
 
 
-def exchanged(
+def exchange_rows(
     comm: MPI.Comm,
     rows: npt.NDArray[Any],
     sent: Sequence[int] | npt.NDArray[np.int64],
@@ -239,7 +239,7 @@ def alltoall[T](comm: MPI.Comm, values: Sequence[T]) -> list[T]:
     packed = [_packed(each) for each in values]
     sent, received = np.array([len(each) for each in packed], np.int64), np.empty(comm.size, np.int64)
     comm.Alltoall(sent, received)
-    return _unpacked(exchanged(comm, np.concatenate(packed), sent, received), received)
+    return _unpacked(exchange_rows(comm, np.concatenate(packed), sent, received), received)
 
 
 def bcast(comm: MPI.Comm, value: Any) -> Any:
@@ -309,7 +309,7 @@ class Gather:
         return result
 
 
-class GatherSome(Gather):
+class GatherSubset(Gather):
     """The same of some rows: those left out are 0 when scattered."""
 
     def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64], which: npt.NDArray[np.bool_]) -> None:

@@ -15,7 +15,7 @@ from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-SLACK = 1e-9  # of the body's size: faces that coincide are meant
+RELATIVE_TOLERANCE = 1e-9  # of the body's size: faces that coincide are meant
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class InBox:
+class PointsInBox:
     """The closed box between two corners (d numbers each, m)."""
 
     lower: tuple[float, ...]
@@ -40,17 +40,17 @@ class InBox:
 
     def selects(self, points: Values, size: float) -> Flags:
         """(n,) which of the points (n, d) in m lie in it; `size`: of the body, m."""
-        slack = SLACK * size
+        slack = RELATIVE_TOLERANCE * size
         return np.all((points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack), axis=1)
 
-    def meets(self, lower: Values, upper: Values) -> bool:
+    def intersects_box(self, lower: Values, upper: Values) -> bool:
         """Whether it reaches into a bounding box."""
-        slack = SLACK * float(np.linalg.norm(upper - lower))
+        slack = RELATIVE_TOLERANCE * float(np.linalg.norm(upper - lower))
         return bool(np.all(self.lower <= upper + slack) and np.all(self.upper >= lower - slack))
 
 
 @dataclass(frozen=True)
-class OnPlane:
+class PointsOnPlane:
     """A plane through a point (m), and what lies within `within` of it (m; default 1e-6 of the body's size).
 
     Raises InputError where the normal is zero.
@@ -73,15 +73,17 @@ class OnPlane:
         distance = np.abs((points - np.array(self.point)) @ normal) / np.linalg.norm(normal)
         return np.asarray(distance <= (self.within or 1e-6 * size))
 
-    def meets(self, lower: Values, upper: Values) -> bool:
+    def intersects_box(self, lower: Values, upper: Values) -> bool:
         """Whether it passes through a bounding box, whose corners may be infinite."""
         normal = np.array(self.normal)
         ends = np.sort(normal * (np.array([lower, upper]) - np.array(self.point)), axis=0)
-        slack = (self.within or 0.0) * np.linalg.norm(normal) + SLACK * np.abs(ends[np.isfinite(ends)]).sum()
+        slack = (self.within or 0.0) * np.linalg.norm(normal) + RELATIVE_TOLERANCE * np.abs(
+            ends[np.isfinite(ends)]
+        ).sum()
         return bool(ends[0].sum() <= slack and ends[1].sum() >= -slack)
 
 
-type Place = Group | InBox | OnPlane
+type Selector = Group | PointsInBox | PointsOnPlane
 
 
 def check_group(name: str, known: Iterable[str], key: str) -> None:

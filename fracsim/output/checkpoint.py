@@ -19,7 +19,7 @@ from mpi4py import MPI
 from ..errors import InputError, NotConverged
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, bcast, on_root, total
+from ..mesh.parallel import Gather, bcast, on_root, sum_over_ranks
 from ..timestepping.state import State
 from .atomic_write import written
 from .checkpoint_file import (
@@ -66,7 +66,7 @@ def write_checkpoint(
     terms = balance.to_checkpoint()
     nodal = {name: getattr(state, name) for name in (*_NODAL, *_SOMETIMES)}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
-    clock |= {"elastic": float(total(comm, state.elastic)[0]), "dt_before": 0.0}
+    clock |= {"elastic": float(sum_over_ranks(comm, state.elastic)[0]), "dt_before": 0.0}
     if state.previous_increment is not None:
         nodal["u_before"], clock["dt_before"] = state.previous_increment
     nodal = {name: values for name, values in nodal.items() if values is not None}
@@ -161,7 +161,7 @@ def read_checkpoint(
     before = nodal.pop("u_before", None)
     if record is not None and small["weakened"] is not None:
         _check_edges(comm, record, small["weakened"], checkpoint_path(folder))
-        record.graph.restore(small["weakened"], small["integrity"])
+        record.graph.restore_integrity(small["weakened"], small["integrity"])
         record.restore(small["broken"], small["breaks"])
     if surfaces is not None and small["starts"] is not None:
         surfaces.starts = small["starts"]
@@ -288,6 +288,6 @@ def _check_edges(comm: MPI.Comm, record: EdgeRecord, keys: npt.NDArray[np.int64]
     """InputError where pairs of nodes (n, 2), in rising order, are no edges of the mesh (collective)."""
     graph = record.graph
     local, _ = graph.find_keys(keys)
-    found = int(total(comm, np.count_nonzero(local < graph.edge_count))[0])
+    found = int(sum_over_ranks(comm, np.count_nonzero(local < graph.edge_count))[0])
     if found != len(keys):
         raise refusal(path, f"{len(keys) - found} of its weakened edges are none of the mesh")

@@ -10,8 +10,8 @@ from mpi4py import MPI
 
 from ..fracture.edge_history import EdgeRecord
 from ..fracture.initial_cracks import ends_in_order
-from ..mesh.crack_planes import Crack
-from ..mesh.parallel import joined, total
+from ..mesh.crack_planes import CrackPlane
+from ..mesh.parallel import concatenate_over_ranks, sum_over_ranks
 from ..meshes.text import AXES
 
 Ints = npt.NDArray[np.integer]
@@ -34,7 +34,7 @@ class CrackFront:
         names: columns of history.csv.
     """
 
-    def __init__(self, record: EdgeRecord, cracks: Sequence[Crack] = ()) -> None:
+    def __init__(self, record: EdgeRecord, cracks: Sequence[CrackPlane] = ()) -> None:
         """`cracks`: those of the study, which were open at t = 0 (collective)."""
         graph = record.graph
         self._record, self._graph, self._domain = record, graph, graph.domain
@@ -65,30 +65,30 @@ class CrackFront:
     def look(self) -> None:
         """Edges have broken (collective)."""
         changed = np.flatnonzero(self._graph.pattern != self._pattern)
-        if not total(self._domain.comm, len(changed))[0]:
+        if not sum_over_ranks(self._domain.comm, len(changed))[0]:
             return
         self._pattern = self._graph.pattern.copy()
         self._size[changed] = self._cut(changed)
         held = {cell: end for cell, end in self._asked.items() if not self._graph.split[cell]}
         size = self._size.sum() + sum(float(np.linalg.norm(end - self._entry(cell))) for cell, end in held.items())
-        self._figures[0] = total(self._domain.comm, float(size))[0]
+        self._figures[0] = sum_over_ranks(self._domain.comm, float(size))[0]
         self._find_tip(held)
 
     def _find_tip(self, held: dict[int, Values]) -> None:
         """The tip of the crack that advanced last; `held`: ends that were asked for, by their cells (collective)."""
         comm, graph, at = self._domain.comm, self._graph, self._record.at
         newest = np.flatnonzero(at == comm.allreduce(float(np.fmax.reduce(at, initial=-np.inf)), MPI.MAX))
-        cells = graph.cells_at(newest)
+        cells = graph.edge_cells(newest)
         cells = cells[~graph.split[cells]]
         which, side = np.nonzero(np.isin(graph.cell_edges[cells], newest))
         leading = graph.cell_edges[cells][which, side]
         places = self._places(leading)
         for cell, end in held.items():
             places[cells[which] == cell] = end
-        rows = joined(comm, np.column_stack([self._keys(leading), places]))
+        rows = concatenate_over_ranks(comm, np.column_stack([self._keys(leading), places]))
         away = np.zeros(len(rows))
         if not len(rows):
-            rows = joined(comm, np.column_stack([self._keys(newest), self._places(newest)]))
+            rows = concatenate_over_ranks(comm, np.column_stack([self._keys(newest), self._places(newest)]))
             away = np.nan_to_num(np.linalg.norm(rows[:, 2:] - self._figures[1:], axis=1))
         if len(rows):
             self._figures[1:] = rows[np.lexsort([*rows.T[::-1], -away])[0], 2:]

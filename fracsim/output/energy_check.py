@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..mechanics.stress import Stress
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from ..timestepping.state import State
 from ..timestepping.stepper import StepReport
 
@@ -86,4 +86,4 @@ class EnergyGain:
 def worth_telling(stress: Stress) -> float:
     """Y V STRAIN^2 of a body, J (collective)."""
     domain = stress.domain
-    return float(total(domain.comm, np.sum(stress.material.young * domain.volumes))[0]) * STRAIN**2
+    return float(sum_over_ranks(domain.comm, np.sum(stress.material.young * domain.volumes))[0]) * STRAIN**2

@@ -19,7 +19,7 @@ from .fields_file import TENSOR, Field
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import Breaking
-    from ..mesh.fragments import Pieces
+    from ..mesh.fragments import Fragments
 
 Values = npt.NDArray[np.generic]
 _ENTRIES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENSOR]
@@ -33,7 +33,7 @@ class Frames:
         self._names = names
         self._compiled: dict[str, CellExpression] = {}
 
-    def __call__(self, state: State, pieces: Pieces | None) -> list[Field]:
+    def __call__(self, state: State, pieces: Fragments | None) -> list[Field]:
         """All fields in input order (complete on rank 0; collective)."""
         d = self._domain.dim
         fields = [self._on_nodes("displacement", state.u.reshape(-1, d))]
@@ -42,7 +42,7 @@ class Frames:
                 fields.append(self._on_nodes(name, state.v.reshape(-1, d)))
             elif name == "piece":
                 assert pieces is not None
-                fields.append(self._on_nodes(name, pieces.of_node[: self._domain.node_count].astype(np.int32)))
+                fields.append(self._on_nodes(name, pieces.node_fragment[: self._domain.node_count].astype(np.int32)))
             else:
                 fields.append(Field(name, "Cell", self._domain.gather_cells(self._cell_values(name))))
         return fields

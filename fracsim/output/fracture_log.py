@@ -10,13 +10,13 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.connected_bodies import bodies_of
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
     from ..fracture.edge_history import EdgeRecord
     from ..fracture.fracture_pass import Breaking
-    from ..mesh.fragments import Pieces
+    from ..mesh.fragments import Fragments
 
 
 class Breaks:
@@ -35,15 +35,15 @@ class Breaks:
         self._stress, self._domain, self._by_forces = stress, stress.domain, cut_by_forces
         self.record: EdgeRecord | None = None
         self.surfaces: BrittleSurfaces | None = None
-        self.pieces: Pieces | None = None
+        self.pieces: Fragments | None = None
         self.figures = (0, 0, _bodies(self._domain))
         self._cut_by: npt.NDArray[np.float64] | None = None
         self._carried: npt.NDArray[np.float64] | None = None
         if breaking is not None:
             from ..fracture.edge_history import EdgeRecord
-            from ..mesh.incremental_fragments import Parting
+            from ..mesh.incremental_fragments import IncrementalFragments
 
-            self.record, self._parting = EdgeRecord(breaking.graph), Parting(breaking.graph)
+            self.record, self._parting = EdgeRecord(breaking.graph), IncrementalFragments(breaking.graph)
             if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
             self._cut_by = breaking.criterion.cut
@@ -82,19 +82,19 @@ class Breaks:
         if self.record is None:
             return
         graph = self.record.graph
-        broken, split = total(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
-        self.pieces = self._parting.look()
+        broken, split = sum_over_ranks(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
+        self.pieces = self._parting.update()
         self.figures = int(broken), int(split), self.pieces.count
 
     def dust(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:
         """Pieces of a single corner of cells, and their mass, kg; `mass` (cells,) of cells, kg (collective)."""
         if self.pieces is None:
             return 0, 0.0
-        domain, of_node = self._domain, self.pieces.of_node
-        size = total(domain.comm, np.bincount(of_node[domain.corners], minlength=self.pieces.count))
+        domain, of_node = self._domain, self.pieces.node_fragment
+        size = sum_over_ranks(domain.comm, np.bincount(of_node[domain.owned_corners], minlength=self.pieces.count))
         alone = (size == 1)[of_node]
         share = np.count_nonzero(alone[domain.cell_nodes], axis=1) / (domain.dim + 1)
-        return int(np.count_nonzero(size == 1)), float(total(domain.comm, np.array([share @ mass]))[0])
+        return int(np.count_nonzero(size == 1)), float(sum_over_ranks(domain.comm, np.array([share @ mass]))[0])
 
     def _cuts(self) -> npt.NDArray[np.float64]:
         """(edges,) cuts in inverse proportion to the nodal forces of now (M22 fig. 12)."""

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..mechanics.balance import Balance
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from ..meshes.text import AXES
 from ..timestepping.state import State
 from ..timestepping.stepper import StepReport
@@ -81,7 +81,7 @@ class Probes:
         if not self._readings:
             return np.empty(0)
         parts = [reading() for reading in self._readings] + [np.array([each() for each in self._works])]
-        sums = total(self._domain.comm, np.concatenate(parts))
+        sums = sum_over_ranks(self._domain.comm, np.concatenate(parts))
         if not self._least:
             return sums * self._factor
         least = np.array([each() for each in self._least])
@@ -100,7 +100,7 @@ class Probes:
 
     def _mean_displacement(self, probe: Probe) -> Reading:
         owned, d = self._owned(probe), self._domain.dim
-        count = total(self._domain.comm, len(owned))[0]
+        count = sum_over_ranks(self._domain.comm, len(owned))[0]
         return lambda: self._balance.u.x.array.reshape(-1, d)[owned].sum(axis=0) / count
 
     def _owned(self, probe: Probe) -> Ints:

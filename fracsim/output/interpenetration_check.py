@@ -28,13 +28,13 @@ class Passing:
 
     def look(self, t: float, surface: Surface, u: Values) -> None:
         """Note the pieces of a frame at t s, u (N, d) the displacement of its nodes, m (rank 0)."""
-        pieces = surface.split.piece_of_node
-        if self.seen or surface.split.pieces == 1:
+        pieces = surface.split.node_fragment
+        if self.seen or surface.split.fragment_count == 1:
             return
-        from ..mesh.interpenetration import overlap
+        from ..mesh.interpenetration import find_interpenetration
 
         x = surface.skeleton.points + u
-        found = overlap(x, surface.skeleton.cells[surface.whole], pieces)
+        found = find_interpenetration(x, surface.skeleton.cells[surface.whole], pieces)
         if found is not None:
             node, cell = found
             inner = surface.skeleton.cells[surface.whole][cell, 0]

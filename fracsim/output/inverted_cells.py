@@ -9,7 +9,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mechanics.stress import Stress
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import Breaking
@@ -45,7 +45,7 @@ class InvertedCells:
         rest = domain.nodes[domain.cell_nodes[cells]]
         J = _spanned(self._stress.cell_corners(cells)) / _spanned(rest)
         self.least = min(self.least, domain.comm.allreduce(float(J.min(initial=np.inf)), op=MPI.MIN))
-        turned = int(total(domain.comm, np.count_nonzero(J <= FLAT))[0])
+        turned = int(sum_over_ranks(domain.comm, np.count_nonzero(J <= FLAT))[0])
         if turned and not self.count:
             self.since = t
         self.count = max(self.count, turned)

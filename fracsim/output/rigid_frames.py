@@ -74,10 +74,10 @@ class RigidFrames:
         surface.update(pattern, cut)
         surface.reshape(dented)
         made = surface.split
-        of, bodies = made.piece_of_point, bodies.part(slice(made.pieces))
+        of, bodies = made.point_fragment, bodies.part(slice(made.fragment_count))
         points = bodies.to_space(made.points, of)
         velocity = bodies.velocity_at(points, of)
-        nodes = np.bincount(made.piece_of_node, minlength=made.pieces)
+        nodes = np.bincount(made.node_fragment, minlength=made.fragment_count)
         turn = np.asarray(Rotation.from_matrix(bodies.turn).as_rotvec())
         volume = surface.volume
         pieces = Fragments(

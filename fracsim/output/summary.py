@@ -12,7 +12,7 @@ from typing import Any
 from mpi4py import MPI
 
 from ..errors import one_line
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from ..timestepping.stepper import Stepper
 from .atomic_write import replace_text, written
 
@@ -41,7 +41,7 @@ class Meter:
         """Of all parts of the run, for `restore` and for summary.json; s and MiB (collective)."""
         earlier = self._earlier
         # of all ranks: processor time hardly feels other work
-        cpu, memory = total(self._comm, [time.process_time() - self._cpu_began, _peak_memory()])
+        cpu, memory = sum_over_ranks(self._comm, [time.process_time() - self._cpu_began, _peak_memory()])
         seconds = {"setup": self.setup, **self._stepper.phases, "output": self.output}
         return {
             "trouble": _sum(earlier["trouble"], self._stepper.failure_counts()),

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ..errors import NotConverged
 from ..mesh.c_library import at, load_library
-from ..mesh.split_surface.polyhedron_moments import Moments
+from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ class Bodies:
     spin: Values
 
     @classmethod
-    def at_rest(cls, density: Values, of: Moments) -> Bodies:
+    def at_rest(cls, density: Values, of: PolyhedronMoments) -> Bodies:
         """Where the mesh has them; `density`: (n,) kg/m^3."""
         n = len(of.volume)
         still, turn = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
@@ -75,7 +75,7 @@ class Bodies:
         """(k, 3) velocity of bodies (k,) at points x (k, 3), m/s."""
         return np.asarray(self.velocity[body] + np.cross(self.spin[body], x - self.place[body]))
 
-    def divided(self, density: Values, of: Moments, parent: Ints) -> Bodies:
+    def divided(self, density: Values, of: PolyhedronMoments, parent: Ints) -> Bodies:
         """The pieces that they have broken into, each a part of one body `parent` (m,) and moving as that did there:
         v_i = v + w x r_i, w_i = w (B07 sec. 7)."""
         parts = Bodies.at_rest(density, of)
@@ -83,7 +83,7 @@ class Bodies:
         velocity = self.velocity_at(place, parent)
         return replace(parts, place=place, turn=self.turn[parent], velocity=velocity, spin=self.spin[parent])
 
-    def reshaped(self, of: Moments, which: Ints) -> Bodies:
+    def reshaped(self, of: PolyhedronMoments, which: Ints) -> Bodies:
         """Some (k,) of them have other shapes: mass stays, and so do the place of the centre, momentum and angular
         momentum."""
         centre, inertia, spin = (np.array(each) for each in (self.centre, self.inertia, self.spin))

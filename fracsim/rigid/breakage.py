@@ -19,7 +19,7 @@ from ..fracture.edge_stress import frobenius_norm
 from ..fracture.neighbour_average import NeighbourAverage
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from ..mesh.fragments import Pieces, find_pieces
+from ..mesh.fragments import Fragments, find_fragments
 from ..mesh.input_topology import MeshTopology
 from ..solvers.petsc_options import PetscOptions
 from .surface_loads import PointLoads, patches, point_loads
@@ -140,7 +140,7 @@ class Breakable:
         self._find_pieces()
 
     def _find_pieces(self) -> None:
-        self.pieces: Pieces = find_pieces(self.graph)
+        self.pieces: Fragments = find_fragments(self.graph)
         self._length: Values | None = None
 
     def damage(self) -> tuple[npt.NDArray[np.uint8], Values]:
@@ -173,7 +173,7 @@ class Breakable:
 
     def piece_of(self, name: int) -> int:
         """The piece that a node of the input mesh is in."""
-        return int(self.pieces.of_node[self._node[name]])
+        return int(self.pieces.node_fragment[self._node[name]])
 
     def may_break(self, piece: int, force: float) -> bool:
         """Whether forces of this sum (N) could break a piece, or have it flow: no beam of its length, an edge thick,
@@ -188,7 +188,7 @@ class Breakable:
 
     def _lengths(self) -> Values:
         """(pieces,) diagonals of the boxes around them, m."""
-        piece, X = self.pieces.of_node, self._domain.nodes
+        piece, X = self.pieces.node_fragment, self._domain.nodes
         order = np.argsort(piece, kind="stable")
         start = np.searchsorted(piece[order], np.arange(int(piece.max()) + 1))
         sides = np.maximum.reduceat(X[order], start) - np.minimum.reduceat(X[order], start)
@@ -198,14 +198,14 @@ class Breakable:
         """Forces (k, d) at points (k, d) of a piece at rest, on circles of radii (k,), m; None: at points."""
         if radius is not None:
             radius = radius if self._flow is None else np.maximum(radius, self._flow.pressed(force))
-            points, force = patches(points, force, radius, self._domain.mean_edge)
+            points, force = patches(points, force, radius, self._domain.mean_edge_length)
         cells = self._domain.cell_nodes[self.shares(piece) > 0].astype(np.int64)
         return point_loads(self._domain.nodes, cells, points, force)
 
     def shares(self, piece: int) -> Values:
         """(cells,) what of each cell belongs to a piece: as many parts as it has nodes of it; of a cell in which a
         crack ends, hardly anything."""
-        share = self._count(self.pieces.of_node == piece) / len(self._corners)
+        share = self._count(self.pieces.node_fragment == piece) / len(self._corners)
         share[self.graph.split & (share == 1)] = CRACKED
         return share
 
@@ -227,7 +227,7 @@ class Breakable:
 
     def _free(self, piece: int) -> Analysis:
         """The analysis of a piece, kept until it breaks; of all cells it is that of all copies of the mesh."""
-        key = int(np.flatnonzero(self.pieces.of_node == piece)[0])
+        key = int(np.flatnonzero(self.pieces.node_fragment == piece)[0])
         if key not in self._kept:
             share = self.shares(piece)
             if np.all(share == 1):
@@ -290,9 +290,9 @@ class Breakable:
         local, place = self.graph.find_keys(keys[order])
         new = ~self.graph.broken[local]
         if np.any(new):
-            pieces = np.unique(self.pieces.of_node[self.graph.edge_nodes[local[new]]])
+            pieces = np.unique(self.pieces.node_fragment[self.graph.edge_nodes[local[new]]])
             for piece in pieces:
-                self._forget(int(np.flatnonzero(self.pieces.of_node == piece)[0]))
+                self._forget(int(np.flatnonzero(self.pieces.node_fragment == piece)[0]))
             criterion.cut[local] = cut[order][place]
             flags = np.zeros(len(self.graph.broken), bool)
             flags[local] = True
@@ -306,11 +306,11 @@ class Breakable:
         """Break a piece, and what it breaks into, until nothing more does; returns how many edges broke."""
         if self._criterion is None:
             return 0
-        broken, waiting = 0, [int(np.flatnonzero(self.pieces.of_node == piece)[0])]
+        broken, waiting = 0, [int(np.flatnonzero(self.pieces.node_fragment == piece)[0])]
         while waiting:
             node = waiting.pop()
-            piece = int(self.pieces.of_node[node])
-            mine = self.pieces.of_node == piece
+            piece = int(self.pieces.node_fragment[node])
+            mine = self.pieces.node_fragment == piece
             on = loads.of(mine[loads.owner])
             if not len(on.force) or not self._may_break(mine):
                 continue
@@ -343,7 +343,7 @@ class Breakable:
         ends = self.graph.edge_nodes.T
         # the boundary of a grain may go on in other bodies
         count = self.graph.break_edges(flags & mine[ends[0]] & mine[ends[1]])
-        return count + self.graph.break_idle() if count else 0
+        return count + self.graph.break_unloaded_edges() if count else 0
 
     def _surely_holds(self, stress: Values) -> bool:
         """Whether no average over cells of the piece comes near its strength, for none of them does; cells that a crack
@@ -357,7 +357,7 @@ class Breakable:
     def _lowest(self, mine: Flags) -> list[int]:
         """The lowest node of each piece that these nodes (nodes,) are in, the last first."""
         nodes = np.flatnonzero(mine)
-        _, first = np.unique(self.pieces.of_node[nodes], return_index=True)
+        _, first = np.unique(self.pieces.node_fragment[nodes], return_index=True)
         return [int(each) for each in nodes[first][::-1]]
 
     def _forget(self, node: int) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
-from ..mesh.split_surface.polyhedron_moments import Moments, cones, moments
+from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, cones, moments
 from ..meshes.components import components
 
 Ints = npt.NDArray[np.int64]
@@ -71,7 +71,7 @@ class Solid:
         return Solid.of(self.points, self.triangles[volume[of] > 0])
 
     @property
-    def moments(self) -> Moments:
+    def moments(self) -> PolyhedronMoments:
         """Of volume."""
         return moments(self.points, self.triangles, np.zeros(len(self.triangles), np.int64), 1)
 

@@ -26,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mesh.c_library import at, load_library
-from ..mesh.split_surface.closed_surface import Split
-from ..mesh.split_surface.entity_numbering import Skeleton
+from ..mesh.split_surface.closed_surface import SplitSurface
+from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..meshes.topology import facets_of
 from .bodies import Bodies
 
@@ -57,11 +57,11 @@ class Core:
     crack: Ints
 
     @classmethod
-    def of_split(cls, made: Split, skeleton: Skeleton) -> Core:
+    def of_split(cls, made: SplitSurface, skeleton: EntityNumbering) -> Core:
         """Of a split surface."""
         node = np.unique(skeleton.edges[made.broken])
-        node = node[np.argsort(made.piece_of_node[node], kind="stable")]
-        of_cell, facets = made.piece_of_node[skeleton.cells], skeleton.cell_facets
+        node = node[np.argsort(made.node_fragment[node], kind="stable")]
+        of_cell, facets = made.node_fragment[skeleton.cells], skeleton.cell_facets
         whole = np.all(of_cell == of_cell[:, :1], axis=1)
         cells, wholes = (np.bincount(each.ravel(), minlength=len(skeleton.facets)) for each in (facets, facets[whole]))
         cell, side = np.nonzero((wholes == 1)[facets] & whole[:, None])
@@ -69,7 +69,7 @@ class Core:
         cell, side = cell[order], side[order]
         faces = skeleton.points[skeleton.cells[cell[:, None], facets_of(np.arange(4)[None])[0][side]]]
         crack = np.asarray(cells[facets[cell, side]] == 2, np.int64)
-        return cls(skeleton.points[node], made.piece_of_node[node], faces, of_cell[cell, 0], crack)
+        return cls(skeleton.points[node], made.node_fragment[node], faces, of_cell[cell, 0], crack)
 
     @classmethod
     def none(cls) -> Core:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.split_surface.closed_surface import Split, split
-from ..mesh.split_surface.entity_numbering import Skeleton
-from ..mesh.split_surface.polyhedron_moments import Moments, moments
+from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from ..meshes.data import MeshData
 from .convex_decomposition import Solid, convex_parts, outermost
 from .core_contact import Core, Cores
@@ -35,7 +35,7 @@ class Shapes:
     """
 
     names: Ints
-    moments: Moments
+    moments: PolyhedronMoments
     piece_of_node: Ints
     parts: list[list[Values]]
     turn: Values
@@ -50,7 +50,7 @@ class _Copy:
     points: Values
     pattern: Patterns
     names: Ints
-    of: Moments
+    of: PolyhedronMoments
     piece_of_node: Ints
     parts: list[list[Values]]
     outer: list[Values]
@@ -66,7 +66,7 @@ class Geometry:
 
     def __init__(self, mesh: MeshData, poses: Poses | None = None) -> None:
         """`poses`: where the copies are at rest; None: one, where the mesh has it."""
-        self.skeleton, self.poses = Skeleton(mesh), poses or Poses.at_rest(1)
+        self.skeleton, self.poses = EntityNumbering(mesh), poses or Poses.at_rest(1)
         self._shell = mesh.shell
         self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
         # of each copy, by lowest node: the key of its surface to the last digit, or a restart would come to other hulls
@@ -91,7 +91,7 @@ class Geometry:
                 self._known[number] = known = self._copy(pattern.copy(), cut, number, at)
                 self._placed[number] = self._at(number, known)
         pieces = np.cumsum([0, *(len(each.names) for each in self._placed)])
-        of = Moments(*(np.concatenate([getattr(each.moments, name) for each in self._placed])
+        of = PolyhedronMoments(*(np.concatenate([getattr(each.moments, name) for each in self._placed])
                        for name in ("volume", "centre", "second")))  # fmt: skip
         piece = [each.piece_of_node + first for each, first in zip(self._placed, pieces, strict=False)]
         parts = [part for each in self._placed for part in each.parts]
@@ -110,10 +110,10 @@ class Geometry:
 
     def _copy(self, pattern: Patterns, cut: Values | None, number: int, at: Values) -> _Copy:
         """A copy with patterns (C,), and nodes at places (N, 3)."""
-        made = split(self.skeleton.moved(at), pattern, cut)
-        piece = made.piece_of_point[made.elements[:, 0]]
-        of = moments(made.points, made.elements, piece, made.pieces)
-        names = np.unique(made.piece_of_node, return_index=True)[1]
+        made = build_split_surface(self.skeleton.moved(at), pattern, cut)
+        piece = made.point_fragment[made.elements[:, 0]]
+        of = moments(made.points, made.elements, piece, made.fragment_count)
+        names = np.unique(made.node_fragment, return_index=True)[1]
         solids = _solids(made, piece)
         before = self._hulls.get(number, {})
         same = [before.get(name) for name in map(int, names)]
@@ -124,35 +124,35 @@ class Geometry:
         found = [kept for kept in same if kept is not None]
         self._hulls[number] = dict(zip(map(int, names), found, strict=True))
         parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
-        drawn = made.pieces > 1 and not self._in_clusters(made)
+        drawn = made.fragment_count > 1 and not self._in_clusters(made)
         core = Core.of_split(made, self.skeleton) if drawn else Core.none()
-        return _Copy(at, pattern, names, of, made.piece_of_node, parts, outer, core)
+        return _Copy(at, pattern, names, of, made.node_fragment, parts, outer, core)
 
-    def _parts(self, made: Split, piece: Ints, solids: list[Solid], chosen: Ints) -> list[list[Values]]:
+    def _parts(self, made: SplitSurface, piece: Ints, solids: list[Solid], chosen: Ints) -> list[list[Values]]:
         """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
         if not self._in_clusters(made):
             return [convex_parts(solids[each].filled, self.mean_edge) for each in chosen]
-        place = np.full(made.pieces, -1)
+        place = np.full(made.fragment_count, -1)
         place[chosen] = np.arange(len(chosen))
         of = place[piece]
         assert self._shell is not None
         mine, thickness = np.flatnonzero(of >= 0), self._shell.thickness
         return clustered_parts(made.points, made.elements[mine], of[mine], len(chosen), thickness, self.mean_edge)
 
-    def _in_clusters(self, made: Split) -> bool:
+    def _in_clusters(self, made: SplitSurface) -> bool:
         """Whether parts are clusters, of few corners: whole a shell may be closed, and its parts are for all copies."""
-        return self._shell is not None and made.pieces > 1
+        return self._shell is not None and made.fragment_count > 1
 
     def _at(self, number: int, copy: _Copy) -> Shapes:
         """A copy where it is at rest."""
         turn, place = self.poses.turn[number], self.poses.place[number]
-        of = Moments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
+        of = PolyhedronMoments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
         names, turns = copy.names + number * len(copy.piece_of_node), np.tile(turn, (len(copy.names), 1, 1))
         return Shapes(names, of, copy.piece_of_node, copy.parts, turns, copy.outer)
 
 
-def _solids(made: Split, piece: Ints) -> list[Solid]:
+def _solids(made: SplitSurface, piece: Ints) -> list[Solid]:
     """What each piece of a split surface, whose elements are of pieces (m,), encloses."""
     order = np.argsort(piece, kind="stable")
-    ends = np.cumsum(np.bincount(piece, minlength=made.pieces))[:-1]
+    ends = np.cumsum(np.bincount(piece, minlength=made.fragment_count))[:-1]
     return [Solid.of(made.points, elements) for elements in np.split(made.elements[order], ends)]

@@ -110,7 +110,7 @@ class Stiffness:
     @property
     def finest(self) -> float:
         """m, an edge of the mesh."""
-        return self.stress.domain.mean_edge
+        return self.stress.domain.mean_edge_length
 
     def tensor(self, u: Values, share: Values) -> Values:
         """(cells, 3 or 6) stress of displacements u (nodes, d) in the cells with a share, 0 in all others, Pa."""

@@ -160,6 +160,6 @@ def _probes(study: Study, domain: Domain) -> list[Probe]:
         else:
             assert entry.on is not None
             key = f"probe.{i}.on"
-            nodes = domain.nodes_of(find_selector(entry.on, domain.dim, key), key)
+            nodes = domain.select_nodes(find_selector(entry.on, domain.dim, key), key)
         probes.append(Probe(entry.name, entry.quantity, nodes))
     return probes

@@ -116,7 +116,7 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     rest = {number: each for number, each in every if each.shape != "mesh" and each.free_motion is None}
     free = [each for each in entries.values() if each.free]
     shapes = {number: _obstacle(each, number) for number, each in rest.items()}
-    others = before_solids(shapes, free, law.barrier.width, domain.mean_edge)
+    others = before_solids(shapes, free, law.barrier.width, domain.mean_edge_length)
     made = partial(
         FreeSolids, domain, u, entries, scheme=scheme, others=others, barrier=cast("Barrier", law.barrier)
     )  # fmt: skip
@@ -180,7 +180,7 @@ def _self_contact(
     from ..contact import ipc_surface
 
     contact = _contact(study)
-    distance = contact.distance or share * domain.mean_edge
+    distance = contact.distance or share * domain.mean_edge_length
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
     pieces, straight = contact.itself == "pieces", _straight(study)
@@ -253,7 +253,7 @@ def _straight(study: Study) -> bool:
 def _law(
     contact: ContactSettings, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
 ) -> Law:
-    distance = contact.distance or DISTANCE * domain.mean_edge
+    distance = contact.distance or DISTANCE * domain.mean_edge_length
     return Law(
         barrier(contact.stiffness or STIFFNESS * _young(domain, material), distance),
         contact.creep or CREEP * domain.size,

@@ -51,7 +51,7 @@ class Parts:
     def on_facets(self, kind: str) -> list[OnFacets]:
         """Facets and function of time of each condition of a kind."""
         of_kind = [each for each in self.conditions if each.kind == kind]
-        return [(self.domain.facets_of(each.place, f"{each.key}.on"), each.function) for each in of_kind]
+        return [(self.domain.select_facets(each.place, f"{each.key}.on"), each.function) for each in of_kind]
 
 
 def _viscosity(parts: Parts) -> Term | None:
@@ -158,7 +158,7 @@ def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialF
     assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
     moved = [each for each in entries if each.prescribes_motion]
-    nodes = [domain.nodes_of(each.place, f"{each.key}.on") for each in moved]
+    nodes = [domain.select_nodes(each.place, f"{each.key}.on") for each in moved]
     motion = PrescribedMotion(
         domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
     )

@@ -26,8 +26,8 @@ from scipy.sparse.linalg import splu
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from ..mesh.facet_components import parts_of_nodes
-from ..mesh.parallel import allgather, total
+from ..mesh.facet_components import node_components
+from ..mesh.parallel import allgather, sum_over_ranks
 from .weak_callbacks import ApplyContext
 
 Values = npt.NDArray[np.float64]
@@ -90,10 +90,10 @@ class DeflatedPreconditioner:
         """y = P x (collective)."""
         comm, at, near, rest = self._balance.domain.comm, self._at, self._near, self._rest
         x.copy(rest)
-        moved = self._solve(total(comm, self._Zt @ rest.array_r[at]))
+        moved = self._solve(sum_over_ranks(comm, self._Zt @ rest.array_r[at]))
         rest.array_w[near] -= self._KZ @ moved
         self.base_pc.apply(rest, y)
-        moved -= self._solve(total(comm, self._KZt @ y.array_r[near]))
+        moved -= self._solve(sum_over_ranks(comm, self._KZt @ y.array_r[near]))
         y.array_w[at] += self._Z @ moved
 
     def destroy(self) -> None:
@@ -107,7 +107,7 @@ def create_deflation(balance: Balance, base_pc: PETSc.PC) -> DeflatedPreconditio
     domain, multiplier = balance.domain, balance.stress.energy_multiplier
     if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
         return None
-    count, part = parts_of_nodes(domain, multiplier.x.array[: domain.cell_count] > 0)
+    count, part = node_components(domain, multiplier.x.array[: domain.cell_count] > 0)
     _join_tied(balance, part)
     nodes = np.flatnonzero(part > 0)
     return DeflatedPreconditioner(balance, base_pc, nodes, part[nodes] - 1, count - 1) if count > 1 else None
@@ -119,7 +119,7 @@ def _join_tied(balance: Balance, part: Ints) -> None:
     for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
         known = np.zeros(tied.K.shape[0], np.int64)
         known[tied.indices] = part[tied.nodes] + 1
-        known = total(balance.domain.comm, known)
+        known = sum_over_ranks(balance.domain.comm, known)
         smallest, K = known.copy(), tied.K.tocoo()
         np.maximum.at(smallest, K.row, known[K.col])
         alone = part[tied.nodes] < 0
@@ -134,12 +134,12 @@ def _motions(
     comm, d = domain.comm, x.shape[1]
     sums: Values = np.zeros((count, d + 1))
     np.add.at(sums, part, np.concatenate([np.ones((len(x), 1)), x], axis=1))
-    sums = total(comm, sums)
+    sums = sum_over_ranks(comm, sums)
     middle = sums[:, 1:] / np.maximum(sums[:, :1], 1)
-    B = _rigid((x - middle[part]) / domain.mean_edge) * free[:, :, None]
+    B = _rigid((x - middle[part]) / domain.mean_edge_length) * free[:, :, None]
     gram = np.zeros((count, B.shape[2], B.shape[2]))
     np.add.at(gram, part, np.einsum("ndi,ndj->nij", B, B))
-    values, vectors = np.linalg.eigh(total(comm, gram))
+    values, vectors = np.linalg.eigh(sum_over_ranks(comm, gram))
     kept = values > DEPENDENT * np.maximum(values[:, -1:], 1.0)
     scaled = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
     columns = np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)

@@ -29,7 +29,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .weak_callbacks import weak_callback
 
 # Potentials that differ by less than this share of their terms are the same.
@@ -129,9 +129,9 @@ def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec) -> None:
     """Shorten a correction x <- x - y, m, of the FEW nodes that go further than an edge, where it still leads down a
     potential whose derivative at x is `r`, N (collective)."""
     moves = y.array_r.reshape(-1, domain.dim)
-    lengths, far = np.sqrt((moves * moves).sum(axis=1)), domain.mean_edge
+    lengths, far = np.sqrt((moves * moves).sum(axis=1)), domain.mean_edge_length
     most = FEW * domain.space.dofmap.index_map.size_global
-    while (beyond := total(domain.comm, np.count_nonzero(lengths > far))[0]) > most:
+    while (beyond := sum_over_ranks(domain.comm, np.count_nonzero(lengths > far))[0]) > most:
         far *= 2
     if not beyond:
         return

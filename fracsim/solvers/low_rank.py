@@ -20,7 +20,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..mechanics.low_rank_springs import StiffCoupling
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 
 Values = npt.NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class LowRankOperator:
         """y = (K - sum of U C U^T + sum of C') x (collective)."""
         self._tangent.mult(x, y)
         for U, C in self._parts():
-            y.array_w[:] -= U @ (C @ total(self._tangent.comm.tompi4py(), U.T @ x.array_r))
+            y.array_w[:] -= U @ (C @ sum_over_ranks(self._tangent.comm.tompi4py(), U.T @ x.array_r))
         for each in self._springs():
             each.matrix.multAdd(x, y, y)
 
@@ -62,12 +62,12 @@ class WoodburyPreconditioner:
         U = np.concatenate([each.directions for each in springs], axis=1)
         self._V = _applied(body, U, like)
         flexibility = np.diag(1.0 / np.concatenate([each.stiffness for each in springs]))
-        self._G = np.linalg.inv(flexibility + total(self._comm, U.T @ self._V))
+        self._G = np.linalg.inv(flexibility + sum_over_ranks(self._comm, U.T @ self._V))
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = (P - V G V^T) x (collective)."""
         self._body.apply(x, y)
-        y.array_w[:] -= self._V @ (self._G @ total(self._comm, self._V.T @ x.array_r))
+        y.array_w[:] -= self._V @ (self._G @ sum_over_ranks(self._comm, self._V.T @ x.array_r))
 
 
 def _applied(body: PETSc.PC, U: Values, like: PETSc.Vec) -> Values:

@@ -36,7 +36,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
 from ..mechanics.tangent import adds_single_entries
 from ..mechanics.term import Term
-from ..mesh.parallel import allgather, total
+from ..mesh.parallel import allgather, sum_over_ranks
 from .line_search import ROUND_OFF
 
 Values = npt.NDArray[np.float64]
@@ -126,7 +126,7 @@ class NonlinearElimination:
         if not len(nodes):
             return False
         region = self._around(nodes)
-        moved = _settle(region, little, self._balance.domain.mean_edge)
+        moved = _settle(region, little, self._balance.domain.mean_edge_length)
         u = self._balance.u.x.array[: self._balance.owned_dof_count].copy()
         self._balance.set_displacement(u)
         return moved
@@ -139,7 +139,7 @@ class NonlinearElimination:
         most, own = int(FEW * self._count), np.flatnonzero(squares)
         if len(own) > most:
             own = own[np.argpartition(-squares[own], most)[: most + 1]]
-        of_all = total(comm, np.sum(squares))[0]
+        of_all = sum_over_ranks(comm, np.sum(squares))[0]
         names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[own], squares[own])), strict=True))
         falling = np.sort(parts)[::-1][:most]
         held = np.cumsum(falling)
@@ -174,7 +174,7 @@ class NonlinearElimination:
         for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
             numbers = np.zeros(tied.K.shape[0], np.int64)
             numbers[tied.indices] = self._names[tied.nodes]
-            at, each = _places(total(balance.domain.comm, numbers), names), tied.K.tocoo()
+            at, each = _places(sum_over_ranks(balance.domain.comm, numbers), names), tied.K.tocoo()
             inside = (at[each.row] >= 0) & (at[each.col] >= 0)
             K = K + coo_array((each.data[inside], (at[each.row][inside], at[each.col][inside])), shape=(n, n)).tocsr()
         return K.tocoo()

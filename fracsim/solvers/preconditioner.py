@@ -41,7 +41,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .petsc_options import PetscOptions, PetscOptionSet
 
 if TYPE_CHECKING:
@@ -94,8 +94,8 @@ def mass_stiffness_ratio(balance: Balance) -> float:
     """The inertia of a cell as a share of its stiffness, in the step that is solved now (collective)."""
     domain, material = balance.domain, balance.stress.material
     sums = [np.sum(each * domain.volumes) for each in (material.young, material.density)]
-    stiffness, mass = total(domain.comm, np.array(sums))
-    return float(balance.c_a * mass * domain.mean_edge**2 / stiffness)
+    stiffness, mass = sum_over_ranks(domain.comm, np.array(sums))
+    return float(balance.c_a * mass * domain.mean_edge_length**2 / stiffness)
 
 
 class Due(IntEnum):

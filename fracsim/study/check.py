@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.connected_bodies import bodies_of, not_held
-from ..mesh.selectors import Group, Place, check_group, check_regions
+from ..mesh.selectors import Group, Selector, check_group, check_regions
 from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import MOST_CELLS as CELLS
 from ..meshes.text import AXES, format_point
@@ -199,11 +199,11 @@ def _check_groups(study: Study, anatomy: MeshSummary) -> None:
     check_regions(study.material.regions, anatomy.regions)
 
 
-def _check_place(key: str, place: Place, anatomy: MeshSummary) -> None:
+def _check_place(key: str, place: Selector, anatomy: MeshSummary) -> None:
     """Whether the mesh has the group, or a box or plane meets the body's bounding box at all."""
     if isinstance(place, Group):
         check_group(place.name, anatomy.groups, key)
-    elif not place.meets(np.array(anatomy.lower), np.array(anatomy.upper)):
+    elif not place.intersects_box(np.array(anatomy.lower), np.array(anatomy.upper)):
         raise InputError(f"{key} selects no node; the body lies in {_extent(anatomy)}")
 
 
@@ -218,7 +218,7 @@ def _check_dimensions(study: Study, anatomy: MeshSummary) -> None:
     obstacle_placements(study, dim)
     fibre_direction(study, dim)
     for crack in initial_cracks(study, dim):
-        if not crack.meets(np.array(anatomy.lower), np.array(anatomy.upper)):
+        if not crack.intersects_box(np.array(anatomy.lower), np.array(anatomy.upper)):
             raise InputError(f"{crack.name} lies outside the body, which spans {_extent(anatomy)}")
     for i, probe in enumerate(study.probe):
         if probe.point is not None:

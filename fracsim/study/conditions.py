@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import TabulatedFunction, TimeFunction, Values, constant_function
-from ..mesh.crack_planes import Crack, plane, polygon, segment
-from ..mesh.selectors import Group, InBox, OnPlane, Place
+from ..mesh.crack_planes import CrackPlane, plane, polygon, segment
+from ..mesh.selectors import Group, PointsInBox, PointsOnPlane, Selector
 from ..meshes.text import AXES
 from . import (
     MOTIONS,
@@ -49,7 +49,7 @@ class BoundaryCondition:
 
     key: str
     kind: str
-    place: Place
+    place: Selector
     function: TimeFunction
     components: Flags
 
@@ -157,16 +157,16 @@ def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
     return np.array([axis in axes for axis in AXES[:dim]])
 
 
-def find_selector(where: str | BoxSelector | PlaneSelector, dim: int, key: str) -> Place:
+def find_selector(where: str | BoxSelector | PlaneSelector, dim: int, key: str) -> Selector:
     """A place of the study. InputError where its vectors do not fit the dimension, or a normal is zero."""
     if isinstance(where, str):
         return Group(where)
     if isinstance(where, BoxSelector):
         lower, upper = (_vector(corner, dim, f"{key}.box") for corner in where.box)
-        return InBox(lower, upper)
+        return PointsInBox(lower, upper)
     normal, point = (_vector(getattr(where, name), dim, f"{key}.{name}") for name in ("normal", "point"))
     try:
-        return OnPlane(point, normal, where.within)
+        return PointsOnPlane(point, normal, where.within)
     except InputError as error:
         raise InputError(f"{key}.{error}") from None
 
@@ -267,12 +267,12 @@ def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None
     return velocity, spin
 
 
-def initial_cracks(study: Study, dim: int) -> list[Crack]:
+def initial_cracks(study: Study, dim: int) -> list[CrackPlane]:
     """[[crack]] of a body with d dimensions. InputError where they are of another, or have no extent."""
     return [_crack(entry, f"crack.{i}", dim) for i, entry in enumerate(study.crack)]
 
 
-def _crack(entry: CrackSettings, key: str, dim: int) -> Crack:
+def _crack(entry: CrackSettings, key: str, dim: int) -> CrackPlane:
     if entry.plane is not None:
         point = check_size(entry.plane.point, dim, f"{key}.plane.point")
         return plane(key, point, check_size(entry.plane.normal, dim, f"{key}.plane.normal"))

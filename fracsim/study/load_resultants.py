@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import TabulatedFunction
-from ..mesh.selectors import Group, Place
+from ..mesh.selectors import Group, Selector
 from ..meshes.data import MeshData
 from ..meshes.topology import boundary_facets, facets_where, signed_measures
 from . import Study
@@ -56,7 +56,7 @@ def facet_area_vectors(mesh: MeshData, load: BoundaryCondition) -> tuple[Values,
     return vectors.sum(axis=0), float(np.linalg.norm(vectors, axis=1).sum())
 
 
-def _facets(mesh: MeshData, place: Place) -> npt.NDArray[np.int64]:
+def _facets(mesh: MeshData, place: Selector) -> npt.NDArray[np.int64]:
     if isinstance(place, Group):
         return mesh.facet_groups[place.name]
     size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))

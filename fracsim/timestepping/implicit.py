@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from ..solvers.nonlinear_solver import NonlinearSolver
 from .energy_balance import released_state
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
@@ -48,7 +48,7 @@ class ImplicitStepper(BalanceStepper):
     def _tell_solver(self) -> None:
         """Tell the solver of the damage that there is, whenever that came about."""
         pattern = self.breaking.broken_edge_patterns
-        torn = pattern is not None and total(self.comm, np.count_nonzero(pattern))[0] > 0
+        torn = pattern is not None and sum_over_ranks(self.comm, np.count_nonzero(pattern))[0] > 0
         self.solver.damage_changed(None if torn else 0)
 
     def discard_unsaved_data(self) -> None:

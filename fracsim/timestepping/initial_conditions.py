@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 
 Values = npt.NDArray[np.float64]
 
@@ -20,7 +20,7 @@ def initial_velocity(balance: Balance, velocity: Values | None, spin: Values | N
         v += velocity
     if spin is not None:
         mass = balance.mass.lumped.reshape(-1, d)[:, :1]
-        sums = total(domain.comm, np.concatenate([(mass * X).sum(axis=0), mass.sum(axis=0)]))
+        sums = sum_over_ranks(domain.comm, np.concatenate([(mass * X).sum(axis=0), mass.sum(axis=0)]))
         arm = X - sums[:d] / sums[d]
         v += np.cross(spin, arm) if d == 3 else spin * np.column_stack([-arm[:, 1], arm[:, 0]])
     return v.reshape(-1)

@@ -22,7 +22,7 @@ from mpi4py import MPI
 from ..errors import NotConverged
 from ..mechanics.balance import Balance
 from ..mechanics.time_functions import TabulatedFunction
-from ..mesh.parallel import total
+from ..mesh.parallel import sum_over_ranks
 from .energy_balance import balanced_forces, step_work
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
@@ -162,7 +162,7 @@ class BalanceStepper:
 
     def failure_counts(self) -> dict[str, int]:
         """Counts by name of what failed on the way, over all ranks (collective)."""
-        crushed = int(total(self.comm, self.breaking.nonfinite_cells)[0])
+        crushed = int(sum_over_ranks(self.comm, self.breaking.nonfinite_cells)[0])
         return asdict(self.failures) | {"cells_not_finite": crushed}
 
     # --- the state at the start ---
@@ -347,7 +347,7 @@ class BalanceStepper:
         stiffened = balance.stiffen_contact()
         work, lost, elastic = work + worked + stiffened, lost + rubbed, elastic + stiffened
         kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
-        work, lost, kinetic, every = map(float, total(self.comm, np.array([work, lost, kinetic, elastic])))
+        work, lost, kinetic, every = map(float, sum_over_ranks(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(
             end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, history=self._memory()
         )

@@ -118,7 +118,7 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
     """Figures of one case on the ranks of this process (collective); the baseline is for one rank."""
     from mpi4py import MPI
 
-    from ...mesh.parallel import total
+    from ...mesh.parallel import sum_over_ranks
     from ...run import Run
     from ...scene import build_scene
     from ...study.reader import validate
@@ -130,7 +130,7 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
         whole, cut = (Run(build_scene(comm, study), inside / name) for name in ("whole", "cut"))
         domain = whole.scene.domain
         planes = random_planes(max(cuts), domain.lower, domain.upper)
-        sizes = total(comm, np.array([domain.cell_count, domain.node_count]))
+        sizes = sum_over_ranks(comm, np.array([domain.cell_count, domain.node_count]))
         stages, done = [], 0
         for count in cuts:
             cut_planes(cut, planes[done:count])
@@ -227,7 +227,7 @@ def _facet_nodes(domain: Any, facets: Any) -> Any:
 
 def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
     """Seconds per step of the loops, one step of each in turn."""
-    from ...mesh.parallel import total
+    from ...mesh.parallel import sum_over_ranks
     from ..bench import timed
 
     loops = {"whole": whole.scene.stepper, "cut": cut.scene.stepper}
@@ -243,7 +243,7 @@ def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
             times[name].append(timed(cut.comm, step))
             krylov[name].append(int(loops[name].solver.snes.getLinearSolveIterations()))
     broken, split, pieces = cut.breaks.figures
-    dofs = int(total(cut.comm, len(cut.state.u))[0])
+    dofs = int(sum_over_ranks(cut.comm, len(cut.state.u))[0])
     ratios = {
         f"{name}_ratio": median(a / b for a, b in zip(times[name][WARM:], times["whole"][WARM:], strict=False))
         for name in loops

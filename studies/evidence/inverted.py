@@ -40,7 +40,7 @@ def main() -> None:
 
 def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
-    from ...mesh.parallel import total
+    from ...mesh.parallel import sum_over_ranks
     from ...output.inverted_cells import InvertedCells
     from ...scene import build_scene
     from ...study.reader import validate
@@ -53,7 +53,7 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     middle = (domain.lower + domain.upper) / 2
     u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
     state = stepper.with_forces(replace(scene.start(), u=u))
-    energies, newton = [total(comm, scene.balance.stress.stored_energy())[0]], []
+    energies, newton = [sum_over_ranks(comm, scene.balance.stress.stored_energy())[0]], []
     while state.t < study["time"]["end"] * (1 - 1e-12):
         state, report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)

@@ -13,8 +13,8 @@ from fracsim.fracture.brittle.crack_level_set import DirectionField
 from fracsim.fracture.brittle.grains import SurfaceRules
 from fracsim.fracture.brittle.surface_cut import Body
 from fracsim.fracture.brittle.surface_pass import Load, Opened, Pattern
-from fracsim.mesh.split_surface.closed_surface import Split, split
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
 from fracsim.output.surface.fragment_table import volumes
 from fracsim.scene import Scene
@@ -29,7 +29,7 @@ class Broken:
 
     opened: Opened
     places: Values  # (n, d) where edges are cut, m
-    surface: Split
+    surface: SplitSurface
     volumes: Values  # (pieces,) m^d enclosed
 
 
@@ -72,11 +72,11 @@ def open_at(
 
 def after(mesh: MeshData, opened: Opened) -> Broken:
     """The body with what a pass opened."""
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     cut = skeleton.of_edges(opened.keys, opened.cut)
     broken = ~np.isnan(cut)
     bits = 1 << np.arange(skeleton.cell_edges.shape[1])
-    made = split(skeleton, broken[skeleton.cell_edges] @ bits, cut)
+    made = build_split_surface(skeleton, broken[skeleton.cell_edges] @ bits, cut)
     return Broken(opened, cut_points(mesh.points, opened.keys, opened.cut), made, enclosed(made))
 
 
@@ -86,20 +86,20 @@ def cut_points(points: Values, keys: Ints, cut: Values) -> Values:
     return np.asarray(ends[:, 0] + cut[:, None] * (ends[:, 1] - ends[:, 0]))
 
 
-def enclosed(made: Split) -> Values:
+def enclosed(made: SplitSurface) -> Values:
     """(pieces,) volumes inside a surface, by the divergence theorem."""
-    return volumes(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)
+    return volumes(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)
 
 
-def scene_surface(scene: Scene) -> Split:
+def scene_surface(scene: Scene) -> SplitSurface:
     """The split surface of a scene as it stands (serial)."""
     assert scene.domain.source is not None
-    skeleton, graph = Skeleton(scene.domain.source), scene.fracture.graph
+    skeleton, graph = EntityNumbering(scene.domain.source), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
     cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut[own])
     pattern = scene.domain.gather_cells(graph.pattern)
     assert pattern is not None
-    return split(skeleton, pattern, cut)
+    return build_split_surface(skeleton, pattern, cut)
 
 
 def volume_above(mesh: MeshData, point: Values, normal: Values) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fracsim.mesh.halo import Halo
-from fracsim.mesh.parallel import Gather, GatherSome, allgather, alltoall, bcast, gather
+from fracsim.mesh.halo import RankHalo
+from fracsim.mesh.parallel import Gather, GatherSubset, allgather, alltoall, bcast, gather
 
 END = 1500  # elements
 UNIT = 2**31 // 1024
@@ -64,12 +64,12 @@ def main(path: str) -> None:
             Gather(comm, own).scatter(values if rank == 0 else None), values[own]
         )
     which = own % 2 == 0
-    some = GatherSome(comm, own // 2, which)
+    some = GatherSubset(comm, own // 2, which)
     there = some(whole[own])
     result["some"] = there is None or np.array_equal(there, whole[::2])
     back = some.scatter(whole[::2] if rank == 0 else None)
     result["some-back"] = np.array_equal(back, whole[own] * which[:, None, None])
-    near = Halo(comm, np.zeros((300, 2)), 1.0)(rows_of(rank, (300, 9)))
+    near = RankHalo(comm, np.zeros((300, 2)), 1.0)(rows_of(rank, (300, 9)))
     others = [rows_of(each, (300, 9)) for each in range(size) if each != rank]
     result["halo"] = np.array_equal(near, np.concatenate([rows_of(rank, (300, 9)), *others]))
     sent = [rows_of(10 * rank + each, (5000 + 100 * each,)) for each in range(size)]

@@ -32,13 +32,13 @@ def broken_bit_by_bit(dim: int, h: float, order: int) -> npt.NDArray[np.int64]:
         fracture={"strength": 1.0},
     )
     graph, rows = scene.fracture.graph, []
-    follow, turn = incremental_fragments.Parting(graph), _turns(graph)
+    follow, turn = incremental_fragments.IncrementalFragments(graph), _turns(graph)
     for last in np.arange(0, turn[-1] + AT_ONCE, AT_ONCE):
         graph.break_edges(turn[:-1] <= last)
-        everywhere = patch.object(incremental_fragments, "find_pieces", wraps=incremental_fragments.find_pieces)
+        everywhere = patch.object(incremental_fragments, "find_fragments", wraps=incremental_fragments.find_fragments)
         with patch.object(incremental_fragments, "FAR", NEAR), everywhere as searched:
-            pieces = follow.look()
-        of_node = graph.domain.gather_nodes(pieces.of_node[: graph.domain.node_count])
+            pieces = follow.update()
+        of_node = graph.domain.gather_nodes(pieces.node_fragment[: graph.domain.node_count])
         keys = graph.broken_keys()
         if keys is not None:
             assert of_node is not None

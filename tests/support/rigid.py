@@ -16,9 +16,9 @@ from fracsim.mechanics.matrix_assembly import VectorAssembler
 from fracsim.mechanics.stress import DegradationModel, Stress
 from fracsim.mesh.domain import Domain, distribute
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.closed_surface import split
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
-from fracsim.mesh.split_surface.polyhedron_moments import Moments, moments
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from fracsim.mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.breakage import Breakable, Operator, Within
 from fracsim.rigid.free_body_analysis import FreeBody, Stiffness
@@ -66,17 +66,17 @@ def breakable(mesh: MeshData, strength: float, rules: SurfaceRules, poisson: flo
     return Breakable(stiffness, graph, criterion, within)
 
 
-def density_of(bodies: Moments) -> Values:
+def density_of(bodies: PolyhedronMoments) -> Values:
     """(n,) the same everywhere."""
     return np.full(len(bodies.volume), DENSITY)
 
 
-def moments_of(body: Breakable) -> Moments:
+def moments_of(body: Breakable) -> PolyhedronMoments:
     """Of the pieces, from the split surface of the mesh at rest."""
     domain = body.graph.domain
     assert domain.source is not None
-    skeleton = Skeleton(domain.source)
+    skeleton = EntityNumbering(domain.source)
     pattern = np.empty(domain.cell_count, np.uint8)
     pattern[domain.cell_input] = body.graph.pattern
-    made = split(skeleton, pattern)
-    return moments(made.points, made.elements, made.piece_of_point[made.elements[:, 0]], made.pieces)
+    made = build_split_surface(skeleton, pattern)
+    return moments(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)

@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from fracsim.mesh.split_surface.closed_surface import Split, split
-from fracsim.mesh.split_surface.entity_numbering import Skeleton
+from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import oriented, signed_measures
 
@@ -74,18 +74,18 @@ def lattice(*numbers: int, size: float = 1.0) -> MeshData:
     return MeshData(points.astype(float), oriented(points.astype(float), cells)[0])
 
 
-def patterns(skeleton: Skeleton, broken: Flags) -> npt.NDArray[np.uint8]:
+def patterns(skeleton: EntityNumbering, broken: Flags) -> npt.NDArray[np.uint8]:
     """Bit k of a cell: its local edge k is broken."""
     return (broken[skeleton.cell_edges] @ (1 << np.arange(skeleton.cell_edges.shape[1]))).astype(np.uint8)
 
 
-def torn(mesh: MeshData, broken: Flags, cut: Values | None = None) -> Split:
+def torn(mesh: MeshData, broken: Flags, cut: Values | None = None) -> SplitSurface:
     """The split surface of a mesh with broken edges (E,)."""
-    skeleton = Skeleton(mesh)
-    return split(skeleton, patterns(skeleton, broken), cut)
+    skeleton = EntityNumbering(mesh)
+    return build_split_surface(skeleton, patterns(skeleton, broken), cut)
 
 
-def separated(skeleton: Skeleton, part: Ints) -> Flags:
+def separated(skeleton: EntityNumbering, part: Ints) -> Flags:
     """(E,) edges between nodes of different parts (N,)."""
     return part[skeleton.edges[:, 0]] != part[skeleton.edges[:, 1]]
 
@@ -93,7 +93,7 @@ def separated(skeleton: Skeleton, part: Ints) -> Flags:
 # --- what must hold ---
 
 
-def assert_closed(made: Split) -> None:
+def assert_closed(made: SplitSurface) -> None:
     """3D: every directed edge of a triangle stands there once, and once reversed. 2D: a vertex has one in, one out."""
     corners, size = made.elements, len(made.points)
     if corners.shape[1] == 2:
@@ -114,7 +114,7 @@ def enclosed(points: Values, corners: Ints, label: Ints, count: int) -> tuple[Va
     return np.bincount(label, each, minlength=count), slack
 
 
-def assert_volume(mesh: MeshData, made: Split) -> float:
+def assert_volume(mesh: MeshData, made: SplitSurface) -> float:
     """The divergence theorem gives the volume of the mesh; returns the relative error."""
     (found,), slack = enclosed(made.points, made.elements, np.zeros(len(made.elements), int), 1)
     expected = signed_measures(mesh.points, mesh.cells).sum()
@@ -122,14 +122,14 @@ def assert_volume(mesh: MeshData, made: Split) -> float:
     return float(abs(found - expected) / expected)
 
 
-def assert_pieces(mesh: MeshData, made: Split, broken: Flags) -> None:
+def assert_pieces(mesh: MeshData, made: SplitSurface, broken: Flags) -> None:
     """Parts of the surface that share points lie in one component of the graph, and every component has some."""
-    skeleton = Skeleton(mesh)
+    skeleton = EntityNumbering(mesh)
     count, piece = components(len(mesh.points), skeleton.edges[~broken])
-    assert made.pieces == count
-    assert len(np.unique(np.stack([piece, made.piece_of_node]), axis=1).T) == count
-    assert np.all(np.diff(np.unique(made.piece_of_node, return_index=True)[1]) > 0)  # numbered by their lowest node
-    follow = made.follow
+    assert made.fragment_count == count
+    assert len(np.unique(np.stack([piece, made.node_fragment]), axis=1).T) == count
+    assert np.all(np.diff(np.unique(made.node_fragment, return_index=True)[1]) > 0)  # numbered by their lowest node
+    follow = made.parents
     of_parent = piece[follow.parents]
     lowest = np.minimum.reduceat(of_parent, follow.start[:-1])
     assert np.array_equal(lowest, np.maximum.reduceat(of_parent, follow.start[:-1]))  # parents of one piece

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fracsim.fracture.edge_history import EdgeRecord
-from fracsim.mesh.fragments import find_pieces
+from fracsim.mesh.fragments import find_fragments
 from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene
 from fracsim.timestepping.state import State
@@ -35,17 +35,17 @@ class WrittenSurface:
     def result(self, name: str) -> dict[str, npt.NDArray[Any]]:
         """The last frame, on rank 0 (collective)."""
         domain = self._scene.domain
-        of_node = domain.gather_nodes(find_pieces(self._scene.fracture.graph).of_node[: domain.node_count])
+        of_node = domain.gather_nodes(find_fragments(self._scene.fracture.graph).node_fragment[: domain.node_count])
         ours = domain.gather_cells(domain.node_input[domain.cell_nodes])
         if self._output.made is None:
             return {}
         surface, _ = self._output.made
-        made, follow = surface.split, surface.split.follow
+        made, follow = surface.split, surface.split.parents
         assert domain.source is not None
         assert np.array_equal(ours, domain.source.cells)  # patterns are in the local order of the input cells
         arrays = {
             "elements": made.elements, "cell": made.cell, "edge": made.edge, "origin": made.origin,
             "points": made.points, "start": follow.start, "parents": follow.parents, "fill": made.fill,
-            "names": surface.names, "piece": made.piece_of_node, "graph-piece": of_node,
+            "names": surface.names, "piece": made.node_fragment, "graph-piece": of_node,
         }  # fmt: skip
         return {f"surface-{name}-{key}": values for key, values in arrays.items()}

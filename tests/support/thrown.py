@@ -34,9 +34,9 @@ def _held_back(scene: Scene) -> Values:
     """(n, 1) lengths."""
     domain, y = scene.domain, scene.balance.work_vector.duplicate()
     near = np.exp(-100 * np.sum((positions(scene) - 1.0) ** 2, axis=1))
-    y.array_w[:] = np.repeat(100 * domain.mean_edge * near, 3)
+    y.array_w[:] = np.repeat(100 * domain.mean_edge_length * near, 3)
     line_search.clip_correction(domain, y, y)
-    return np.asarray(np.linalg.norm(y.array_r.reshape(-1, 3), axis=1)[:, None] / domain.mean_edge)
+    return np.asarray(np.linalg.norm(y.array_r.reshape(-1, 3), axis=1)[:, None] / domain.mean_edge_length)
 
 
 def compared() -> Found:

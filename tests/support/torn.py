@@ -18,9 +18,9 @@ from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hashed
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.facet_components import parts_of_nodes
-from fracsim.mesh.fragments import find_pieces
-from fracsim.mesh.parallel import total
+from fracsim.mesh.facet_components import node_components
+from fracsim.mesh.fragments import find_fragments
+from fracsim.mesh.parallel import sum_over_ranks
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.multigrid import block_operator
@@ -105,9 +105,9 @@ def pieces(label: str) -> Found:
     of_node = law(domain.nodes)
     ends = of_node[graph.edge_nodes]
     count = graph.break_edges(ends[:, 0] != ends[:, 1])
-    bodies = find_pieces(graph)
+    bodies = find_fragments(graph)
     d = domain.dim
-    piece = domain.gather_nodes(bodies.of_node[: domain.node_count])
+    piece = domain.gather_nodes(bodies.node_fragment[: domain.node_count])
     mass = domain.gather_nodes(scene.balance.mass.lumped[::d])
     return {
         f"pieces-{label}": np.array([bodies.count, count]),
@@ -127,7 +127,7 @@ def edges(domain: Domain) -> Found:
     every = domain.comm.gather((keys, hashed(ends[:, 0] + ends[:, 1])))
     found = {
         "edges-broken": graph.broken_keys(),
-        "edges-count": np.array([count, total(domain.comm, graph.broken_count)[0]]),
+        "edges-count": np.array([count, sum_over_ranks(domain.comm, graph.broken_count)[0]]),
         "edges-patterns": domain.gather_cells(graph.pattern.astype(np.int64)),
     }
     if every is not None:
@@ -196,7 +196,7 @@ def dead_cells(mass: str, *ways: str) -> Found:
         (balance.tangent.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
         found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
         found[f"residual-{name}-dead"] = domain.gather_nodes(balance.update_forces().reshape(-1, domain.dim))
-        found[f"cells-{name}-dead"] = total(domain.comm, len(integrated_cells(scene)))
+        found[f"cells-{name}-dead"] = sum_over_ranks(domain.comm, len(integrated_cells(scene)))
         balance.damage_changed()
     return {f"{mass}-{key}": values for key, values in found.items()}
 
@@ -223,7 +223,7 @@ def hanging() -> Found:
     jacobi = PETSc.PC().create(domain.comm)
     jacobi.setType("jacobi")
     jacobi.setOperators(balance.tangent.matrix)
-    count, part = parts_of_nodes(domain, whole)
+    count, part = node_components(domain, whole)
     loose = create_deflation(balance, jacobi)
     assert loose is not None and loose.update_operator(balance.tangent.matrix)
     x = domain.nodes[: domain.node_count]
@@ -254,7 +254,7 @@ def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) ->
         found[f"{name}-chi"] = domain.gather_cells(scene.balance.stress.chi.x.array[: domain.cell_count])
     if scene.fracture is not None:
         found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
-        found[f"{name}-pieces"] = np.array([find_pieces(scene.fracture.graph).count])
+        found[f"{name}-pieces"] = np.array([find_fragments(scene.fracture.graph).count])
     return found
 
 

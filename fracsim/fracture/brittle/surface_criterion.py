@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
-from ...mesh.parallel import from_root, gather, total
+from ...mesh.parallel import from_root, gather, sum_over_ranks
 from ...mesh.simplices import local_edges
 from ..criterion import Average, CarriedStress, Edges
 from ..strength import Strength
@@ -41,7 +41,7 @@ class BrittleSurfaces:
         self._stress, self._graph, self.strength, self._rules = stress, graph, strength, rules
         self._domain = stress.domain
         self._carried = CarriedStress(stress, graph, average, whole_tensor=True)
-        self.spacing = rules.spacing if rules.spacing is not None else SPACING * self._domain.mean_edge
+        self.spacing = rules.spacing if rules.spacing is not None else SPACING * self._domain.mean_edge_length
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut: Values = np.full(len(graph.broken), np.nan)
         self.kept_back = 0  # surfaces that may not start now
@@ -59,7 +59,7 @@ class BrittleSurfaces:
             return none
         carried, active = self._carried(stress)
         load = self._overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
-        if not total(self._domain.comm, len(load.cell))[0]:
+        if not sum_over_ranks(self._domain.comm, len(load.cell))[0]:
             return none
         parts = gather(self._domain.comm, load)
         field = self._field(self._carried.everywhere(carried, active)) if self._rules.curved else None
@@ -113,7 +113,7 @@ class BrittleSurfaces:
         """
         domain, d = self._domain, self._domain.dim
         x = domain.nodes + self._stress.u.x.array.reshape(-1, d)
-        middles, share = x[domain.cell_middles[cells]], 4 / (d + 1)
+        middles, share = x[domain.cell_midside_nodes[cells]], 4 / (d + 1)
         result: Values = (share - 1) * x[domain.cell_nodes[cells]]
         for number, ends in enumerate(local_edges(d)):
             result[:, ends] += share * middles[:, number, None]

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
-from ...mesh.parallel import total
+from ...mesh.parallel import sum_over_ranks
 from ..degradation import Lost
 from ..fracture_pass import Breaking, PassResult
 from .cohesive_tips import CohesiveTips
@@ -43,10 +43,10 @@ class CohesiveBreaking(Breaking):
         if not self._softer(lost) and self._cut(stress, psi, begins=True):
             lost = self._grown(stress, psi)
         broken = 0
-        if total(self.graph.domain.comm, int(lost.died))[0]:
+        if sum_over_ranks(self.graph.domain.comm, int(lost.died))[0]:
             broken = self.graph.break_edges(self.softening.let_go())
             if broken:
-                broken += self.graph.break_idle()
+                broken += self.graph.break_unloaded_edges()
         if broken or lost.loss:
             self.changed()
         return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died)

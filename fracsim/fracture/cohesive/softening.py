@@ -115,4 +115,4 @@ class Softening:
         gone, held = np.zeros((2, len(cuts.broken)), bool)
         gone[cuts.cell_edges[split & (self._chi == 0)]] = True
         held[cuts.cell_edges[split & (self._chi > 0)]] = True
-        return np.asarray(cuts.broken & cuts.on_any_rank(gone) & ~cuts.on_any_rank(held))
+        return np.asarray(cuts.broken & cuts.any_over_ranks(gone) & ~cuts.any_over_ranks(held))

@@ -102,7 +102,7 @@ class Front:
         """(n, WIDTH) polygons of split cells: four corners in m, and 1 for each side inside the body."""
         corners, faces = (table[self._graph.pattern[cells]] for table in polygons())
         edges = self._graph.cell_edges[cells[:, None], corners]
-        counts = ~self._domain.sides_outside[cells[:, None], faces]
+        counts = ~self._domain.boundary_sides[cells[:, None], faces]
         return np.concatenate([self.places(edges, cut).reshape(len(cells), 12), counts], axis=1)
 
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
-from ...mesh.halo import Halo
+from ...mesh.halo import RankHalo
 from ...mesh.parallel import alltoall
 from ...mesh.small_matrices import barycentric_gradients
 
@@ -72,7 +72,7 @@ def local_size(domain: Domain) -> Values:
 def surface_of(domain: Domain) -> tuple[Values, Values]:
     """(cells, d) int n dA over the facets that cells of this rank have in the body's surface, outwards, and (cells, d)
     the mean of the middles of these facets, m."""
-    corners, outside = domain.nodes[domain.cell_nodes], domain.sides_outside
+    corners, outside = domain.nodes[domain.cell_nodes], domain.boundary_sides
     areas = -domain.dim * domain.volumes[:, None, None] * barycentric_gradients(corners)
     middles = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
     count = np.maximum(outside.sum(axis=1), 1)[:, None]
@@ -145,7 +145,7 @@ class Around:
     def __init__(self, domain: Domain, reach: float) -> None:
         """`reach`: farthest that anybody will look, m (collective)."""
         own = domain.nodes[domain.cell_nodes].mean(axis=1)
-        halo, self._comm = Halo(domain.comm, own, reach), domain.comm
+        halo, self._comm = RankHalo(domain.comm, own, reach), domain.comm
         rank, index = np.full(len(own), float(domain.comm.rank)), np.arange(float(len(own)))
         known = halo(np.column_stack([domain.cell_input, rank, index, domain.volumes, own, *surface_of(domain)]))
         known = known[np.argsort(known[:, 0], kind="stable")]

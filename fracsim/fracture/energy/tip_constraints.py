@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...mesh.edge_graph import EdgeGraph
-from ...mesh.parallel import total
+from ...mesh.parallel import sum_over_ranks
 from ..criterion import Edges
 from ..node_retention import Joining
 from .tip_criterion import CrackTips
@@ -47,7 +47,7 @@ class JoinedTips:
             spared[edges[~self._joining(edges, stress)]] = True
             cells = self._tips.cells
             stuck = cells[spared[graph.cell_edges[cells]].any(axis=1)]
-            if not total(graph.domain.comm, len(stuck))[0]:
+            if not sum_over_ranks(graph.domain.comm, len(stuck))[0]:
                 return edges, load
             barred[stuck] = True
             self._tips.cut[edges] = np.nan

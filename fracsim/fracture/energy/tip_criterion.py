@@ -19,7 +19,7 @@ from ...forms.waves import rayleigh_speed
 from ...mechanics.material_fields import PerCell
 from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
-from ...mesh.parallel import allgather, total
+from ...mesh.parallel import allgather, sum_over_ranks
 from ...mesh.simplices import local_edges
 from ..brittle.principal_stress import directions, largest, material_normals, tensors, upper_bound
 from ..criterion import Edges
@@ -127,7 +127,7 @@ class CrackTips:
         tips = self.tips()
         weak = self._weak(stress)
         waits = self._waiting is not None and self._waiting.holds(self._toughness_at(tips), self._now)
-        found, begun = total(self._domain.comm, np.array([0 if waits else len(tips), len(weak)]))
+        found, begun = sum_over_ranks(self._domain.comm, np.array([0 if waits else len(tips), len(weak)]))
         proposals = [self._grown(self.sight.look(stress, psi)) if found else self._none(0)]
         proposals.append(self._begun(weak, stress) if begun else self._none(1))
         if not found + begun:
@@ -280,7 +280,7 @@ class CrackTips:
         """(edges,) edges of cells, on any rank, that have come apart (collective)."""
         flags = np.zeros(len(self._graph.broken), bool)
         flags[self._graph.cell_edges[self._graph.split]] = True
-        return self._graph.on_any_rank(flags)
+        return self._graph.any_over_ranks(flags)
 
     # --- what is chosen, and cut ---
 
@@ -296,7 +296,7 @@ class CrackTips:
     def _chosen(self, *proposals: Proposal) -> list[Proposal]:
         """The first of those too near to one another: tips before new cracks, then by sigma_1 (collective)."""
         comm, rank = self._domain.comm, np.concatenate([each.rank for each in proposals])
-        if not total(comm, len(rank))[0]:
+        if not sum_over_ranks(comm, len(rank))[0]:
             self._idle = True
             return list(proposals)
         parts = allgather(comm, rank)

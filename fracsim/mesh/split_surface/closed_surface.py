@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from ...meshes.topology import facets_of
 from ..simplices import local_edges
-from .cut_patterns import CELL, EDGE, FACET, Elements, Table, table, table_of_whole_cells
-from .entity_numbering import CRACK, Skeleton
-from .surface_motion import Follow
+from .cut_patterns import CELL, EDGE, FACET, CutTable, PatternElements, cut_table, intact_cell_table
+from .entity_numbering import CRACK, EntityNumbering
+from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -33,7 +33,9 @@ class SurfacePoints:
         group: (copies, d + 1) nodes of the cell that each follows.
     """
 
-    def __init__(self, skeleton: Skeleton, damaged: Ints, pattern: Ints, cut: Values | None, table: Table) -> None:
+    def __init__(
+        self, skeleton: EntityNumbering, damaged: Ints, pattern: Ints, cut: Values | None, table: CutTable
+    ) -> None:
         """`pattern`: of the damaged cells; `cut`: see build.split."""
         self._skeleton, self._copies = skeleton, table.copies
         self._cut = cut if cut is not None and np.isfinite(cut).any() else None
@@ -50,7 +52,7 @@ class SurfacePoints:
         parents = np.concatenate([nodes, skeleton.cells[cell][group]])
         count = np.concatenate([np.ones(len(nodes), np.int64), group.sum(axis=1)])
         self.positions: Values = np.concatenate([skeleton.points[nodes], self._places(row, cell)])
-        self.follow = Follow.of(parents, count, self.positions, skeleton.points)
+        self.parents = PointParents.of(parents, count, self.positions, skeleton.points)
 
     def of_nodes(self, nodes: Ints) -> Ints:
         """Points of nodes that have one: those of the boundary, in 2D all."""
@@ -135,7 +137,7 @@ def _numbered(keys: Ints) -> tuple[Ints, Ints]:
 
 
 @dataclass(frozen=True)
-class Split:
+class SplitSurface:
     """The surface of a state of damage, in the reference configuration.
 
     Attributes:
@@ -149,7 +151,7 @@ class Split:
     """
 
     points: Values
-    follow: Follow
+    parents: PointParents
     elements: Ints
     cell: Ints
     edge: Ints
@@ -157,32 +159,32 @@ class Split:
     fill: Ints
     fill_cell: Ints
     broken: npt.NDArray[np.bool_]
-    pieces: int
-    piece_of_node: Ints
+    fragment_count: int
+    node_fragment: Ints
 
     @property
-    def piece_of_point(self) -> Ints:
+    def point_fragment(self) -> Ints:
         """(n,) the parents of a point are all of one piece."""
-        return self.piece_of_node[self.follow.first_parent]
+        return self.node_fragment[self.parents.first_parent]
 
 
-def split(
-    skeleton: Skeleton,
+def build_split_surface(
+    skeleton: EntityNumbering,
     pattern: npt.NDArray[np.integer],
     cut: Values | None = None,
-    table: Callable[[int], Table] = table,
-) -> Split:
+    table: Callable[[int], CutTable] = cut_table,
+) -> SplitSurface:
     """The surface of damage patterns (C,), as in EdgeGraph.pattern.
 
     `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle. `table`: what the
     patterns mean, by dimension.
     """
-    rows = table if pattern.any() else table_of_whole_cells
+    rows = table if pattern.any() else intact_cell_table
     return _Builder(skeleton, pattern, cut, rows(skeleton.dim))()
 
 
-def points_of(
-    skeleton: Skeleton, pattern: npt.NDArray[np.integer], table: Callable[[int], Table] = table
+def build_surface_points(
+    skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], table: Callable[[int], CutTable] = cut_table
 ) -> SurfacePoints:
     """The points of the same, cut in the middle."""
     damaged = np.flatnonzero(pattern)
@@ -192,7 +194,9 @@ def points_of(
 class _Builder:
     """Works on the damaged cells only; the boundary facets of all others stay as they are."""
 
-    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], cut: Values | None, table: Table) -> None:
+    def __init__(
+        self, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], cut: Values | None, table: CutTable
+    ) -> None:
         self.skeleton, self.table = skeleton, table
         self.damaged = np.flatnonzero(pattern)
         self.pattern = pattern[self.damaged].astype(np.int64)
@@ -201,13 +205,13 @@ class _Builder:
         self.broken = skeleton.broken_edges(pattern)
         self.points = SurfacePoints(skeleton, self.damaged, self.pattern, cut, table)
 
-    def __call__(self) -> Split:
+    def __call__(self) -> SplitSurface:
         parts = self._whole_facets(), self._torn_facets(), self._walls()
         elements, cell, edge, origin = (np.concatenate(each) for each in zip(*parts, strict=True))
         count, piece = self.skeleton.pieces(self.broken)
         points = self.points
-        return Split(
-            points.positions, points.follow, elements, cell, edge, origin, *self._fill(), self.broken, count, piece
+        return SplitSurface(
+            points.positions, points.parents, elements, cell, edge, origin, *self._fill(), self.broken, count, piece
         )
 
     def _whole_facets(self) -> tuple[Ints, ...]:
@@ -229,7 +233,7 @@ class _Builder:
 
     def _walls(self) -> tuple[Ints, ...]:
         """The same of both sides of the cracks."""
-        corners, owner, edge = self._expand(self.table.walls, self.pattern, np.arange(len(self.damaged)))
+        corners, owner, edge = self._expand(self.table.crack_faces, self.pattern, np.arange(len(self.damaged)))
         cell = self.damaged[owner]
         return corners, cell, self.skeleton.cell_edges[cell, edge], np.full(len(cell), CRACK)
 
@@ -242,14 +246,14 @@ class _Builder:
         triangles = np.concatenate([self.skeleton.cells[whole], corners])
         return triangles, np.concatenate([whole, self.damaged[owner]])
 
-    def _expand(self, elements: Elements, key: Ints, place: Ints) -> tuple[Ints, Ints, Ints]:
+    def _expand(self, elements: PatternElements, key: Ints, place: Ints) -> tuple[Ints, Ints, Ints]:
         """(corners, owner, local edge) of the elements of each key; `place` of its damaged cell."""
         row, owner = elements.expand(key)
         of = place[owner]
         return self.points.of_corners(elements.corners[row], of, self.damaged[of]), owner, elements.edge[row]
 
 
-def boundary_corners(skeleton: Skeleton, which: Ints) -> Ints:
+def boundary_corners(skeleton: EntityNumbering, which: Ints) -> Ints:
     """(n, d) nodes of boundary facets, their normals outwards."""
     outward = facets_of(np.arange(skeleton.dim + 1)[None])[0]
     cell, facet = skeleton.boundary[which].T

@@ -36,7 +36,7 @@ Ints = npt.NDArray[np.int64]
 EDGE, FACET, CELL = 0, 1, 2
 
 
-class Copy(NamedTuple):
+class PatternPoint(NamedTuple):
     """A copy of the point of an edge, facet or cell: facet i lies opposite node i, as in DOLFINx."""
 
     kind: int
@@ -44,14 +44,14 @@ class Copy(NamedTuple):
     group: tuple[int, ...]  # local nodes that it follows, ascending
 
 
-Corner = int | Copy  # a node of the cell, or a copy
+Corner = int | PatternPoint  # a node of the cell, or a copy
 
 
 Element = tuple[tuple[Corner, ...], int]  # corners, and the local edge whose breaking opened it (-1: none)
 
 
 @dataclass(frozen=True)
-class Rows:
+class PatternRows:
     """Rows of a table by key: those of key k are start[k] : start[k + 1]."""
 
     start: Ints
@@ -65,7 +65,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Copies(Rows):
+class PatternPoints(PatternRows):
     """Copies of each pattern: kind, entity, lead (lowest local node of the group): (rows,); group (rows, d + 1)."""
 
     kind: Ints
@@ -75,7 +75,7 @@ class Copies(Rows):
 
 
 @dataclass(frozen=True)
-class Elements(Rows):
+class PatternElements(PatternRows):
     """Elements of each key. corners (rows, w): >= 0 a copy of the cell's pattern, -1 - i node i; edge (rows,) or -1."""
 
     corners: Ints
@@ -83,7 +83,7 @@ class Elements(Rows):
 
 
 @dataclass(frozen=True)
-class Table:
+class CutTable:
     """The patterns of a simplex of dimension d.
 
     Attributes:
@@ -92,29 +92,29 @@ class Table:
         fill: by pattern: triangles that cover a cell in 2D, none in 3D.
     """
 
-    copies: Copies
-    walls: Elements
-    facets: Elements
-    fill: Elements
+    copies: PatternPoints
+    crack_faces: PatternElements
+    facets: PatternElements
+    fill: PatternElements
 
 
 @cache
-def table(dim: int) -> Table:
+def cut_table(dim: int) -> CutTable:
     """The table for triangles (8 patterns) or tetrahedra (64), worked out once."""
-    return tabled(Cell, dim)
+    return tabled(CutCell, dim)
 
 
 @cache
-def table_of_whole_cells(dim: int) -> Table:
+def intact_cell_table(dim: int) -> CutTable:
     """The first row of it, which does for a body in which nothing has broken."""
-    return tabled(Cell, dim, 1)
+    return tabled(CutCell, dim, 1)
 
 
-def tabled(kind: type[Cell], dim: int, patterns: int | None = None) -> Table:
+def tabled(kind: type[CutCell], dim: int, patterns: int | None = None) -> CutTable:
     """What that kind of cell makes of every pattern, or of the first few."""
     cells = [kind(dim, pattern) for pattern in range(patterns or 1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
-    return Table(
+    return CutTable(
         _copies(cells, dim),
         _elements([(cell, cell.walls) for cell in cells], dim),
         _elements([(cell, cell.boundary(facet)) for cell in cells for facet in nodes], dim),
@@ -122,7 +122,7 @@ def tabled(kind: type[Cell], dim: int, patterns: int | None = None) -> Table:
     )
 
 
-class Cell:
+class CutCell:
     """One cell with one pattern, in words."""
 
     def __init__(self, dim: int, pattern: int) -> None:
@@ -130,7 +130,7 @@ class Cell:
         pairs: list[list[int]] = local_edges(dim).tolist()  # type: ignore[assignment]
         self.edge = {frozenset(pair): k for k, pair in enumerate(pairs)}
         self.walls = self._walls()
-        used = {corner for corners, _ in self.walls for corner in corners if isinstance(corner, Copy)}
+        used = {corner for corners, _ in self.walls for corner in corners if isinstance(corner, PatternPoint)}
         self.copies = sorted(used)
 
     def broken(self, i: int, j: int) -> bool:
@@ -143,14 +143,14 @@ class Cell:
             found |= more
         return tuple(sorted(found))
 
-    def m(self, i: int, j: int) -> Copy:
-        return Copy(EDGE, self.edge[frozenset((i, j))], (i,))
+    def m(self, i: int, j: int) -> PatternPoint:
+        return PatternPoint(EDGE, self.edge[frozenset((i, j))], (i,))
 
-    def G(self, facet: int, i: int) -> Copy:
-        return Copy(FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
+    def G(self, facet: int, i: int) -> PatternPoint:
+        return PatternPoint(FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
 
-    def T(self, i: int) -> Copy:
-        return Copy(CELL, 0, self.group(range(self.dim + 1), i))
+    def T(self, i: int) -> PatternPoint:
+        return PatternPoint(CELL, 0, self.group(range(self.dim + 1), i))
 
     def _walls(self) -> list[Element]:
         return [element for i, j, *rest in _turned(self.dim) for element in self._wall(i, j, rest)]
@@ -176,7 +176,7 @@ class Cell:
             return [((a, b), -1)]
         return [((a, self.m(a, b)), -1), ((self.m(b, a), b), -1)]
 
-    def fan(self, centre: Callable[[int], Copy], loop: tuple[int, ...]) -> list[Element]:
+    def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
         """A triangle as it is, or as a fan from the copies of its centre."""
         sides = list(zip(loop, loop[1:] + loop[:1], strict=True))
         if not any(self.broken(i, j) for i, j in sides):
@@ -201,37 +201,37 @@ def sign(order: tuple[int, ...]) -> int:
     return -1 if swaps % 2 else 1
 
 
-def _copies(cells: list[Cell], dim: int) -> Copies:
+def _copies(cells: list[CutCell], dim: int) -> PatternPoints:
     rows = [copy for cell in cells for copy in cell.copies]
     group = np.zeros((len(rows), dim + 1), bool)
     for row, copy in zip(group, rows, strict=True):
         row[list(copy.group)] = True
     kind, entity = (np.array([copy[field] for copy in rows], np.int64) for field in (0, 1))
-    return Copies(_starts([cell.copies for cell in cells]), kind, entity, group.argmax(axis=1), group)
+    return PatternPoints(_starts([cell.copies for cell in cells]), kind, entity, group.argmax(axis=1), group)
 
 
-def _elements(lists: list[tuple[Cell, list[Element]]], width: int) -> Elements:
+def _elements(lists: list[tuple[CutCell, list[Element]]], width: int) -> PatternElements:
     corners, edges = [], []
     for cell, elements in lists:
         place = {copy: index for index, copy in enumerate(cell.copies)}
         for element, edge in elements:
-            corners.append([place[corner] if isinstance(corner, Copy) else -1 - corner for corner in element])
+            corners.append([place[corner] if isinstance(corner, PatternPoint) else -1 - corner for corner in element])
             edges.append(edge)
     start = _starts([elements for _, elements in lists])
-    return Elements(start, np.array(corners, np.int64).reshape(-1, width), np.array(edges, np.int64))
+    return PatternElements(start, np.array(corners, np.int64).reshape(-1, width), np.array(edges, np.int64))
 
 
-def _starts(lists: list[list[Element]] | list[list[Copy]]) -> Ints:
+def _starts(lists: list[list[Element]] | list[list[PatternPoint]]) -> Ints:
     return np.concatenate([[0], np.cumsum([len(each) for each in lists])]).astype(np.int64)
 
 
 @cache
-def flat_table(dim: int) -> Table:
+def planar_cut_table(dim: int) -> CutTable:
     """The table of cells that are cut flat, worked out once."""
-    return tabled(FlatCell, dim)
+    return tabled(PlanarCutCell, dim)
 
 
-class FlatCell(Cell):
+class PlanarCutCell(CutCell):
     """A cell that is cut between its groups of nodes; edges within a group count as whole."""
 
     def __init__(self, dim: int, pattern: int) -> None:
@@ -245,7 +245,7 @@ class FlatCell(Cell):
         walls = [corners for part in parts if len(part) < len(nodes) for corners in self._around(part)]
         return [(corners, min(corner.entity for corner in corners)) for corners in walls]
 
-    def _around(self, part: tuple[int, ...]) -> list[tuple[Copy, ...]]:
+    def _around(self, part: tuple[int, ...]) -> list[tuple[PatternPoint, ...]]:
         """Between these nodes and the others, positively ordered as seen from there."""
         part, rest = _ordered(part, tuple(node for node in range(self.dim + 1) if node not in part))
         if len(part) == 1:
@@ -256,7 +256,7 @@ class FlatCell(Cell):
         a, b, c, d = self.m(i, k), self.m(i, last), self.m(j, last), self.m(j, k)
         return [(a, b, c), (a, c, d)]  # along the same diagonal from both sides: middles
 
-    def fan(self, centre: Callable[[int], Copy], loop: tuple[int, ...]) -> list[Element]:
+    def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
         """A triangle, without a centre."""
         corners: list[tuple[Corner, ...]] = []
         turns = [loop, (*loop[1:], loop[0]), (*loop[2:], *loop[:2])]

@@ -18,7 +18,7 @@ Values = npt.NDArray[np.float64]
 CRACK, BODY = 0, 1  # origins of elements that are on no boundary facet
 
 
-class Skeleton(MeshTopology):
+class EntityNumbering(MeshTopology):
     """A mesh with its facets as well.
 
     Attributes:
@@ -36,7 +36,7 @@ class Skeleton(MeshTopology):
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
 
-    def moved(self, points: Values) -> Skeleton:
+    def moved(self, points: Values) -> EntityNumbering:
         """The same with nodes at other places (N, d), m."""
         if points is self.points:
             return self

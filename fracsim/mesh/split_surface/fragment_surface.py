@@ -17,10 +17,10 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, eye_array
 
 from ..simplices import is_split, local_edges
-from .closed_surface import Split, SurfacePoints, points_of, split
-from .cut_patterns import EDGE, FACET, flat_table, middles
-from .entity_numbering import Skeleton
-from .surface_map import Places, whole
+from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, build_surface_points
+from .cut_patterns import EDGE, FACET, middles, planar_cut_table
+from .entity_numbering import EntityNumbering
+from .surface_map import SurfaceMap, whole
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -29,19 +29,19 @@ Patterns = npt.NDArray[np.integer]
 KEPT = 0.15  # of an edge
 
 
-def split_of_pieces(skeleton: Skeleton, pattern: Patterns, cut: Values | None = None) -> Split:
+def build_fragment_surface(skeleton: EntityNumbering, pattern: Patterns, cut: Values | None = None) -> SplitSurface:
     """The split surface of damage patterns (C,) without the elements of loose nodes, which have no whole cell, and
     without walls between nodes of one piece: edges are open that join other pieces, or lead to loose nodes. `cut`: (E,)
     as for `split`, but no nearer to an end than KEPT: what is thinner has no room for contact."""
     apart, loose, _ = parted(skeleton, pattern)
     cut = None if cut is None else np.clip(cut, KEPT, 1 - KEPT)
-    made = split(skeleton, patterns_of(skeleton, apart), cut, flat_table)
-    kept = ~loose[made.follow.first_parent[made.elements[:, 0]]]  # all corners of an element follow the same side
+    made = build_split_surface(skeleton, patterns_of(skeleton, apart), cut, planar_cut_table)
+    kept = ~loose[made.parents.first_parent[made.elements[:, 0]]]  # all corners of an element follow the same side
     each = {name: getattr(made, name)[kept] for name in ("elements", "cell", "edge", "origin")}
     return replace(made, **each)
 
 
-def is_same_solid(skeleton: Skeleton, pattern: Patterns, before: Patterns) -> bool:
+def has_same_fragments(skeleton: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
     """Whether damage patterns (C,) of now and of before have the same surface of pieces, and the same cells say how it
     moves with its nodes: cracks within a piece change neither."""
     apart, loose, _ = parted(skeleton, pattern)
@@ -54,7 +54,7 @@ def is_same_solid(skeleton: Skeleton, pattern: Patterns, before: Patterns) -> bo
     return np.array_equal(gone[pattern[at]], gone[before[at]])
 
 
-def parted(skeleton: Skeleton, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
+def parted(skeleton: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
     """(E,) open edges, (N,) loose nodes, and what (N,) holds together without edges that are broken or lead there."""
     loose = np.ones(len(skeleton.points), bool)
     loose[skeleton.cells[pattern == 0]] = False
@@ -64,35 +64,39 @@ def parted(skeleton: Skeleton, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
     return cut & (piece[ends[:, 0]] != piece[ends[:, 1]]), loose, piece
 
 
-def patterns_of(skeleton: Skeleton, broken: Flags) -> Patterns:
+def patterns_of(skeleton: EntityNumbering, broken: Flags) -> Patterns:
     """(C,) patterns of the cells with `broken` (E,) edges."""
     bits = np.arange(skeleton.cell_edges.shape[1])
     return np.asarray((broken[skeleton.cell_edges] << bits).sum(axis=1), np.uint8)
 
 
-def laid(at: Places, skeleton: Skeleton, pattern: npt.NDArray[np.integer], flat: Places) -> Places:
+def project_onto_fragments(
+    at: SurfaceMap, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
+) -> SurfaceMap:
     """The points of `split` with those on walls between pieces where `flat` has those of `split_of_pieces`.
 
     Where a crack within the piece has come to one its sides are there at rest, and go with their own nodes from then
     on. Nodes without a whole cell keep their walls.
     """
-    drawn = points_of(skeleton, pattern)
+    drawn = build_surface_points(skeleton, pattern)
     points, mean, cracked = _on_flat(skeleton, pattern, drawn)
-    at = at.laid_on(points[~cracked], mean[~cracked], flat)
+    at = at.projected_onto(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
         return at
     places, beside = drawn.positions.copy(), points[cracked]
     places[beside] = mean[cracked] @ flat.rest
-    return at.laid_on(beside, eye_array(len(places), format="csr")[beside], whole(drawn, skeleton, pattern, places))
+    return at.projected_onto(
+        beside, eye_array(len(places), format="csr")[beside], whole(drawn, skeleton, pattern, places)
+    )
 
 
 def _on_flat(
-    skeleton: Skeleton, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
+    skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
 ) -> tuple[Ints, csr_matrix, Flags]:
     """Numbers (k,) of the points `drawn` on walls between pieces, rows (k, m) of which points of the flat surface each
     is the mean, and flags (k,) of those beside a crack within the piece."""
     apart, loose, piece = parted(skeleton, pattern)
-    flat = points_of(skeleton, patterns_of(skeleton, apart), flat_table)
+    flat = build_surface_points(skeleton, patterns_of(skeleton, apart), planar_cut_table)
     node = skeleton.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
     own = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]
@@ -120,14 +124,14 @@ def _within(points: SurfacePoints, dim: int) -> Flags:
     return result
 
 
-def _keys(skeleton: Skeleton, flat: SurfacePoints) -> Ints:
+def _keys(skeleton: EntityNumbering, flat: SurfacePoints) -> Ints:
     """(copies,) that of each point, all on edges: ascending, as they are numbered."""
     edge = skeleton.cell_edges[flat.cell, flat.entity]
     end = skeleton.cells[flat.cell, flat.group.argmax(axis=1)]
     return np.asarray(2 * edge + (end == skeleton.edges[edge, 1]))
 
 
-def _key(skeleton: Skeleton, ends: Ints) -> Ints:
+def _key(skeleton: EntityNumbering, ends: Ints) -> Ints:
     """(k,) of the points of the edges between nodes (k, 2) that follow the first of them."""
     edge = skeleton.find_edges(ends)
     return np.asarray(2 * edge + (ends[:, 0] == skeleton.edges[edge, 1]))

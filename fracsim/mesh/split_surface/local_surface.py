@@ -25,10 +25,10 @@ from ...meshes.data import MeshData
 from ..domain import Domain
 from ..parallel import offset
 from ..simplices import is_split
-from .closed_surface import Split, split
-from .entity_numbering import CRACK, Skeleton
-from .point_matching import identity
-from .surface_map import Places, gradient_entries, middles
+from .closed_surface import SplitSurface, build_split_surface
+from .entity_numbering import CRACK, EntityNumbering
+from .point_matching import point_identity
+from .surface_map import SurfaceMap, gradient_entries, middles
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -46,32 +46,32 @@ class LocalSurface:
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
         mesh = _mesh_of(domain)
-        self._skeleton = Skeleton(mesh)
-        self.follow_damage(np.zeros(len(mesh.cells), np.uint8))
+        self._skeleton = EntityNumbering(mesh)
+        self.update_damage(np.zeros(len(mesh.cells), np.uint8))
 
-    def follow_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
+    def update_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Be the surface of a body with these patterns of broken edges, (cells,) (collective)."""
-        made = split(self._skeleton, pattern)
+        made = build_split_surface(self._skeleton, pattern)
         if self._domain.order == 2:
-            from .quadratic_surface import with_middles_of
+            from .quadratic_surface import with_midside_points
 
-            made = with_middles_of(made, self._domain, pattern)
+            made = with_midside_points(made, self._domain, pattern)
         area = _areas(made, self._skeleton)
         self._touching = np.flatnonzero(area > 0)
         self.area, self._made = area[self._touching], made
         means = self._means(made)
-        turning = self._domain.comm.allreduce(len(made.follow.turning)) > 0
+        turning = self._domain.comm.allreduce(len(made.parents.rotating_nodes)) > 0
         arms = self._arms(made, pattern) if turning else csr_matrix(means.shape)
         self.columns, (means, arms) = _on_columns([means, arms])
-        middle = middles(made.points, made.follow)[self._touching]
+        middle = middles(made.points, made.parents)[self._touching]
         out = made.points[self._touching] - middle
-        self.at = Places(means, middle, arms, out)
+        self.at = SurfaceMap(means, middle, arms, out)
 
     def identity(self, points: Ints | None = None) -> Values:
         """(k, 2 d + 1) rows that tell `points` (k,), or the copies `at.copies`, from all others, whatever breaks
         (split.identity)."""
         domain, which = self._domain, self.at.copies if points is None else points
-        return identity(self._made, self._touching[which], domain.node_input, domain.size)
+        return point_identity(self._made, self._touching[which], domain.node_input, domain.size)
 
     def facets(self) -> tuple[Ints, Values]:
         """(m, d) points of the elements that make up the areas of points, and their measures (m,), m^2 (2D: m)."""
@@ -79,16 +79,16 @@ class LocalSurface:
         real = measure > 0
         return np.searchsorted(self._touching, elements[real]), measure[real]
 
-    def _means(self, made: Split) -> csr_matrix:
+    def _means(self, made: SplitSurface) -> csr_matrix:
         """(points, nodes of all ranks) means over the parents of each point."""
         start, of = _parents_of(made, self._touching)
-        return self._wide(start, self._global(made.follow.parents[of]), _shares(start))
+        return self._wide(start, self._global(made.parents.parents[of]), _shares(start))
 
-    def _arms(self, made: Split, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
+    def _arms(self, made: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
         """(points, nodes of all ranks) arms times the averages of gradients, means over the parents (collective)."""
         comm, d = self._domain.comm, self._domain.dim
         start, of = _parents_of(made, self._touching)
-        parents, arm = made.follow.parents[of], made.follow.arm[of]
+        parents, arm = made.parents.parents[of], made.parents.arm[of]
         arms = self._wide(d * start, _by_axis(self._global(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d)
         count = arms.shape[0]
         left = _assembled(comm, (count, d * self._domain.node_count), arms, offset(comm, count) + np.arange(count))
@@ -157,7 +157,7 @@ def _mesh_of(domain: Domain) -> MeshData:
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 
 
-def _touched(made: Split, skeleton: Skeleton) -> tuple[Ints, Values]:
+def _touched(made: SplitSurface, skeleton: EntityNumbering) -> tuple[Ints, Values]:
     """(m, d) elements of cracks and of the body's own boundary, and their measures (m,)."""
     outside = np.flatnonzero([OUTSIDE in name for name in skeleton.origins])
     elements = made.elements[np.isin(made.origin, [CRACK, *outside])]
@@ -168,16 +168,16 @@ def _touched(made: Split, skeleton: Skeleton) -> tuple[Ints, Values]:
     return elements, np.linalg.norm(spanned, axis=1) / 2
 
 
-def _areas(made: Split, skeleton: Skeleton) -> Values:
+def _areas(made: SplitSurface, skeleton: EntityNumbering) -> Values:
     """(points,) a d-th of the measure of the elements around each."""
     elements, measure = _touched(made, skeleton)
     shares = np.repeat(measure / skeleton.dim, skeleton.dim)
     return np.asarray(np.bincount(elements.reshape(-1), shares, len(made.points)), np.float64)
 
 
-def _parents_of(made: Split, points: Ints) -> tuple[Ints, Ints]:
+def _parents_of(made: SplitSurface, points: Ints) -> tuple[Ints, Ints]:
     """Of k points: (k + 1,) where the parents of each begin, and the places of these in `follow.parents`."""
-    begin, count = made.follow.start[points], np.diff(made.follow.start)[points]
+    begin, count = made.parents.start[points], np.diff(made.parents.start)[points]
     start = np.concatenate([[0], np.cumsum(count)])
     return start, np.repeat(begin - start[:-1], count) + np.arange(start[-1])
 
@@ -203,7 +203,7 @@ def _on_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
     return columns, [csr_matrix((each.data, place[each.indices], each.indptr), shape=shape) for each in matrices]
 
 
-class Following:
+class ParentMatrix:
     """Carries values between the nodes of a body, wherever they are, and the points of this rank's surface.
 
     Attributes:
@@ -230,7 +230,7 @@ class Following:
         self._scatter.scatter(self._nodes, self._here, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
         return np.asarray(self._here.array_r.reshape(-1, self.dim))
 
-    def handed_down(self, forces: Values) -> Values:
+    def assemble_to_nodes(self, forces: Values) -> Values:
         """(owned dofs,) nodal forces of forces (n, d) at the points, N (collective)."""
         return self.summed(self._surface.at.weights.T @ forces)
 

@@ -24,7 +24,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Moments:
+class PolyhedronMoments:
     """Of n bodies.
 
     Attributes:
@@ -50,7 +50,7 @@ def cones(x: Values) -> Values:
     return np.asarray(np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2]))) / 6
 
 
-def moments(points: Values, elements: Ints, body: Ints, count: int) -> Moments:
+def moments(points: Values, elements: Ints, body: Ints, count: int) -> PolyhedronMoments:
     """Moments of `count` bodies from the points (n, d) of their closed surfaces and the elements (m, d), each of the
     body that `body` (m,) says."""
     d = points.shape[1]
@@ -62,4 +62,4 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Moments:
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
     across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]
     about = second.reshape(-1, d, d) / ((d + 1) * (d + 2)) - across
-    return Moments(volume[:, 0], near + arm, about)
+    return PolyhedronMoments(volume[:, 0], near + arm, about)

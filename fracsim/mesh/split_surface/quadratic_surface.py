@@ -15,11 +15,11 @@ import numpy.typing as npt
 from ...meshes.data import MeshData
 from ...meshes.topology import oriented
 from ..domain import Domain
-from ..midside_nodes import with_middles
+from ..midside_nodes import with_midside_nodes
 from ..simplices import local_edges
-from .closed_surface import Split
+from .closed_surface import SplitSurface
 from .entity_numbering import CRACK
-from .surface_motion import Follow
+from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
 
@@ -38,23 +38,23 @@ SMALL = {
 }  # fmt: skip
 
 
-def with_middles_of(made: Split, domain: Domain, pattern: npt.NDArray[np.integer]) -> Split:
+def with_midside_points(made: SplitSurface, domain: Domain, pattern: npt.NDArray[np.integer]) -> SplitSurface:
     """The surface of this rank's straight cells with 2 segments (2D) or 4 triangles for each facet of the body's own
     boundary whose cell is whole: the middles come after all its points, and follow themselves alone."""
     on_boundary = (made.edge < 0) & (made.origin != CRACK) & (pattern[made.cell] == 0)
     facets, cell = made.elements[on_boundary], made.cell[on_boundary]
     i, j = local_edges(domain.dim - 1).T
-    between = _middle_of(domain, cell, made.follow.first_parent[facets[:, i]], made.follow.first_parent[facets[:, j]])
+    between = _middle_of(domain, cell, made.parents.first_parent[facets[:, i]], made.parents.first_parent[facets[:, j]])
     nodes, place = np.unique(between, return_inverse=True)
     smaller = _all_cut(_between(facets, len(made.points) + place.reshape(between.shape)))
     rest, each = ~on_boundary, len(SMALL[domain.dim - 1])
-    count = np.concatenate([np.diff(made.follow.start), np.ones(len(nodes), np.int64)])
+    count = np.concatenate([np.diff(made.parents.start), np.ones(len(nodes), np.int64)])
     points = np.concatenate([made.points, domain.nodes[nodes]])
-    parents = np.concatenate([made.follow.parents, nodes])
+    parents = np.concatenate([made.parents.parents, nodes])
     return replace(
         made,
         points=points,
-        follow=Follow.of(parents, count, points, domain.nodes),
+        parents=PointParents.of(parents, count, points, domain.nodes),
         elements=np.concatenate([made.elements[rest], smaller]),
         cell=np.concatenate([made.cell[rest], np.repeat(cell, each)]),
         edge=np.concatenate([made.edge[rest], np.full(len(smaller), -1)]),
@@ -67,15 +67,15 @@ def _middle_of(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
     ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]  # (m, edges, 2)
     pair = np.sort(np.stack([low, high], axis=-1), axis=-1)
     same = (pair[:, :, None] == np.sort(ends, axis=-1)[:, None]).all(axis=-1)
-    return np.asarray(np.take_along_axis(domain.cell_middles[cell], same.argmax(axis=-1), axis=1), np.int64)
+    return np.asarray(np.take_along_axis(domain.cell_midside_nodes[cell], same.argmax(axis=-1), axis=1), np.int64)
 
 
 def refined_input(domain: Domain) -> MeshData | None:
     """The input mesh on rank 0, where displacement is quadratic with its cells cut up, without groups; its points are
     those that `Domain.node_input` numbers. None elsewhere."""
-    if domain.middles is None or domain.source is None:
+    if domain.midside_nodes is None or domain.source is None:
         return domain.source
-    whole = with_middles(domain.source, domain.middles, written=False)
+    whole = with_midside_nodes(domain.source, domain.midside_nodes, written=False)
     cells = _all_cut(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, oriented(whole.points, cells)[0])
 

@@ -15,14 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
 
-from .entity_numbering import Skeleton
+from .entity_numbering import EntityNumbering
 
 Values = npt.NDArray[np.float64]
 KEPT = 0.15  # of an edge: what each end has of it at least
 DAMPING, TIMES = 0.5, 30
 
 
-def smooth_cuts(skeleton: Skeleton, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
+def smooth_cuts(skeleton: EntityNumbering, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
     """(E,) shares of edges from the lower node, NaN of whole ones; those that have a place in `cut` (E,) keep it."""
     result = np.full(len(broken), np.nan)
     at = np.flatnonzero(broken)
@@ -44,7 +44,7 @@ def smooth_cuts(skeleton: Skeleton, broken: npt.NDArray[np.bool_], cut: Values |
     return result
 
 
-def _neighbours(skeleton: Skeleton, broken: npt.NDArray[np.bool_]) -> coo_matrix:
+def _neighbours(skeleton: EntityNumbering, broken: npt.NDArray[np.bool_]) -> coo_matrix:
     """(n, n) rows are means over the broken edges that share a cell with a broken edge, itself among them."""
     cells = np.flatnonzero(broken[skeleton.cell_edges].any(axis=1))
     row, column = np.nonzero(broken[skeleton.cell_edges[cells]])

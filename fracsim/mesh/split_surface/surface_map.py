@@ -16,15 +16,15 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, diags
 
 from ..simplices import is_split
-from .closed_surface import Split, SurfacePoints
-from .entity_numbering import Skeleton
-from .surface_motion import Follow
+from .closed_surface import SplitSurface, SurfacePoints
+from .entity_numbering import EntityNumbering
+from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-class Places:
+class SurfaceMap:
     """Where n points are, at shares of their arms; never changed.
 
     Attributes:
@@ -52,40 +52,42 @@ class Places:
         """(n, nodes) w."""
         return (self._mean + diags(self.share) @ self._arms).tocsr()
 
-    def drawn_in(self, share: Values) -> Places:
+    def with_arm_share(self, share: Values) -> SurfaceMap:
         """The points with `share` (n,) of their arms."""
-        return Places(self._mean, self._middle, self._arms, self._out, share)
+        return SurfaceMap(self._mean, self._middle, self._arms, self._out, share)
 
-    def laid_on(self, points: Ints, mean: csr_matrix, other: Places) -> Places:
+    def projected_onto(self, points: Ints, mean: csr_matrix, other: SurfaceMap) -> SurfaceMap:
         """With `points` (k,) at means, rows (k, m), of the points of `other` once their arms are whole."""
         n = len(self.share)
         to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
         keep, out = diags(1.0 - np.bincount(points, minlength=n)), self._out.copy()
         out[points] = mean @ other.rest - self._middle[points]
         arms = keep @ self._arms + to @ (mean @ other.weights - self._mean[points])
-        return Places(self._mean, self._middle, arms.tocsr(), out, self.share)
+        return SurfaceMap(self._mean, self._middle, arms.tocsr(), out, self.share)
 
     def __call__(self, u: Values) -> Values:
         """(n, d) x of nodal displacements (nodes, d), m."""
         return np.asarray(self.rest + self.weights @ u)
 
-    def some(self, u: Values, points: Ints, share: Values) -> Values:
+    def evaluate_points(self, u: Values, points: Ints, share: Values) -> Values:
         """(k, d) x of some points at other shares (k,); u (nodes, d), m."""
         middle = self._middle[points] + self._mean[points] @ u
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
 
 
-def middles(points: Values, follow: Follow) -> Values:
+def middles(points: Values, follow: PointParents) -> Values:
     """(n, d) means of the parents of reference `points` (n, d), m."""
     start = follow.start
     result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     return result
 
 
-def whole(made: Split | SurfacePoints, skeleton: Skeleton, pattern: npt.NDArray[np.integer], places: Values) -> Places:
+def whole(
+    made: SplitSurface | SurfacePoints, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], places: Values
+) -> SurfaceMap:
     """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
     that has the whole mesh."""
-    d, count, follow = skeleton.dim, len(places), made.follow
+    d, count, follow = skeleton.dim, len(places), made.parents
     parents = np.diff(follow.start)
     rows = np.repeat(np.arange(count), parents)
     share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
@@ -102,7 +104,7 @@ def whole(made: Split | SurfacePoints, skeleton: Skeleton, pattern: npt.NDArray[
     arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
                       shape=(count, d * follow.nodes))  # fmt: skip
     middle = np.asarray(mean @ skeleton.points)
-    return Places(mean, middle, (arms @ gradients).tocsr(), places - middle)
+    return SurfaceMap(mean, middle, (arms @ gradients).tocsr(), places - middle)
 
 
 def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:

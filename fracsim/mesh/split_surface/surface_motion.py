@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..simplices import is_split, local_edges
 from ..small_matrices import polar_rotation
-from .entity_numbering import Skeleton
+from .entity_numbering import EntityNumbering
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -28,7 +28,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Follow:
+class PointParents:
     """Parents of n points, by rows.
 
     Attributes:
@@ -44,7 +44,7 @@ class Follow:
     nodes: int
 
     @classmethod
-    def of(cls, parents: Ints, count: Ints, points: Values, node_points: Values) -> Follow:
+    def of(cls, parents: Ints, count: Ints, points: Values, node_points: Values) -> PointParents:
         """`count` (n,) of parents of each point, at `points` (n, d)."""
         arm = np.repeat(points, count, axis=0) - node_points[parents]
         return cls(np.concatenate([[0], np.cumsum(count)]), parents, arm, len(node_points))
@@ -62,7 +62,7 @@ class Follow:
         return csr_matrix((np.repeat(1.0 / count, count), self.parents, self.start), shape=(len(count), self.nodes))
 
     @cached_property
-    def turning(self) -> Ints:
+    def rotating_nodes(self) -> Ints:
         """Nodes whose rotation matters: parents of points that are not where the parent is."""
         return np.unique(self.parents[np.any(self.arm != 0, axis=1)])
 
@@ -79,7 +79,7 @@ class Follow:
     def displacement(self, u: Values, rotation: Values) -> Values:
         """(n, d) x - X = mean of u_p + (R_p - 1)(X - X_p); `rotation` (turning, d, d), u (nodes, d) in m."""
         place = np.full(self.nodes, -1)
-        place[self.turning] = np.arange(len(self.turning))
+        place[self.rotating_nodes] = np.arange(len(self.rotating_nodes))
         entry = np.flatnonzero(np.any(self.arm != 0, axis=1))
         arm = self.arm[entry]
         each = u[self.parents]
@@ -87,14 +87,14 @@ class Follow:
         return self._mean(each)
 
 
-class Rotations:
+class NodalRotations:
     """R of some nodes: the polar rotation of the volume average of F over the whole (not split) cells around each.
 
     A node that has none turns with those that it is joined to; where these have none either its fragment is smaller
     than a cell and its rotation unknown: identity.
     """
 
-    def __init__(self, skeleton: Skeleton, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
+    def __init__(self, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
         d = skeleton.dim
         nodes, self._of = np.unique(_turning_with(skeleton, pattern)[nodes], return_inverse=True)
         place = np.full(len(skeleton.points), -1)
@@ -129,7 +129,7 @@ class Rotations:
         return polar_rotation(F)[self._of]
 
 
-def _turning_with(skeleton: Skeleton, pattern: npt.NDArray[np.integer]) -> Ints:
+def _turning_with(skeleton: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
     """(nodes,) the node whose rotation each node has: its own where it has a whole cell, else that of the nearest one
     with such a cell over intact edges, of these the first; its own, too, where there is none."""
     result = np.arange(len(skeleton.points))

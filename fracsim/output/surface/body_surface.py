@@ -10,21 +10,21 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import NotConverged
-from ...mesh.split_surface.closed_surface import Split, split
-from ...mesh.split_surface.entity_numbering import BODY, Skeleton
-from ...mesh.split_surface.surface_motion import Rotations
+from ...mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ...mesh.split_surface.entity_numbering import BODY, EntityNumbering
+from ...mesh.split_surface.surface_motion import NodalRotations
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
 from ..fields_file import Field
 from .fragment_table import Fragments, PieceNames, fragments, sums, volumes
 
 if TYPE_CHECKING:
-    from ...mesh.split_surface.surface_map import Places
+    from ...mesh.split_surface.surface_map import SurfaceMap
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Arrays = dict[str, npt.NDArray[np.generic]]
-type Apart = Callable[[Places, Ints, Values, float], Places]  # of where points are, their elements, u and t
+type Apart = Callable[[SurfaceMap, Ints, Values, float], SurfaceMap]  # of where points are, their elements, u and t
 FARTHEST = float(np.finfo(np.float32).max)  # viewers draw in single precision
 
 
@@ -61,13 +61,13 @@ class Surface:
         builds: how often it was built.
     """
 
-    split: Split
+    split: SplitSurface
 
     def __init__(self, mesh: MeshData, density: Values | float, *, smooth: bool = False) -> None:
         """`density`: kg/m^3, one number or (C,).    `smooth`: edges without a place of their cut get one that makes
         cracks smooth."""
         self._smooth = smooth
-        self.skeleton = Skeleton(mesh)
+        self.skeleton = EntityNumbering(mesh)
         volume = signed_measures(mesh.points, mesh.cells)
         share = np.broadcast_to((density * volume / (mesh.dim + 1))[:, None], mesh.cells.shape)
         self.mass = sums(mesh.cells.ravel(), share.ravel(), len(mesh.points))
@@ -100,14 +100,14 @@ class Surface:
             from ...mesh.split_surface.smooth_cuts import smooth_cuts
 
             cut = smooth_cuts(self.skeleton, self.skeleton.broken_edges(self._pattern), cut)
-        made = split(self.skeleton, self._pattern, cut)
+        made = build_split_surface(self.skeleton, self._pattern, cut)
         self.split = made
-        self.names = self._names.update(made.pieces, made.piece_of_node, self.mass)
-        piece = made.piece_of_point
-        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.pieces)
-        self._rotations = Rotations(self.skeleton, self._pattern, made.follow.turning)
+        self.names = self._names.update(made.fragment_count, made.node_fragment, self.mass)
+        piece = made.point_fragment
+        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.fragment_count)
+        self._rotations = NodalRotations(self.skeleton, self._pattern, made.parents.rotating_nodes)
         self._piece = self.names[piece]
-        self._linear: Places | None = None
+        self._linear: SurfaceMap | None = None
         self.builds += 1
 
     def at(
@@ -128,7 +128,7 @@ class Surface:
         NotConverged, naming piece and cell, where a node has gone astray.
         """
         self._check(t, u, v)
-        made, follow = self.split, self.split.follow
+        made, follow = self.split, self.split.parents
         moved = self._moved(t, u, apart)
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
         at_points: Arrays = {"displacement": moved, "velocity": follow.mean(v), "piece": self._piece.astype(np.int32)}
@@ -136,7 +136,7 @@ class Surface:
         triangles, segments, cell, at_elements = self._elements()
         at_elements["age"] = self._ages(t, broken_at)
         at_elements |= {field.name: field.values[cell] for field in fields if field.centre == "Cell"}
-        figures = fragments(self.names, made.piece_of_node, self.mass, self.volume, self.skeleton.points + u, v)
+        figures = fragments(self.names, made.node_fragment, self.mass, self.volume, self.skeleton.points + u, v)
         points, origins = made.points + moved, self.skeleton.origins
         return Frame(t, points, triangles, segments, at_points, at_elements, origins, figures)
 
@@ -156,7 +156,7 @@ class Surface:
         """(n, d) displacements of the points, m."""
         made = self.split
         if not apart:
-            return made.follow.displacement(u, self._rotations(u))
+            return made.parents.displacement(u, self._rotations(u))
         if self._linear is None:
             from ...mesh.split_surface.surface_map import whole
 
@@ -173,7 +173,7 @@ class Surface:
         cell = np.concatenate([made.fill_cell, made.cell])
         origin = np.concatenate([np.full(len(made.fill), BODY), made.origin])
         piece = self._piece[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
-        alone = np.bincount(made.piece_of_node)[made.piece_of_point] == 1
+        alone = np.bincount(made.node_fragment)[made.point_fragment] == 1
         dust = alone[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
         fixed = {"piece": piece, "origin": origin, "cell": cell, "dust": dust}
         return triangles, segments, cell, {name: values.astype(np.int32) for name, values in fixed.items()}
@@ -193,7 +193,7 @@ class Surface:
             if len(lost):
                 node = lost[0]
                 cell = int(np.argmax(np.any(self.skeleton.cells == node, axis=1)))
-                piece = self.names[self.split.piece_of_node[node]]
+                piece = self.names[self.split.node_fragment[node]]
                 raise NotConverged(
                     f"the surface at t = {t:g} s was not written: node {node} of piece {piece} (cell {cell}) has the "
                     f"{what} {values[node]}; {len(lost)} nodes are not numbers below {FARTHEST:.0e}; "

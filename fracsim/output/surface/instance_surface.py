@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ...mesh.split_surface.closed_surface import Split, split
-from ...mesh.split_surface.entity_numbering import Skeleton
-from ...mesh.split_surface.surface_motion import Follow
+from ...mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ...mesh.split_surface.entity_numbering import EntityNumbering
+from ...mesh.split_surface.surface_motion import PointParents
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
 from ...rigid.instance_placement import Poses
@@ -30,12 +30,12 @@ class SurfaceOfCopies(Surface):
 
     def __init__(self, mesh: MeshData, poses: Poses, density: float) -> None:
         """`poses`: where the copies are at rest; `density`: kg/m^3."""
-        self.skeleton, self._poses, self._names, self.builds = Skeleton(mesh), poses, PieceNames(), 0
+        self.skeleton, self._poses, self._names, self.builds = EntityNumbering(mesh), poses, PieceNames(), 0
         count = len(poses)
         share = np.repeat(density * signed_measures(mesh.points, mesh.cells) / (mesh.dim + 1), mesh.dim + 1)
         self.mass = np.tile(sums(mesh.cells.ravel(), share, len(mesh.points)), count)
         self._pattern: Patterns = np.zeros(count * len(mesh.cells), np.uint8)
-        self._parts = count * [split(self.skeleton, self._pattern[: len(mesh.cells)])]
+        self._parts = count * [build_split_surface(self.skeleton, self._pattern[: len(mesh.cells)])]
         self._of = self._pattern.reshape(count, -1).copy()  # of the parts
         self._dented: dict[int, Values] = {}
         self._build(None)
@@ -45,7 +45,7 @@ class SurfaceOfCopies(Surface):
         new = [number for number, each in points.items() if each is not self._dented.get(number)]
         for number in new:
             self._dented[number] = points[number]
-            self._parts[number] = split(self.skeleton.moved(points[number]), self._of[number])
+            self._parts[number] = build_split_surface(self.skeleton.moved(points[number]), self._of[number])
         if new:
             self._join()
 
@@ -75,20 +75,22 @@ class SurfaceOfCopies(Surface):
         pattern = self._pattern.reshape(len(self._poses), -1)
         cuts = None if cut is None else cut.reshape(len(self._poses), -1)
         for number in np.flatnonzero((pattern != self._of).any(axis=1)):
-            self._parts[number] = split(self.skeleton, pattern[number], None if cuts is None else cuts[number])
+            self._parts[number] = build_split_surface(
+                self.skeleton, pattern[number], None if cuts is None else cuts[number]
+            )
             self._of[number] = pattern[number]
         self._join()
 
     def _join(self) -> None:
         self.split = made = joined(self._parts, self.skeleton, self._poses)
-        self.names = self._names.update(made.pieces, made.piece_of_node, self.mass)
-        piece = made.piece_of_point
-        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.pieces)
+        self.names = self._names.update(made.fragment_count, made.node_fragment, self.mass)
+        piece = made.point_fragment
+        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.fragment_count)
         self._piece = self.names[piece]
         self.builds += 1
 
 
-def joined(parts: Sequence[Split], skeleton: Skeleton, poses: Poses) -> Split:
+def joined(parts: Sequence[SplitSurface], skeleton: EntityNumbering, poses: Poses) -> SplitSurface:
     """One surface of those of all copies, where they are at rest."""
 
     def numbers(name: str, step: int | Sequence[int]) -> Ints:
@@ -100,14 +102,14 @@ def joined(parts: Sequence[Split], skeleton: Skeleton, poses: Poses) -> Split:
 
     points, nodes = [len(part.points) for part in parts], len(skeleton.points)
     places = [part.points @ turn.T + place for part, turn, place in zip(parts, poses.turn, poses.place, strict=True)]
-    parents = [part.follow.parents + nodes * k for k, part in enumerate(parts)]
+    parents = [part.parents.parents + nodes * k for k, part in enumerate(parts)]
     starts = np.cumsum([0, *(len(each) for each in parents)])
-    start = [part.follow.start[:-1] + first for part, first in zip(parts, starts, strict=False)]
-    arm = [part.follow.arm @ turn.T for part, turn in zip(parts, poses.turn, strict=True)]
-    follow = Follow(np.append(np.concatenate(start), starts[-1]), np.concatenate(parents), np.concatenate(arm),
+    start = [part.parents.start[:-1] + first for part, first in zip(parts, starts, strict=False)]
+    arm = [part.parents.arm @ turn.T for part, turn in zip(parts, poses.turn, strict=True)]
+    follow = PointParents(np.append(np.concatenate(start), starts[-1]), np.concatenate(parents), np.concatenate(arm),
                     nodes * len(parts))  # fmt: skip
-    pieces = [part.pieces for part in parts]
-    return Split(
+    pieces = [part.fragment_count for part in parts]
+    return SplitSurface(
         np.concatenate(places), follow, numbers("elements", points), numbers("cell", len(skeleton.cells)),
         numbers("edge", len(skeleton.edges)), np.concatenate([part.origin for part in parts]),
         np.empty((0, 3), np.int64), np.empty(0, np.int64), np.concatenate([part.broken for part in parts]),

@@ -92,7 +92,7 @@ class SurfaceOutput:
     def _of_points(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
         """Nodal values without those in the middles of edges: the surface is that of straight cells (rank 0)."""
         source = self._domain.source
-        if self._domain.middles is None or source is None:
+        if self._domain.midside_nodes is None or source is None:
             return gathered, fields
         count = len(source.points)
         nodal = [replace(each, values=each.values[:count]) if each.centre == "Node" else each for each in fields]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...mesh.parallel import total
+from ...mesh.parallel import sum_over_ranks
 from .bcsr import BlockCSR, BlockDiagonal, GhostedVector
 from .hierarchy import BlockCSRData, LevelData
 
@@ -101,7 +101,7 @@ class SmoothedLevel:
         beside: list[float] = []
         for _ in range(LOOKS):
             self._inverse.first_step(1.0, self.b, self._d, self.x)
-            beside.append(float(np.sqrt(total(self._comm, np.vdot(b[:n], x[:n]))[0])))
+            beside.append(float(np.sqrt(sum_over_ranks(self._comm, np.vdot(b[:n], x[:n]))[0])))
             if beside[-1] < 1e-5:  # of round-off
                 break
             x[:n] /= np.float32(beside[-1])
@@ -110,7 +110,7 @@ class SmoothedLevel:
             b[:n] = self.residual.array[:n]
             if diagonal:
                 b[:n] -= np.float32(beside[-1]) * before
-            diagonal.append(float(total(self._comm, np.vdot(b[:n], x[:n]))[0]))
+            diagonal.append(float(sum_over_ranks(self._comm, np.vdot(b[:n], x[:n]))[0]))
             b[:n] -= np.float32(diagonal[-1]) * now
             before = now
         off = beside[1 : len(diagonal)]
@@ -124,7 +124,7 @@ class SmoothedLevel:
     def rhs_norm(self) -> float:
         """|b| (collective)."""
         own = self.b.array[: self._owned]
-        return float(np.sqrt(total(self._comm, np.vdot(own, own))[0]))
+        return float(np.sqrt(sum_over_ranks(self._comm, np.vdot(own, own))[0]))
 
     def _multiply(self) -> None:
         """left = A' x (collective)."""

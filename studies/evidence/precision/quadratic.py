@@ -47,7 +47,7 @@ def system(study: dict[str, Any]) -> tuple[Any, ...]:
         return 2 * mu * strain + lmbda * ufl.tr(strain) * ufl.Identity(d)
 
     loads = [entry for entry in checked.boundary if entry.kind == "traction"]
-    measures = surface_measures(domain, [domain.facets_of(Group(str(entry.on))) for entry in loads])
+    measures = surface_measures(domain, [domain.select_facets(Group(str(entry.on))) for entry in loads])
     zero: Any = fem.Constant(domain.mesh, np.zeros(d))
     force = ufl.inner(zero, w) * ufl.dx
     for entry, ds in zip(loads, measures, strict=True):
