@@ -140,12 +140,12 @@ def _of_obstacles(scene: Scene) -> tuple[Meetings | None, Overlapping | None]:
     obstacles = scene.study.obstacle
     if not obstacles:
         return None, None
-    from .contact.obstacle_term import Obstacles
+    from .contact.obstacle_term import ObstacleTerm
     from .output.contact_checks import Meetings
 
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
     meetings = Meetings(cast("list[Met]", terms))
-    watched = [term for term in terms if isinstance(term, Obstacles)]
+    watched = [term for term in terms if isinstance(term, ObstacleTerm)]
     if not watched or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
         return meetings, None
     from .output.obstacle_overlap_check import Overlapping

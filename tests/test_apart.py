@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.contact.obstacle_term import Obstacles
+from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.self_contact import SelfContact
 from fracsim.run import Run
 from fracsim.scene import build_scene
@@ -53,7 +53,7 @@ def test_crumbs_between_hammer_and_floor(tmp_path: Path) -> None:
     """In no frame is a point below the floor or in the hammer, and no crumb overlaps another; and as edges break the
     energy of the barriers does not rise."""
     run = Run(build_scene(MPI.COMM_SELF, make_study(**crushed())), tmp_path / "out")
-    terms = [term for term in run.scene.balance.terms if isinstance(term, Obstacles | SelfContact)]
+    terms = [term for term in run.scene.balance.terms if isinstance(term, ObstacleTerm | SelfContact)]
     rose: list[float] = []
     for term in terms:
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.contact.barrier import KEPT, Barrier, longest_step
-from fracsim.contact.facet_contact import Facets, between
-from fracsim.contact.friction import Friction, tangential
-from fracsim.contact.laws import Along
-from fracsim.contact.node_contact import Start, touch
-from fracsim.contact.pose import Placed, Pose
-from fracsim.contact.shapes import Box, Capsule, Plane, Shape, Sphere
-from fracsim.contact.step_limit import Motion, safe_shares
+from fracsim.contact.barrier import KEPT, Barrier, safe_fractions
+from fracsim.contact.facet_contact import ContactFacets, evaluate_facets
+from fracsim.contact.friction import CoulombFriction, tangential
+from fracsim.contact.laws import TimeAveragedPotential
+from fracsim.contact.node_contact import StepStart, evaluate_points
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, Shape, Sphere
+from fracsim.contact.step_limit import PointMotion, safe_motion_fractions
 from fracsim.errors import InputError
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
@@ -47,7 +47,7 @@ def test_along_the_way_it_gives_no_energy(start: float, end: float) -> None:
     it but for a fifth of what the force at the end would lose. p and p' are derivatives of its potential."""
     d = BARRIER.width
     start_gap, g, h = np.array([start * d]), np.array([[end * d]]), 1e-4 * end * d
-    along = Along(BARRIER, start_gap)
+    along = TimeAveragedPotential(BARRIER, start_gap)
     done = -along.slope(g[0]) * (g[0] - start_gap)
     released = BARRIER.energy(start_gap) - BARRIER.energy(g[0])
     round_off = 1e-12 * (BARRIER.energy(start_gap) + BARRIER.energy(g[0]))
@@ -93,13 +93,17 @@ def test_a_point_in_an_obstacle_is_pushed_straight_out_of_it(along: bool) -> Non
     """Before a floor: a force in no other direction, and no stiffness that a tangent could hold (with infinities
     0 times infinity would be an invalid value)."""
     x, area = np.array([[0.3, -1e-4], [0.5, 0.5e-3]]), np.array([0.1, 0.2])
-    start = Start.straight(np.array([0.5e-3, 0.5e-3]), 2) if along else None
-    found = touch(x, area, Placed(Plane((0.0, 1.0)), Pose.at(np.zeros(2))), BARRIER, None, None, np.zeros(2), start)
+    start = StepStart.from_gaps(np.array([0.5e-3, 0.5e-3]), 2) if along else None
+    found = evaluate_points(
+        x, area, PosedShape(HalfSpace((0.0, 1.0)), Pose.at_point(np.zeros(2))), BARRIER, None, None, np.zeros(2), start
+    )
     assert found.energy == np.inf and found.potential == np.inf
     assert (found.normal[:, 0] == 0).all() and found.normal[0, 1] > 1e150 and 0 < found.normal[1, 1] < 1e8
     assert not found.stiffness[0].any() and found.stiffness[1, 1, 1] > 0
-    facets = Facets(np.array([[0, 1]]), np.array([0.2]), 1e-4)
-    inner, stored = between(facets, Placed(Sphere(0.1, dim=2), Pose.at(np.array([0.4, -0.05]))), x, BARRIER)
+    facets = ContactFacets(np.array([[0, 1]]), np.array([0.2]), 1e-4)
+    inner, stored = evaluate_facets(
+        facets, PosedShape(Sphere(0.1, dim=2), Pose.at_point(np.array([0.4, -0.05]))), x, BARRIER
+    )
     assert stored == np.inf and np.isfinite(inner.forces).all() and np.isfinite(inner.stiffness).all()
 
 
@@ -111,8 +115,9 @@ def test_barrier_pushes_the_more_the_smaller_the_gap(shares: list[float]) -> Non
     assert (BARRIER.slope(g) <= 0).all() and (BARRIER.curvature(g) >= 0).all()
 
 
-@pytest.mark.parametrize("wrong", (lambda: Barrier(0.0, 1.0), lambda: Barrier(1.0, np.nan), lambda: Friction(-1, 1),
-                                   lambda: Friction(0.3, 0.0)))  # fmt: skip
+@pytest.mark.parametrize("wrong", (lambda: Barrier(0.0, 1.0), lambda: Barrier(1.0, np.nan),
+                                   lambda: CoulombFriction(-1, 1),
+                                   lambda: CoulombFriction(0.3, 0.0)))  # fmt: skip
 def test_bad_numbers_are_said(wrong: object) -> None:
     assert callable(wrong)
     with pytest.raises(InputError, match="must be"):
@@ -124,14 +129,14 @@ def test_bad_numbers_are_said(wrong: object) -> None:
 def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
     """Fast points through a wire of 1 mm that moves and turns: along all of the share every gap keeps its tenth."""
     rng = np.random.default_rng(seed)
-    wire, pose = Capsule(5e-4, 1.0, axis=(0.0, 0.0, 1.0)[-dim:]), Pose.at(np.zeros(dim))
+    wire, pose = Capsule(5e-4, 1.0, axis=(0.0, 0.0, 1.0)[-dim:]), Pose.at_point(np.zeros(dim))
     x = rng.uniform(-1, 1, (20, dim))
     x = x[wire.distance(x) > 1e-3]
     target = rng.uniform(-0.5, 0.5, len(x))[:, None] * np.eye(dim)[-1]
     moved = 10 * (target - x)  # aimed at the wire, and far beyond
     q = rng.normal(size=3 if dim == 2 else 6) * rng.choice([0.0, 1.0])
-    motion = Motion(Placed(wire, pose), x, moved, q)
-    share = longest_step(motion.gap, motion.speed, len(x))
+    motion = PointMotion(PosedShape(wire, pose), x, moved, q)
+    share = safe_fractions(motion.gap, motion.speed, len(x))
     assert ((share > 0) & (share <= 1)).all()
     assert q.any() or (share < 1).all()  # the wire at rest is hit by all
     now = wire.distance(x)
@@ -139,16 +144,18 @@ def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
         assert (motion.gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
 
 
-def still(shape: Shape, x: Values, moved: Values) -> Motion:
+def still(shape: Shape, x: Values, moved: Values) -> PointMotion:
     """Points that move past an obstacle at rest."""
-    return Motion(Placed(shape, Pose.at(np.zeros(shape.dim))), x, moved, np.zeros(3 if shape.dim == 2 else 6))
+    return PointMotion(
+        PosedShape(shape, Pose.at_point(np.zeros(shape.dim))), x, moved, np.zeros(3 if shape.dim == 2 else 6)
+    )
 
 
 def test_a_point_straight_at_a_plane_goes_nine_tenths() -> None:
     """Gap 1, way 4 down: 0.9 / 4. Away, along, or not at all: the whole."""
-    plane, x = Plane((0.0, 1.0)), np.array([[0.0, 1.0]] * 4)
+    plane, x = HalfSpace((0.0, 1.0)), np.array([[0.0, 1.0]] * 4)
     motion = still(plane, x, np.array([[0.0, -4.0], [0.0, 5.0], [7.0, 0.0], [0.0, 0.0]]))
-    np.testing.assert_allclose(longest_step(motion.gap, motion.speed, 4), [0.225, 1, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(safe_fractions(motion.gap, motion.speed, 4), [0.225, 1, 1, 1], rtol=1e-12)
 
 
 def test_a_free_way_past_a_sphere_is_taken() -> None:
@@ -157,7 +164,7 @@ def test_a_free_way_past_a_sphere_is_taken() -> None:
     x, moved = np.array([[-2.0, 1.3, 0.0], [-2.0, 0.9, 0.0]]), np.array([[4.0, 0.0, 0.0]] * 2)
     motion = still(sphere, x, moved)
     for speed in (motion.speed, lambda share: np.linalg.norm(moved, axis=1)):  # tangents; 1-Lipschitz alone
-        share = longest_step(motion.gap, speed, 2)
+        share = safe_fractions(motion.gap, speed, 2)
         assert share[0] == 1 and share[1] < 1
         assert motion.gap(share)[1] == pytest.approx(KEPT * sphere.distance(x)[1], rel=0.01)
 
@@ -165,9 +172,9 @@ def test_a_free_way_past_a_sphere_is_taken() -> None:
 @pytest.mark.parametrize("gap", (1e-3, 1e-6, 1e-9))
 def test_what_slides_close_over_a_floor_goes_on(gap: float) -> None:
     """10 mm along the floor, however close: only what comes nearer counts."""
-    floor = Plane((0.0, 0.0, 1.0))
+    floor = HalfSpace((0.0, 0.0, 1.0))
     motion = still(floor, np.array([[0.0, 0.0, gap]]), np.array([[1e-2, 0.0, 0.0]]))
-    assert longest_step(motion.gap, motion.speed, 1)[0] == 1
+    assert safe_fractions(motion.gap, motion.speed, 1)[0] == 1
 
 
 @pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
@@ -179,8 +186,8 @@ def test_no_gap_closes_faster_than_its_bound(shape: Shape, seed: int) -> None:
     q = rng.normal(size=3 if d == 2 else 6)
     q[d:] *= seed % 2
     x, moved = points(shape, 30, seed), rng.normal(size=(30, d))
-    motion, shares = Motion(Placed(shape, pose), x, moved, q), np.linspace(0, 1, 11)
-    gaps = np.array([Placed(shape, pose.moved(s * q)).distance(x + s * moved) for s in shares])
+    motion, shares = PointMotion(PosedShape(shape, pose), x, moved, q), np.linspace(0, 1, 11)
+    gaps = np.array([PosedShape(shape, pose.incremented(s * q)).distance(x + s * moved) for s in shares])
     np.testing.assert_allclose([motion.gap(np.full(30, s)) for s in shares], gaps, atol=1e-13)
     for at, s in enumerate(shares):
         least = gaps[at] - motion.speed(np.full(30, s)) * (shares[at:, None] - s)
@@ -189,19 +196,19 @@ def test_no_gap_closes_faster_than_its_bound(shape: Shape, seed: int) -> None:
 
 def test_closed_gaps_have_no_safe_share() -> None:
     with pytest.raises(ValueError, match="1 gaps are closed before the motion"):
-        longest_step(lambda s: np.array([1.0, 0.0]), np.ones_like, 2)
-    assert longest_step(lambda s: s, np.ones_like, 0).shape == (0,)
+        safe_fractions(lambda s: np.array([1.0, 0.0]), np.ones_like, 2)
+    assert safe_fractions(lambda s: s, np.ones_like, 0).shape == (0,)
 
 
 def test_a_container_keeps_what_is_in_it() -> None:
     """Points flung in a closed box stay in it."""
-    room, rng = Box((1.0, 1.0, 1.0), hollow=True), np.random.default_rng(0)
+    room, rng = RoundedBox((1.0, 1.0, 1.0), hollow=True), np.random.default_rng(0)
     motion = still(room, rng.uniform(-0.45, 0.45, (200, 3)), rng.normal(size=(200, 3)) * 5)
-    share = longest_step(motion.gap, motion.speed, 200)
+    share = safe_fractions(motion.gap, motion.speed, 200)
     assert (motion.gap(share) >= KEPT * room.distance(motion.x) * (1 - 1e-9)).all()
 
 
-FRICTION = Friction(coefficient=0.4, sticking=1e-3)
+FRICTION = CoulombFriction(coefficient=0.4, sticking_slip=1e-3)
 
 
 def sliding(dim: int, seed: int, count: int = 20) -> tuple[Values, Values, Values]:
@@ -220,7 +227,7 @@ def test_friction_force_and_stiffness_are_derivatives(dim: int, seed: int) -> No
     gradient = differences(lambda x: FRICTION.energy(force, n, x), moved, 1e-7)
     np.testing.assert_allclose(FRICTION.gradient(force, n, moved), gradient, atol=1e-5 * 50)
     hessian = differences(lambda x: FRICTION.gradient(force, n, x), moved, 1e-7)
-    stiffest = 0.4 * 50 * 2 / FRICTION.sticking
+    stiffest = 0.4 * 50 * 2 / FRICTION.sticking_slip
     np.testing.assert_allclose(FRICTION.hessian(force, n, moved), hessian, atol=1e-3 * stiffest)
 
 
@@ -232,7 +239,7 @@ def test_coulomb(dim: int, seed: int) -> None:
     s, f = tangential(n, moved), FRICTION.gradient(force, n, moved)
     size, slip = np.linalg.norm(f, axis=1), np.linalg.norm(s, axis=1)
     assert (size <= 0.4 * force * (1 + 10 * EPS)).all()
-    slides = slip >= FRICTION.sticking
+    slides = slip >= FRICTION.sticking_slip
     np.testing.assert_allclose(size[slides], 0.4 * force[slides], rtol=20 * EPS)
     np.testing.assert_allclose(np.einsum("ni,ni->n", f, n), 0, atol=1e-13 * 50)
     np.testing.assert_allclose(np.einsum("ni,ni->n", f, s), size * slip, rtol=1e-9, atol=1e-20)
@@ -261,10 +268,12 @@ def test_no_slip_no_force() -> None:
 def test_a_turn_of_a_ball_is_no_bound() -> None:
     """Past a ball points may go as far however fast it spins, on and beside their facets; of a box that spins less."""
     x, moved = np.array([[0.0, 0.12], [0.3, 0.12], [0.15, 0.4]]), np.array([[0.0, -0.01]] * 3)
-    facets = Facets(np.array([[0, 1], [1, 2]]), np.array([0.3, 0.3]), 1e-4)
+    facets = ContactFacets(np.array([[0, 1], [1, 2]]), np.array([0.3, 0.3]), 1e-4)
     shares = {}
-    for name, shape in (("ball", Sphere(0.1, dim=2)), ("box", Box((0.2, 0.2), rounding=0.02))):
-        placed = Placed(shape, Pose.at(np.zeros(2)))
-        shares[name] = [safe_shares(placed, x, moved, np.array([0.0, 0.0, turn]), facets) for turn in (0.0, 3.0)]
+    for name, shape in (("ball", Sphere(0.1, dim=2)), ("box", RoundedBox((0.2, 0.2), rounding=0.02))):
+        placed = PosedShape(shape, Pose.at_point(np.zeros(2)))
+        shares[name] = [
+            safe_motion_fractions(placed, x, moved, np.array([0.0, 0.0, turn]), facets) for turn in (0.0, 3.0)
+        ]
     np.testing.assert_array_equal(shares["ball"][0], shares["ball"][1])
     assert (shares["ball"][1] == 1).all() and shares["box"][1][0] < shares["box"][0][0] == 1

@@ -7,9 +7,9 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.barrier import Barrier
-from fracsim.contact.node_contact import Start, Touch, touch
-from fracsim.contact.pose import Placed, Pose
-from fracsim.contact.shapes import Box, Shape, Sphere
+from fracsim.contact.node_contact import ContactForces, StepStart, evaluate_points
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.shapes import RoundedBox, Shape, Sphere
 from support.scenes import each_step, make_scene
 
 Values = npt.NDArray[np.float64]
@@ -20,28 +20,28 @@ def test_around_a_ball_by_hand() -> None:
     force is p along the mean of both normals while e is small, which does nothing along the chord."""
     R, a, g = 0.4, 1e-3, 0.1
     x0, x1 = R * np.array([[1.0, 0.0]]), R * np.array([[np.cos(a), np.sin(a)]])
-    start = Start(np.array([g]), np.array([0]), x0 / R, x0)
-    bent = start.bent(np.array([0]), np.array([g]), x1 / R, x1)
+    start = StepStart(np.array([g]), np.array([0]), x0 / R, x0)
+    bent = start.curved_gap(np.array([0]), np.array([g]), x1 / R, x1)
     e = R * (1 - np.cos(a))
     assert bent.value == pytest.approx(g * (g + e / 2) / (g + e))
     assert bent.value == pytest.approx(g - e / 2, rel=1e-9)
     assert abs(bent.gradient[0] @ (x1 - x0)[0]) < 1e-4 * abs((x1 / R)[0] @ (x1 - x0)[0])
 
 
-@pytest.mark.parametrize("shape", [Sphere(0.3), Sphere(0.5, hollow=True), Box((0.5, 0.5, 0.5), rounding=0.1)])
+@pytest.mark.parametrize("shape", [Sphere(0.3), Sphere(0.5, hollow=True), RoundedBox((0.5, 0.5, 0.5), rounding=0.1)])
 def test_forces_and_stiffness_are_derivatives(shape: Shape) -> None:
     """Of the potential, by differences, for points that have gone some way, a few from beyond the barrier."""
-    barrier, placed, rng = Barrier(50.0, 0.2), Placed(shape, Pose.at(np.zeros(3))), np.random.default_rng(0)
+    barrier, placed, rng = Barrier(50.0, 0.2), PosedShape(shape, Pose.at_point(np.zeros(3))), np.random.default_rng(0)
     x0, x = (rng.uniform(-0.45, 0.45, (400, 3)) for _ in range(2))
     x = x0 + 0.1 * x
     apart = (placed.distance(x0) > 0.03) & (placed.distance(x) > 0.02)
     x0, x, gap = x0[apart], x[apart], placed.distance(x0[apart])
     known = np.flatnonzero(gap < 0.2)
-    start, area = Start(gap, known, placed.normal(x0[known]), x0[known]), np.full(len(x), 0.02)
+    start, area = StepStart(gap, known, placed.normal(x0[known]), x0[known]), np.full(len(x), 0.02)
     assert len(known) > 5
 
-    def felt(x: Values) -> Touch:
-        return touch(x, area, placed, barrier, None, None, np.zeros(3), start)
+    def felt(x: Values) -> ContactForces:
+        return evaluate_points(x, area, placed, barrier, None, None, np.zeros(3), start)
 
     found, h = felt(x), 1e-6
     slopes, bends = [], []
@@ -51,7 +51,9 @@ def test_forces_and_stiffness_are_derivatives(shape: Shape) -> None:
         slopes.append((up.potential - down.potential) / (2 * h))
         bends.append(-(up.normal - down.normal) / (2 * h))
     np.testing.assert_allclose(-found.normal.sum(axis=0), slopes, atol=1e-6 * np.abs(found.normal).sum())
-    np.testing.assert_allclose(found.exact, np.stack(bends, axis=2), atol=1e-5 * np.abs(found.exact).max())
+    np.testing.assert_allclose(
+        found.normal_hessian, np.stack(bends, axis=2), atol=1e-5 * np.abs(found.normal_hessian).max()
+    )
 
 
 @pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha"))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 import fracsim.rigid.contact_solver as newton_room
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Sphere
+from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Sphere
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.collision_detection import Finder
 from fracsim.rigid.contact_records import Touches
@@ -178,12 +178,14 @@ def test_what_is_struck_comes_down_on_corners_that_nobody_thought_of(
         assert (disc @ bodies.turn[0].T)[:, 2].min() + bodies.place[0, 2] > -rules.fast * rules.step
 
 
-@pytest.mark.parametrize("shape", [Plane((0.0, 0.0, 1.0)), Box((4.0, 4.0, 2.0))])
+@pytest.mark.parametrize("shape", [HalfSpace((0.0, 0.0, 1.0)), RoundedBox((4.0, 4.0, 2.0))])
 @pytest.mark.parametrize("share", [0.3, 0.95])
-def test_what_rests_does_not_sink_in_before_it_is_struck(shape: Plane | Box, share: float, solver: None) -> None:
+def test_what_rests_does_not_sink_in_before_it_is_struck(
+    shape: HalfSpace | RoundedBox, share: float, solver: None
+) -> None:
     """A block on a floor without friction, met from the side by another as heavy after a share s of the step: it fell
     g (s dt)^2 / 2 = 0.11 mm until then. It goes on with half the speed, on the floor."""
-    step, down = 5e-3, 1.0 if isinstance(shape, Box) else 0.0
+    step, down = 5e-3, 1.0 if isinstance(shape, RoundedBox) else 0.0
     stand = Stand(primitive(shape, "floor"), np.array([0.0, 0.0, -down]), 0.0)
     bodies = cubes([[0.0, 0.0, 0.5], [-1.0 - 10.0 * step * share, 0.0, 0.5]])
     bodies = replace(bodies, velocity=np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]))
@@ -267,11 +269,14 @@ def test_a_ball_lands_on_every_shape_that_stands() -> None:
     """Held at its top: sphere, capsule, cylinder, box and plane, each where its outline says."""
     ball = primitive(Sphere(0.5, 3), "ball")
     slanted = (1.0, 2.0, 2.0)
-    for shape in (Plane((0.0, 0.0, 1.0)), Sphere(0.7, 3), Capsule(0.3, 1.0, slanted), Cylinder(0.4, 1.2, axis=slanted),
-                  Box((1.0, 2.0, 0.6))):  # fmt: skip
-        top = 0.0 if isinstance(shape, Plane) else float(shape.outline()[0][:, 2].max())
+    for shape in (HalfSpace((0.0, 0.0, 1.0)), Sphere(0.7, 3), Capsule(0.3, 1.0, slanted),
+                  RoundedCylinder(0.4, 1.2, axis=slanted),
+                  RoundedBox((1.0, 2.0, 0.6))):  # fmt: skip
+        top = 0.0 if isinstance(shape, HalfSpace) else float(shape.tessellate()[0][:, 2].max())
         at = np.array([0.0, 0.0, -top])
-        over = np.zeros(3) if isinstance(shape, Plane) else shape.outline()[0][shape.outline()[0][:, 2].argmax()]
+        over = (
+            np.zeros(3) if isinstance(shape, HalfSpace) else shape.tessellate()[0][shape.tessellate()[0][:, 2].argmax()]
+        )
         near, far = (cubes([[over[0], over[1], 0.5 + gap]]) for gap in (-0.01, 0.05))
         engine = Engine(near, [[ball]], [Stand(primitive(shape, "it"), at)], Rules(1e-3, DOWN))
         assert engine.depth(near) and not engine.depth(far), shape

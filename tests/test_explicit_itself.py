@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import eye
 
-from fracsim.contact.penalty_point_facet import Pushing, rates
-from fracsim.contact.penalty_self_contact import ExplicitSelfContact, Pushes
+from fracsim.contact.penalty_point_facet import PointFacetPenalty, penalty_stiffness
+from fracsim.contact.penalty_self_contact import PenaltyContactSurface, PenaltySelfContact
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
@@ -23,13 +23,13 @@ from test_itself import SOFT, two_blocks
 Values = npt.NDArray[np.float64]
 
 
-def contact_of(scene: Scene) -> tuple[ExplicitSelfContact, Pushes]:
-    (found,) = [term for term in scene.balance.terms if isinstance(term, ExplicitSelfContact)]
+def contact_of(scene: Scene) -> tuple[PenaltySelfContact, PenaltyContactSurface]:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltySelfContact)]
     assert found._surface is not None
     return found, found._surface
 
 
-def pushed(dim: int) -> tuple[Pushing, Values]:
+def pushed(dim: int) -> tuple[PointFacetPenalty, Values]:
     """A rough sheet over another one, turned outwards, some points of it through: nearer than 0.1 or 0.05 deep."""
     rng, n = np.random.default_rng(3), 5
     grid = np.stack(np.meshgrid(*[np.arange(n) / (n - 1)] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
@@ -44,11 +44,11 @@ def pushed(dim: int) -> tuple[Pushing, Values]:
     elements = np.concatenate([up, up[:, ::-1] + len(grid)])
     x, offset = np.concatenate([low, high]), np.zeros(dim)
     offset[-1] = 0.09
-    pairs = Pushing(x, elements, rng.uniform(1.0, 2.0, size=len(x)), distance=0.12)
+    pairs = PointFacetPenalty(x, elements, rng.uniform(1.0, 2.0, size=len(x)), distance=0.12)
     x[len(grid) :] += offset
-    pairs.arrive(x)
+    pairs.end_step(x)
     x[len(grid) :] -= 0.06 / 0.09 * offset
-    pairs.arrive(x)
+    pairs.end_step(x)
     return pairs, x
 
 
@@ -56,9 +56,9 @@ def pushed(dim: int) -> tuple[Pushing, Values]:
 def test_forces_are_a_derivative_and_sum_to_nothing(dim: int) -> None:
     """Of points before facets and of some that are through: against differences; force and moment vanish."""
     pairs, x = pushed(dim)
-    met, gradient, h = pairs.met(x), pairs.gradient(x), 1e-7
-    assert (met.at.gap < 0).sum() > 1 and (met.at.gap > 0).sum() > 3
-    assert ((met.at.share > 0).all(axis=1)).any()
+    met, gradient, h = pairs.contacts(x), pairs.gradient(x), 1e-7
+    assert (met.pairs.gap < 0).sum() > 1 and (met.pairs.gap > 0).sum() > 3
+    assert ((met.pairs.barycentric > 0).all(axis=1)).any()
     way = np.random.default_rng(1).normal(size=(6, *x.shape))
     for each in way:
         slope = (pairs.energy(x + h * each) - pairs.energy(x - h * each)) / (2 * h)
@@ -74,10 +74,10 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
     """omega^2 of M^-1 times the stiffness along the normals, dense; and with k_p that bodies of the same mesh on both
     sides have, no more than was asked for."""
     pairs, x = pushed(dim)
-    n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs.met(x)
+    n, mass, met = len(x), np.random.default_rng(2).uniform(0.5, 1.0, size=len(x)), pairs.contacts(x)
     K = np.zeros((n * dim, n * dim))
     for p, corners, share, normal, rate in zip(
-        met.at.points, met.at.corners, met.at.share, met.at.normal, met.rate, strict=True
+        met.pairs.points, met.pairs.corners, met.pairs.barycentric, met.pairs.normal, met.stiffness, strict=True
     ):
         row = np.zeros((n, dim))
         row[p] = normal
@@ -85,9 +85,9 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
         K += rate * np.outer(row.reshape(-1), row.reshape(-1))
     m = np.repeat(mass, dim)
     fastest = float(np.linalg.eigvalsh(K / np.sqrt(m[:, None] * m)).max())
-    bound = pairs.fastest(x, eye(n, format="csr"), mass)
+    bound = pairs.max_added_frequency(x, eye(n, format="csr"), mass)
     assert 0.3 * bound < fastest <= bound
-    own = rates(eye(n, format="csr"), np.ones(n), mass, np.inf, 4.0)
+    own = penalty_stiffness(eye(n, format="csr"), np.ones(n), mass, np.inf, 4.0)
     np.testing.assert_allclose(own, mass, rtol=1e-12)
 
 
@@ -111,10 +111,10 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         assert report.kinetic + report.elastic == pytest.approx(0.25 * before[0], rel=0.02)
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
-        x = contact._places()
+        x = contact._end_positions()
         assert x is not None
         touched += contact.stored_energy() > 0
-        assert surface.pairs.met(x).at.gap.min(initial=1.0) > -0.01
+        assert surface.pairs.contacts(x).pairs.gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
     assert min(steps) > 0.75 * max(steps)
@@ -158,13 +158,17 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     state.settle()
     while contact.stored_energy() < 0.5:
         march(scene, state, 1)
-    before, graph, nodes = contact.stored_energy(), scene.fracture.graph, np.flatnonzero(surface.pairs.by[:, 0] >= 0)
+    before, graph, nodes = (
+        contact.stored_energy(),
+        scene.fracture.graph,
+        np.flatnonzero(surface.pairs.contact_facets[:, 0] >= 0),
+    )
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
-    assert again is not surface and len(again.made.points) > len(surface.made.points)
-    assert (again.pairs.by[np.intersect1d(nodes, np.arange(len(X)))] >= 0).any()
+    assert again is not surface and len(again.split.points) > len(surface.split.points)
+    assert (again.pairs.contact_facets[np.intersect1d(nodes, np.arange(len(X)))] >= 0).any()
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
@@ -185,7 +189,7 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
     ends, looks = [], []
     for always in (False, True):
         if always:
-            monkeypatch.setattr(ExplicitSelfContact, "_look", lambda self: None)
+            monkeypatch.setattr(PenaltySelfContact, "_measure_clearance", lambda self: None)
         scene, state = make_scene(
             mesh={"file": two_blocks(tmp_path, 2, 0.1)}, material=SOFT, contact={},
             time={"scheme": "explicit", "step": 0.02, "end": 0.6},
@@ -267,11 +271,11 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
         after = (m * state.v.reshape(-1, 2)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
         assert report.kinetic + report.elastic + state.dissipated == pytest.approx(began, rel=0.02)
-        x = contact._places()
-        assert x is not None and contact._rubbing is not None
-        met = surface.pairs.met(x)
-        pull = met.rate * np.linalg.norm(contact._rubbing.slips(x), axis=1)
-        assert (pull <= 0.3 * met.rate * (surface.pairs.width - met.at.gap) * (1 + 1e-12)).all()
+        x = contact._end_positions()
+        assert x is not None and contact._friction is not None
+        met = surface.pairs.contacts(x)
+        pull = met.stiffness * np.linalg.norm(contact._friction.slips(x), axis=1)
+        assert (pull <= 0.3 * met.stiffness * (surface.pairs.width - met.pairs.gap) * (1 + 1e-12)).all()
         slid = max(slid, float(pull.sum()))
     right = X[:, 0] > 1.01
     assert slid > 0 and state.dissipated > 0.005 * began

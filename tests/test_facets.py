@@ -10,42 +10,42 @@ import pytest
 from scipy.linalg import block_diag
 
 from fracsim.contact.barrier import Barrier
-from fracsim.contact.closest_point import deepest, least_over_shares, most_above
-from fracsim.contact.facet_contact import Between, Facets, between, gripped_between, joined
-from fracsim.contact.friction import Friction
-from fracsim.contact.node_contact import Touch, grip, nothing, touch
-from fracsim.contact.obstacle_term import Obstacles
-from fracsim.contact.pose import Placed, Pose, turning
-from fracsim.contact.rigid_body import by_point_and_pose, on_obstacle, push
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
-from fracsim.contact.step_limit import safe_shares
+from fracsim.contact.closest_point import find_closest_points, minimise_on_simplex, smoothing_error
+from fracsim.contact.facet_contact import ContactFacets, FacetForces, add_facet_friction, evaluate_facets, merge_forces
+from fracsim.contact.friction import CoulombFriction
+from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
+from fracsim.contact.obstacle_term import ObstacleTerm
+from fracsim.contact.pose import Pose, PosedShape, rotation_derivative
+from fracsim.contact.rigid_body import contact_wrench, point_pose_hessian, pose_derivatives
+from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
+from fracsim.contact.step_limit import safe_motion_fractions
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
 
 SHAPES: dict[str, Shape] = {
-    "ball": Sphere(0.3), "capsule": Capsule(0.1, 0.5, (1.0, 0.3, 0.2)), "cylinder": Cylinder(0.25, 0.4, 0.05),
-    "box": Box((0.5, 0.4, 0.3), 0.05), "disk": Sphere(0.3, 2), "rectangle": Box((0.5, 0.3), 0.05),
+    "ball": Sphere(0.3), "capsule": Capsule(0.1, 0.5, (1.0, 0.3, 0.2)), "cylinder": RoundedCylinder(0.25, 0.4, 0.05),
+    "box": RoundedBox((0.5, 0.4, 0.3), 0.05), "disk": Sphere(0.3, 2), "rectangle": RoundedBox((0.5, 0.3), 0.05),
 }  # fmt: skip
 WIDTH, SOFTEN = 0.1, 0.02
 LAW = Barrier(1.0, WIDTH)
 
 
-def facets_near(name: str, count: int) -> tuple[Placed, Values]:
+def facets_near(name: str, count: int) -> tuple[PosedShape, Values]:
     """An obstacle, and facets (count, c, d) of half its size to twice that whose gaps are 10 to 90 % of the width."""
     rng, shape = np.random.default_rng(1), SHAPES[name]
-    placed = Placed(shape, Pose.at(np.full(shape.dim, 0.2)))
+    placed = PosedShape(shape, Pose.at_point(np.full(shape.dim, 0.2)))
     x = rng.normal(size=(count, shape.dim, shape.dim)) * rng.uniform(0.1, 0.5, size=(count, 1, 1))
     wanted = rng.uniform(0.1, 0.9, size=count) * WIDTH
     for _ in range(8):
-        at = deepest(placed, x, SOFTEN)
+        at = find_closest_points(placed, x, SOFTEN)
         x = x + (wanted - at.gap)[:, None, None] * at.normal[:, None]
-    return placed, x[abs(deepest(placed, x, SOFTEN).gap - wanted) < 0.05 * WIDTH]
+    return placed, x[abs(find_closest_points(placed, x, SOFTEN).gap - wanted) < 0.05 * WIDTH]
 
 
-def acting(placed: Placed, x: Values) -> Between:
+def acting(placed: PosedShape, x: Values) -> FacetForces:
     corners = np.arange(x.shape[0] * x.shape[1]).reshape(x.shape[:2])
-    return Between(corners, np.ones(len(x)), deepest(placed, x, SOFTEN), LAW, LAW, LAW)
+    return FacetForces(corners, np.ones(len(x)), find_closest_points(placed, x, SOFTEN), LAW, LAW, LAW)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -59,13 +59,13 @@ def test_the_place_is_the_deepest(name: str) -> None:
     shares = shares[shares[:, -1] >= -1e-12]
     places = np.einsum("sc,kcd->ksd", shares, x)
     distance = placed.distance(places.reshape(-1, d)).reshape(len(x), -1)
-    at = deepest(placed, x, SOFTEN)
+    at = find_closest_points(placed, x, SOFTEN)
     assert (at.gap <= distance.min(axis=1) + 1e-12).all()
     coarse = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) / 20
-    assert (at.gap > distance.min(axis=1) - most_above(c, SOFTEN) - coarse).all()
-    softened = distance + SOFTEN / 2 * np.sum((shares - 1 / c) ** 2, axis=1) - most_above(c, SOFTEN)
+    assert (at.gap > distance.min(axis=1) - smoothing_error(c, SOFTEN) - coarse).all()
+    softened = distance + SOFTEN / 2 * np.sum((shares - 1 / c) ** 2, axis=1) - smoothing_error(c, SOFTEN)
     assert (softened.min(axis=1) >= at.gap - 1e-12).all()
-    kinds = (at.share > 0).sum(axis=1)
+    kinds = (at.barycentric > 0).sum(axis=1)
     assert all((kinds == kind).sum() > 1 for kind in range(1, c + 1))
 
 
@@ -76,7 +76,7 @@ def test_the_least_of_a_quadratic_over_shares(c: int) -> None:
     rng = np.random.default_rng(4)
     factors, slope, share = rng.normal(size=(300, c, c)), rng.normal(size=(300, c)), rng.dirichlet(np.ones(c), 300)
     Q = factors @ factors.transpose(0, 2, 1) * 10.0 ** rng.uniform(-3, 1, size=(300, 1, 1)) + 1e-3 * np.eye(c)
-    least = least_over_shares(Q, slope, share)
+    least = minimise_on_simplex(Q, slope, share)
     np.testing.assert_allclose(least.sum(axis=1), 1.0, rtol=1e-12)
     after = slope + np.einsum("kce,ke->kc", Q, least - share)
     over = after - np.einsum("kc,kc->k", after, least)[:, None]
@@ -88,12 +88,12 @@ def test_the_least_of_a_quadratic_over_shares(c: int) -> None:
 def test_the_deepest_place_does_not_depend_on_where_it_is_looked_for_first(name: str) -> None:
     """From a corner, or where it was before another obstacle."""
     placed, x = facets_near(name, 40)
-    shares, start = deepest(placed, x, SOFTEN).share, np.zeros(x.shape[:2])
+    shares, start = find_closest_points(placed, x, SOFTEN).barycentric, np.zeros(x.shape[:2])
     start[np.arange(len(x)), np.random.default_rng(5).integers(x.shape[1], size=len(x))] = 1.0
     for begin in (start, np.roll(shares, 1, axis=0)):
-        np.testing.assert_allclose(deepest(placed, x, SOFTEN, begin).share, shares, atol=1e-8)
+        np.testing.assert_allclose(find_closest_points(placed, x, SOFTEN, begin).barycentric, shares, atol=1e-8)
     x[:] = x[:, :1]  # of a facet that is a point: its middle
-    np.testing.assert_allclose(deepest(placed, x, SOFTEN).share, 1 / x.shape[1], atol=1e-12)
+    np.testing.assert_allclose(find_closest_points(placed, x, SOFTEN).barycentric, 1 / x.shape[1], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -112,7 +112,7 @@ def test_forces_and_stiffness_are_derivatives(name: str) -> None:
     scale = np.linalg.norm(found.forces.reshape(n, -1), axis=1)
     error = np.linalg.norm(found.forces.reshape(n, -1) + by_energy, axis=1)
     assert (error < 1e-5 * scale + 1e-7).all() and (scale > 0.1).sum() > n / 8
-    exact = found.exact
+    exact = found.hessian
     np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), atol=1e-9 * abs(exact).max())
     error = np.linalg.norm(exact - by_force, axis=(1, 2)) / (np.linalg.norm(exact, axis=(1, 2)) + 1.0)
     assert np.quantile(error, 0.9) < 1e-4  # the rest are at a kink of the curvature: where a rounded edge begins
@@ -121,25 +121,25 @@ def test_forces_and_stiffness_are_derivatives(name: str) -> None:
 def test_flat_against_flat_is_counted_once() -> None:
     """Before a plane the corners have counted all: lying flat or tilted, nothing is added, nor to the tangent."""
     rng = np.random.default_rng(2)
-    placed = Placed(Plane((0.0, 0.0, 1.0)), Pose.at(np.zeros(3)))
+    placed = PosedShape(HalfSpace((0.0, 0.0, 1.0)), Pose.at_point(np.zeros(3)))
     x = rng.normal(size=(200, 3, 3))
     x[:, :, 2] = rng.uniform(0.3, 2.0, size=(200, 3)) * WIDTH
     x[:50, :, 2] = x[:50, :1, 2]
     found, own = acting(placed, x), np.abs(LAW.curvature(x[:, :, 2])).max()
     np.testing.assert_allclose(found.energy, 0.0, atol=1e-9 * LAW.energy(x[:, :, 2]).max())
     np.testing.assert_allclose(found.forces, 0.0, atol=1e-9 * own * WIDTH)
-    np.testing.assert_allclose(found.exact, 0.0, atol=1e-8 * own)
+    np.testing.assert_allclose(found.hessian, 0.0, atol=1e-8 * own)
 
 
 def test_a_facet_over_a_ball_is_held_before_it_is_cut() -> None:
     """A triangle whose corners are far from a small ball in its middle: the energy has no bound as they meet."""
-    placed = Placed(Sphere(0.05), Pose.at(np.zeros(3)))
-    facet = Facets(np.array([[0, 1, 2]]), np.array([1.0]), SOFTEN)
+    placed = PosedShape(Sphere(0.05), Pose.at_point(np.zeros(3)))
+    facet = ContactFacets(np.array([[0, 1, 2]]), np.array([1.0]), SOFTEN)
     turn = 2 * np.pi / 3 * np.arange(3)
     flat = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(3)])
     energies = []
     for gap in (2e-1, 5e-2, 2e-2, 1e-2, 7e-3, -1e-3):
-        found, stored = between(facet, placed, flat + np.array([0.0, 0.0, 0.05 + gap]), LAW)
+        found, stored = evaluate_facets(facet, placed, flat + np.array([0.0, 0.0, 0.05 + gap]), LAW)
         energies.append(stored)
         assert found.forces[:, :, 2].sum() > 0 or not 0 < gap < WIDTH
     assert energies[0] == 0 and (np.diff(energies) > 0).all() and energies[-1] == np.inf
@@ -151,18 +151,18 @@ def test_no_facet_near_an_obstacle_is_passed_over(name: str) -> None:
     asked, and those that are not `closing` keep a tenth of their gaps on the way; nothing of them is nearer than what
     is `beyond`."""
     rng, shape = np.random.default_rng(6), SHAPES[name]
-    placed, d = Placed(shape, Pose.at(np.full(shape.dim, 0.2))), shape.dim
+    placed, d = PosedShape(shape, Pose.at_point(np.full(shape.dim, 0.2))), shape.dim
     x = 0.3 * rng.normal(size=(80, d)) + 3.0
     corners = np.sort(np.stack([rng.permutation(80)[:d] for _ in range(120)]), axis=1)
-    facets, skipped = Facets(corners, np.ones(120), 1e-3), []
+    facets, skipped = ContactFacets(corners, np.ones(120), 1e-3), []
     for way in np.linspace(0.3, -0.9, 12):
         relative = way * (1 + 0.1 * rng.normal(size=x.shape))
-        gaps = [deepest(placed, (x + part * relative)[corners], 1e-3).gap for part in (0.0, 0.3, 0.6, 1.0)]
+        gaps = [find_closest_points(placed, (x + part * relative)[corners], 1e-3).gap for part in (0.0, 0.3, 0.6, 1.0)]
         reach = float(np.quantile(gaps[0], 0.1))
-        assert placed.beyond(x) <= gaps[0].min() + facets.kept + 1e-12
-        far = np.setdiff1d(np.arange(120), facets.near(placed, x, reach))
+        assert placed.distance_bound(x) <= gaps[0].min() + facets.max_gap_error + 1e-12
+        far = np.setdiff1d(np.arange(120), facets.within_reach(placed, x, reach))
         assert (gaps[0][far] >= reach).all()
-        closing = facets.closing(placed, x, relative, None, 1.2 * np.linalg.norm(relative, axis=1))
+        closing = facets.closing_facets(placed, x, relative, None, 1.2 * np.linalg.norm(relative, axis=1))
         free = np.setdiff1d(np.arange(120), closing)
         assert (np.min(gaps, axis=0)[free] >= 0.1 * gaps[0][free] - 1e-12).all()
         skipped += [len(far), len(free)]
@@ -176,21 +176,21 @@ def test_facets_before_what_turns_keep_a_tenth_of_their_gaps(name: str) -> None:
     each. Facets allow less than their corners alone."""
     rng, shape = np.random.default_rng(7), SHAPES[name]
     placed, x = facets_near(name, 40)
-    d, apart, itself = shape.dim, [], Placed(shape, Pose.at(np.zeros(shape.dim)))
+    d, apart, itself = shape.dim, [], PosedShape(shape, Pose.at_point(np.zeros(shape.dim)))
     corners = np.arange(x.shape[0] * d).reshape(-1, d)
-    facets = Facets(corners, np.ones(len(corners)), SOFTEN)
+    facets = ContactFacets(corners, np.ones(len(corners)), SOFTEN)
     for far in (0.0, 0.1, 0.3):
-        flat = (x + far * deepest(placed, x, SOFTEN).normal[:, None]).reshape(-1, d)
+        flat = (x + far * find_closest_points(placed, x, SOFTEN).normal[:, None]).reshape(-1, d)
         moved, q = 0.05 * rng.normal(size=flat.shape), np.r_[0.2 * rng.normal(size=d), rng.normal(size=2 * d - 3)]
-        every = safe_shares(placed, flat, moved, q, facets)
-        apart.append(float((safe_shares(placed, flat, moved, q) > every).mean()))
-        gap = facets.look(placed, flat, np.arange(len(corners))).gap
+        every = safe_motion_fractions(placed, flat, moved, q, facets)
+        apart.append(float((safe_motion_fractions(placed, flat, moved, q) > every).mean()))
+        gap = facets.closest_points(placed, flat, np.arange(len(corners))).gap
         least = every[corners].min(axis=1)
         for part in np.linspace(0.0, 1.0, 5):
-            ways = [(placed.pose.moved(part * s * q), flat[c] + part * s * moved[c])
+            ways = [(placed.pose.incremented(part * s * q), flat[c] + part * s * moved[c])
                     for c, s in zip(corners, least, strict=True)]  # fmt: skip
             seen = np.array([pose.to_body(places) for pose, places in ways])
-            assert (deepest(itself, seen, SOFTEN).gap > 0.1 * gap - 1e-9).all()
+            assert (find_closest_points(itself, seen, SOFTEN).gap > 0.1 * gap - 1e-9).all()
     assert max(apart) > 0.1
 
 
@@ -200,24 +200,24 @@ def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
     stiffness on points and obstacle, from both sides."""
     placed, corners = facets_near(name, 6)
     d, x = placed.shape.dim, corners.reshape(-1, placed.shape.dim)
-    facets = Facets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
+    facets = ContactFacets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
 
-    def felt(q: Values) -> Touch:
-        there = Placed(placed.shape, placed.pose.moved(q))
-        return joined(nothing(d), *between(facets, there, x, LAW))
+    def felt(q: Values) -> ContactForces:
+        there = PosedShape(placed.shape, placed.pose.incremented(q))
+        return merge_forces(no_contact(d), *evaluate_facets(facets, there, x, LAW))
 
     p, h = 3 * d - 3, 1e-5
     steps, found = h * np.eye(p), felt(np.zeros(p))
-    on = push(found, x, placed.pose, None, placed.pose)
+    on = pose_derivatives(found, x, placed.pose, None, placed.pose)
     by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
     np.testing.assert_allclose(on.gradient, by_energy, atol=1e-6 * abs(on.gradient).max())
-    np.testing.assert_allclose(on_obstacle(found, x, placed.pose), -on.gradient, atol=1e-12 * abs(on.gradient).max())
+    np.testing.assert_allclose(contact_wrench(found, x, placed.pose), -on.gradient, atol=1e-12 * abs(on.gradient).max())
     for way in np.random.default_rng(2).normal(size=(4, p)):
         twice = (felt(h * way).potential + felt(-h * way).potential - 2 * found.potential) / h**2
         assert twice == pytest.approx(way @ on.hessian @ way, abs=1e-3 * abs(on.hessian).max())
     arm = x[found.points] - placed.pose.centre
-    J = np.concatenate([np.broadcast_to(-np.eye(d), (len(arm), d, d)), turning(arm)], axis=2)
-    both = np.einsum("nip,niq->pq", J, by_point_and_pose(found, x, placed.pose, None, placed.pose))
+    J = np.concatenate([np.broadcast_to(-np.eye(d), (len(arm), d, d)), rotation_derivative(arm)], axis=2)
+    both = np.einsum("nip,niq->pq", J, point_pose_hessian(found, x, placed.pose, None, placed.pose))
     np.testing.assert_allclose(both, on.stiffness, atol=1e-9 * abs(on.stiffness).max())
 
 
@@ -227,30 +227,32 @@ def test_forces_before_an_obstacle_that_spins_and_rubs(name: str) -> None:
     step began, against differences."""
     placed, corners = facets_near(name, 6)
     d, x = placed.shape.dim, corners.reshape(-1, placed.shape.dim)
-    facets = Facets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
+    facets = ContactFacets(np.arange(len(x)).reshape(-1, d), np.linspace(1.0, 2.0, len(corners)), SOFTEN)
     p, h = 3 * d - 3, 1e-6
-    then = placed.pose.moved(np.concatenate([0.02 * np.ones(d), 0.5 * np.ones(p - d)]))
-    inner, _ = between(facets, placed, x, LAW)
-    held = gripped_between(grip(x, placed.distance(x), np.ones(len(x)), placed, LAW), inner, x)
-    rub = Friction(0.3, 0.05)
+    then = placed.pose.incremented(np.concatenate([0.02 * np.ones(d), 0.5 * np.ones(p - d)]))
+    inner, _ = evaluate_facets(facets, placed, x, LAW)
+    held = add_facet_friction(lag_contact(x, placed.distance(x), np.ones(len(x)), placed, LAW), inner, x)
+    rub = CoulombFriction(0.3, 0.05)
     assert len(held.points) > 4
 
-    def felt(q: Values) -> Touch:
-        there = Placed(placed.shape, placed.pose.moved(q))
-        way = there.pose.points_to_space(then.to_body(held.under)) - held.under
-        return joined(touch(x, np.ones(len(x)), there, LAW, held, rub, way), *between(facets, there, x, LAW))
+    def felt(q: Values) -> ContactForces:
+        there = PosedShape(placed.shape, placed.pose.incremented(q))
+        way = there.pose.points_to_space(then.to_body(held.obstacle_point)) - held.obstacle_point
+        return merge_forces(
+            evaluate_points(x, np.ones(len(x)), there, LAW, held, rub, way), *evaluate_facets(facets, there, x, LAW)
+        )
 
     steps, found = h * np.eye(p), felt(np.zeros(p))
-    mixed = by_point_and_pose(found, x, placed.pose, held, then, exact=True)
+    mixed = point_pose_hessian(found, x, placed.pose, held, then, exact=True)
     for k, q in enumerate(steps):
         up, down = felt(q), felt(-q)
         forces = (down.normal + down.friction - up.normal - up.friction) / (2 * h)
         np.testing.assert_allclose(mixed[:, :, k], forces, atol=1e-5 * abs(mixed).max())
-    on = push(found, x, placed.pose, held, then)
+    on = pose_derivatives(found, x, placed.pose, held, then)
     by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
     np.testing.assert_allclose(on.gradient, by_energy, atol=1e-5 * abs(on.gradient).max())
     # what is left of the points once the pose has given way is a potential that goes up: CG may solve with it
-    rough, C = by_point_and_pose(found, x, placed.pose, held, then), np.linalg.inv(on.stiffness + 1e-6 * np.eye(p))
+    rough, C = point_pose_hessian(found, x, placed.pose, held, then), np.linalg.inv(on.stiffness + 1e-6 * np.eye(p))
     K = block_diag(*found.stiffness)
     for of, block in zip(np.searchsorted(found.points, inner.corners), inner.stiffness, strict=True):
         at = (d * of[:, None] + np.arange(d)).reshape(-1)
@@ -310,23 +312,23 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
                                                                            "end": 1.0}}
     )  # fmt: skip
     march(scene, state)
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, ObstacleTerm)]
     before, graph = contact.stored_energy(), scene.fracture.graph
     assert before > 0
     graph.break_edges(np.random.default_rng(3).random(len(graph.broken)) < 0.5)
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
     assert contact.stored_energy() <= before * (1 + 1e-6)
-    skin, placed = contact.skin, contact._course.placed[0]
-    x = skin.places(contact._at_end())
+    skin, placed = contact.surface, contact._kinematics.posed[0]
+    x = skin.positions(contact._end_displacement())
     assert (skin.facets.gaps(placed, x, 1.0) > 0).all()
-    left_out = skin._cut
+    left_out = skin._excluded_facets
     assert len(left_out) > 0 and len(skin.facets.area) > 100
-    rows = skin.saved_cut()
-    skin.restore_cut(rows)
-    np.testing.assert_array_equal(skin._cut, left_out)
+    rows = skin.cut_to_checkpoint()
+    skin.cut_from_checkpoint(rows)
+    np.testing.assert_array_equal(skin._excluded_facets, left_out)
     # what is drawn: all of it, beside the ball
-    at, (elements, _), u = skin.at, skin._surface.facets(), skin.follow.nodal(contact._at_end())
+    at, (elements, _), u = skin.point_map, skin._surface.facets(), skin.interpolation.nodal(contact._end_displacement())
     whole = at.with_arm_share(np.ones(len(at.share)))
     shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
     least = [

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.contact.shapes import Box, Sphere
+from fracsim.contact.shapes import RoundedBox, Sphere
 from fracsim.rigid.collision_detection import Finder
 from fracsim.rigid.contact_points import Contacts
 from fracsim.rigid.mujoco_model import Rules, Stand, model_of
@@ -56,7 +56,7 @@ def test_two_threads_find_what_one_does() -> None:
     rng = np.random.default_rng(6)
     bodies = cubes((1.05 * np.indices((6, 6, 6)).reshape(3, -1).T + 0.6).tolist())
     bodies = replace(bodies, turn=Rotation.random(216, rng=rng).as_matrix())
-    block = Stand(primitive(Box((2.0, 2.0, 1.0)), "block"), np.array([3.0, 3.0, 0.1]), 0.3)
+    block = Stand(primitive(RoundedBox((2.0, 2.0, 1.0)), "block"), np.array([3.0, 3.0, 0.1]), 0.3)
     ball = Stand(primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
     model = model_of(bodies, [[CUBE]] * 216, [floor(0.5), block, ball], Rules(5e-3, DOWN, 0.4))
     course = Course(np.full((3, 3), 100.0), np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 216))])

@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from pydantic import ValidationError
 
-from fracsim.contact.rigid_obstacle_term import FreeObstacles
+from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
 from fracsim.errors import InputError
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -32,8 +32,8 @@ def ball(**more: Any) -> dict[str, Any]:
     return {"name": "it", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.42], "mass": 5.0} | more
 
 
-def contact_of(scene: Scene) -> FreeObstacles:
-    (found,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacles)]
+def contact_of(scene: Scene) -> FreeObstacleTerm:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
     return found
 
 
@@ -44,7 +44,7 @@ def told(scene: Scene) -> dict[str, float]:
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
     """(d,) linear and (1,) or (3,) angular momentum about the origin of body and obstacle."""
-    d, (flight,) = scene.domain.dim, [each.flight for each in contact_of(scene).free.values()]
+    d, (flight,) = scene.domain.dim, [each.motion for each in contact_of(scene).free.values()]
     mass = scene.balance.mass.lumped.reshape(-1, d)[:, :1]
     x, v = positions(scene) + state.u.reshape(-1, d), state.v.reshape(-1, d)
     rows = [(x, mass * v), (flight.pose.centre[None], flight.momentum[None, :d])]
@@ -153,7 +153,7 @@ def test_angular_momentum_is_kept_to_the_order_of_the_scheme() -> None:
         after = momenta(scene, state)
         np.testing.assert_allclose(after[0], linear, atol=1e-8 * 10)
         lost.append(np.abs(after[1] - angular).max())
-    assert np.linalg.norm(linear - contact_of(scene).free[0].flight.momentum[:3]) > 5  # most of it has changed hands
+    assert np.linalg.norm(linear - contact_of(scene).free[0].motion.momentum[:3]) > 5  # most of it has changed hands
     assert lost[1] < lost[0] / 3 and lost[1] < 5e-3 * np.linalg.norm(angular)
 
 
@@ -269,13 +269,13 @@ def test_a_free_ball_smaller_than_a_facet_is_felt_between_its_corners(dim: int, 
     for report in each_step(scene, state):
         u = scene.domain.gather_nodes(state.u.reshape(-1, dim))
         assert u is not None
-        x, centre = (scene.domain.source.points + u)[top], contact_of(scene).free[0].flight.pose.centre
+        x, centre = (scene.domain.source.points + u)[top], contact_of(scene).free[0].motion.pose.centre
         least = min(least, np.linalg.norm(np.einsum("sc,kcd->ksd", shares, x) - centre, axis=2).min() - 0.05)
         assert np.linalg.norm(x - centre, axis=2).min() > 0.1  # no corner is near
         np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-9 * 2)
         assert report.kinetic + report.elastic < energy * (1 + 1e-6)
-    assert 0 < least < contact_of(scene).width
-    moved = contact_of(scene).free[0].flight.momentum[dim - 1] / 0.5
+    assert 0 < least < contact_of(scene).barrier_width
+    moved = contact_of(scene).free[0].motion.momentum[dim - 1] / 0.5
     assert 0.1 < moved < 4.0
 
 

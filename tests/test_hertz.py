@@ -11,7 +11,7 @@ import meshio
 import numpy as np
 import pytest
 
-from fracsim.contact.obstacle_term import Obstacles
+from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.meshes.builders.box import Box
 from support.scenes import make_scene, march, positions
 
@@ -48,9 +48,9 @@ def test_a_sphere_on_a_half_space(tmp_path: Path) -> None:
         time={"scheme": "quasi-static", "step": 0.25, "end": 1.0}, solver={"snes_rtol": 1e-8},
     )  # fmt: skip
     march(scene, state)
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    touch = contact.touching()[0]
-    pressed, r = -touch.normal[:, 2], np.linalg.norm(contact.x[touch.points][:, :2], axis=1)
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, ObstacleTerm)]
+    touch = contact.obstacle_forces()[0]
+    pressed, r = -touch.normal[:, 2], np.linalg.norm(contact.positions[touch.points][:, :2], axis=1)
     total = 4 * pressed.sum()
     top = np.argmin(np.linalg.norm(positions(scene), axis=1))
     # the bottom of the block stands still, where that of a half space would sink: Boussinesq

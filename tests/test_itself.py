@@ -56,8 +56,8 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -
     before, touched = (m * v).sum(axis=0), 0
     for report in each_step(scene, state):
         assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
-        x = contact._places()
-        assert len(contact._surface.pairs.overlaps(x)) == 0
+        x = contact._end_positions()
+        assert len(contact._surface.pairs.intersections(x)) == 0
         touched += contact.stored_energy() > 0
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
@@ -77,7 +77,7 @@ def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
     m, before, impulse = scene.balance.mass.lumped[::2], state.v[::2].copy(), 0.0
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     for report in each_step(scene, state):
-        assert len(contact._surface.pairs.overlaps(contact._places())) == 0
+        assert len(contact._surface.pairs.intersections(contact._end_positions())) == 0
         assert (positions(scene) + state.u.reshape(-1, 2))[:, 0].max() > 1.8
         impulse += report.dt * scene.probes()[0]
     right = positions(scene)[:, 0] > 1.01
@@ -124,7 +124,7 @@ def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
         (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
         reports = march(scene, state)
         assert len(reports) == 10
-        gaps.append(contact.least_gap() / contact.law.distance)
+        gaps.append(contact.min_gap() / contact.law.distance)
         its.append([report.solve.newton_iterations for report in reports])
         forces.append(scene.probes()[0])
     assert min(gaps) > TIGHT
@@ -203,5 +203,5 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
         hammer = at + state.t * velocity
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
     assert contact._surface is not None
-    assert len(contact._surface.pairs.overlaps(contact._places())) == 0
+    assert len(contact._surface.pairs.intersections(contact._end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10

@@ -9,12 +9,12 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.barrier import Barrier
-from fracsim.contact.obstacle import Obstacle
-from fracsim.contact.obstacle_pairs import Stop
+from fracsim.contact.obstacle import RigidObstacle
+from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose
-from fracsim.contact.rigid_body import between_two
-from fracsim.contact.rigid_obstacle_term import FreeObstacles
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from fracsim.contact.rigid_body import mixed_pose_hessian
+from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
+from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -22,9 +22,9 @@ SCHEMES = ("backward-euler", "newmark", "generalized-alpha")
 G = 10.0
 
 BESIDE: list[tuple[Shape, Shape]] = [
-    (Sphere(0.3), Box((0.6, 0.4, 0.5), rounding=0.05)),
-    (Cylinder(0.2, 0.5, rounding=0.05), Capsule(0.1, 0.5, axis=(1.0, 0.0, 0.0))),
-    (Box((0.6, 0.4), rounding=0.05), Box((0.5, 0.3), rounding=0.05)),
+    (Sphere(0.3), RoundedBox((0.6, 0.4, 0.5), rounding=0.05)),
+    (RoundedCylinder(0.2, 0.5, rounding=0.05), Capsule(0.1, 0.5, axis=(1.0, 0.0, 0.0))),
+    (RoundedBox((0.6, 0.4), rounding=0.05), RoundedBox((0.5, 0.3), rounding=0.05)),
 ]
 
 
@@ -32,18 +32,23 @@ BESIDE: list[tuple[Shape, Shape]] = [
 def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
     """Second derivative of the energy by an increment of one pose and of the other, by differences."""
     d, turns = both[0].dim, 1 if both[0].dim == 2 else 3
-    one, other = (Obstacle(name, shape, np.zeros(d)) for name, shape in zip("ab", both, strict=True))
-    stop, barrier = Stop.of(one, other), Barrier(50.0, 0.2)
-    here = Pose.at(np.array([0.05, 0.03, 1.0][3 - d :])).moved(np.concatenate([np.zeros(d), 0.1 * np.ones(turns)]))
-    there = Pose.at(np.zeros(d)).moved(np.concatenate([np.zeros(d), np.linspace(-0.1, 0.1, turns)]))
+    one, other = (RigidObstacle(name, shape, np.zeros(d)) for name, shape in zip("ab", both, strict=True))
+    stop, barrier = ObstaclePair.between(one, other), Barrier(50.0, 0.2)
+    here = Pose.at_point(np.array([0.05, 0.03, 1.0][3 - d :])).incremented(
+        np.concatenate([np.zeros(d), 0.1 * np.ones(turns)])
+    )
+    there = Pose.at_point(np.zeros(d)).incremented(np.concatenate([np.zeros(d), np.linspace(-0.1, 0.1, turns)]))
     apart = min(gap.min() for gap in stop.gaps(here, there))
-    here = here.moved(np.eye(d + turns)[d - 1] * (0.05 - apart))
+    here = here.incremented(np.eye(d + turns)[d - 1] * (0.05 - apart))
 
     def energy(q: Values, p: Values) -> float:
-        return sum(touch.potential for touch, _ in stop.touches(here.moved(q), there.moved(p), barrier, None))
+        return sum(
+            touch.potential
+            for touch, _ in stop.contact_forces(here.incremented(q), there.incremented(p), barrier, None)
+        )
 
-    (own, x), (its, y) = stop.touches(here, there, barrier, None)
-    found = between_two(own, x, here, there)[0] + between_two(its, y, there, here)[0].T
+    (own, x), (its, y) = stop.contact_forces(here, there, barrier, None)
+    found = mixed_pose_hessian(own, x, here, there)[0] + mixed_pose_hessian(its, y, there, here)[0].T
     steps, assembled = 1e-4 * np.eye(d + turns), np.zeros_like(found)
     for i, q in enumerate(steps):
         for j, p in enumerate(steps):
@@ -52,7 +57,7 @@ def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
     np.testing.assert_allclose(found, assembled, atol=2e-5 * np.abs(assembled).max())
 
 
-def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Scene, Walk, FreeObstacles]:
+def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Scene, Walk, FreeObstacleTerm]:
     """A block from 0 to 1 in x, up to 0.3, that is held below, and obstacles."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.3] if dim == 2 else [1.0, 1.0, 0.3], "h": 0.3},
@@ -60,20 +65,22 @@ def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Sce
         boundary=[{"on": "bottom", "fix": "xyz"[:dim]}], solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         obstacle=list(obstacles), **more,
     )  # fmt: skip
-    (term,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacles)]
+    (term,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
     return scene, state, term
 
 
-def gap(term: FreeObstacles) -> float:
+def gap(term: FreeObstacleTerm) -> float:
     """The least between free obstacles, m."""
-    assert term._mutual is not None
-    at = [each.flight.pose for each in term.free.values()]
-    return min(float(g.min(initial=9.0)) for (i, j), s in term._mutual._stops.items() for g in s.gaps(at[i], at[j]))
+    assert term._free_system is not None
+    at = [each.motion.pose for each in term.free.values()]
+    return min(
+        float(g.min(initial=9.0)) for (i, j), s in term._free_system._pairs.items() for g in s.gaps(at[i], at[j])
+    )
 
 
-def linear(term: FreeObstacles) -> Values:
+def linear(term: FreeObstacleTerm) -> Values:
     """(d,) momentum of the free obstacles, kg m/s."""
-    return np.asarray(sum(each.flight.momentum[: term._domain.dim] for each in term.free.values()))
+    return np.asarray(sum(each.motion.momentum[: term._domain.dim] for each in term.free.values()))
 
 
 def disk(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
@@ -92,7 +99,7 @@ def test_two_disks_share_their_momentum(scheme: str) -> None:
     for report in each_step(scene, state):
         np.testing.assert_allclose(linear(term), [5.0, 0.0], atol=1e-12)
         assert gap(term) > 0 and report.kinetic + report.elastic <= 2.5 * (1 + 1e-9)
-    first, second = (each.flight.momentum / 5.0 for each in term.free.values())
+    first, second = (each.motion.momentum / 5.0 for each in term.free.values())
     n = np.array([np.sqrt(0.2**2 - 0.05**2), 0.05]) / 0.2  # where they met
     assert 0 < second[:2] @ n - first[:2] @ n <= n[0]
     assert second[0] > 0.4 and abs(second[1] / second[0] - n[1] / n[0]) < 0.1
@@ -110,8 +117,8 @@ def test_fast_ones_do_not_pass_through_each_other(dim: int) -> None:
     for _ in each_step(scene, state):
         np.testing.assert_allclose(linear(term), [100.0, *[0.0] * (dim - 1)], atol=1e-10)
         assert gap(term) > 0
-    one, other = (each.flight.pose.centre[0] for each in term.free.values())
-    assert one < other and term.free[1].flight.momentum[0] > 50
+    one, other = (each.motion.pose.centre[0] for each in term.free.values())
+    assert one < other and term.free[1].motion.momentum[0] > 50
 
 
 def test_a_pile_on_a_body_weighs_what_it_weighs() -> None:
@@ -124,6 +131,6 @@ def test_a_pile_on_a_body_weighs_what_it_weighs() -> None:
     march(scene, state)
     told = dict(zip(scene.probes.names, scene.probes(), strict=True))
     assert told["contact_box_y"] == pytest.approx(13.0 * G, rel=1e-3) and told["contact_it_y"] == 0.0
-    assert term._mutual is not None
-    assert [force[1] for force in term._mutual.forces().values()] == pytest.approx([-5.0 * G, 5.0 * G], rel=1e-3)
+    assert term._free_system is not None
+    assert [force[1] for force in term._free_system.wrenches().values()] == pytest.approx([-5.0 * G, 5.0 * G], rel=1e-3)
     assert max(abs(told[f"velocity_{name}_y"]) for name in ("box", "it")) < 1e-3

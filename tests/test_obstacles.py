@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from fracsim.contact.obstacle_term import Obstacles
+from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.errors import InputError
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
@@ -330,10 +330,10 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     graph.break_edges((y.min(axis=1) < 0.25) & (y.max(axis=1) > 0.25))
     scene.fracture.changed()
     scene.balance.edges_broke(graph.pattern)
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, Obstacles)]
-    X = contact.skin.rest
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, ObstacleTerm)]
+    X = contact.surface.rest_positions
     inside = (X[:, 0] > 0.05) & (X[:, 0] < 0.95) & (X[:, 1] > 0.05) & (X[:, 1] < 0.45)
-    assert inside.sum() > 10 and contact.skin.area[inside].min() > 0
+    assert inside.sum() > 10 and contact.surface.area[inside].min() > 0
 
 
 def test_an_obstacle_inside_the_body_is_refused() -> None:

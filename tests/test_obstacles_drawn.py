@@ -11,9 +11,9 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
-from fracsim.contact.drawing import Drawing
-from fracsim.contact.pose import Placed, Pose
-from fracsim.contact.shapes import Plane, Sphere
+from fracsim.contact.drawing import ObstacleTessellation
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.shapes import HalfSpace, Sphere
 from fracsim.output.surface.collection import read_entries
 from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import render
@@ -112,8 +112,8 @@ def test_a_plane_is_a_slab_behind_it_near_the_body(dim: int) -> None:
     direction, point = rng.normal(size=dim), rng.normal(size=dim)
     n = direction / np.linalg.norm(direction)
     lower, upper = np.full(dim, 2.0), np.full(dim, 3.0)
-    placed = Placed(Plane(tuple(direction)), Pose.at(point))
-    drawn = Drawing(placed, lower, upper)(placed)
+    placed = PosedShape(HalfSpace(tuple(direction)), Pose.at_point(point))
+    drawn = ObstacleTessellation(placed, lower, upper)(placed)
     side = 2 * np.sqrt(dim)
     height = (drawn.points - point) @ n
     assert height.max() == pytest.approx(0, abs=1e-12) and height.min() == pytest.approx(-0.01 * side)
@@ -126,6 +126,6 @@ def test_a_plane_is_a_slab_behind_it_near_the_body(dim: int) -> None:
 
 
 def test_a_hollow_disk_is_not_filled() -> None:
-    placed = Placed(Sphere(0.5, 2, hollow=True), Pose.at(np.zeros(2)))
-    drawn = Drawing(placed, np.zeros(2), np.ones(2))(placed)
+    placed = PosedShape(Sphere(0.5, 2, hollow=True), Pose.at_point(np.zeros(2)))
+    drawn = ObstacleTessellation(placed, np.zeros(2), np.ones(2))(placed)
     assert len(drawn.triangles) == 0 and len(drawn.segments) == 48

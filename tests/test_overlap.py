@@ -6,31 +6,31 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.initial_overlap import depth
-from fracsim.contact.pose import Placed, Pose
-from fracsim.contact.shapes import Box, Plane, Shape, Sphere
+from fracsim.contact.initial_overlap import overlap_depth
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.shapes import HalfSpace, RoundedBox, Shape, Sphere
 from support.shapes import ALL, BODIES
 
 Values = npt.NDArray[np.float64]
 
 
-def at(shape: Shape, centre: list[float], turn: list[float] | None = None) -> Placed:
+def at(shape: Shape, centre: list[float], turn: list[float] | None = None) -> PosedShape:
     d = len(centre)
     q = np.concatenate([centre, turn if turn is not None else np.zeros(1 if d == 2 else 3)])
-    return Placed(shape, Pose.at(np.zeros(d)).moved(q))
+    return PosedShape(shape, Pose.at_point(np.zeros(d)).incremented(q))
 
 
 def test_depth_by_hand() -> None:
     """Ball and plane: r - z; two balls: r + r' - distance, also apart; a box on its edge: half a diagonal, less what
     the rounding r takes of it, (sqrt 2 - 1) r, less its height."""
-    floor = at(Plane((0.0, 0.0, 1.0)), [0.0, 0.0, 0.0])
-    assert depth(at(Sphere(0.5), [3.0, 4.0, 0.2]), floor) == pytest.approx(0.3)
-    assert depth(at(Sphere(0.5), [3.0, 4.0, 0.6]), floor) == pytest.approx(-0.1)
+    floor = at(HalfSpace((0.0, 0.0, 1.0)), [0.0, 0.0, 0.0])
+    assert overlap_depth(at(Sphere(0.5), [3.0, 4.0, 0.2]), floor) == pytest.approx(0.3)
+    assert overlap_depth(at(Sphere(0.5), [3.0, 4.0, 0.6]), floor) == pytest.approx(-0.1)
     for away in (0.9, 1.3):
         one, other = at(Sphere(0.5), [0.0, 0.0, 0.0]), at(Sphere(0.6), [0.0, 0.6 * away, 0.8 * away])
-        assert depth(one, other) == pytest.approx(1.1 - away, abs=1e-5)
-    tipped = at(Box((1.0, 1.0, 1.0), rounding=0.1), [0.0, 0.0, 0.6], [np.pi / 4, 0.0, 0.0])
-    assert depth(tipped, floor) == pytest.approx(np.sqrt(0.5) - 0.1 * (np.sqrt(2) - 1) - 0.6, abs=1e-5)
+        assert overlap_depth(one, other) == pytest.approx(1.1 - away, abs=1e-5)
+    tipped = at(RoundedBox((1.0, 1.0, 1.0), rounding=0.1), [0.0, 0.0, 0.6], [np.pi / 4, 0.0, 0.0])
+    assert overlap_depth(tipped, floor) == pytest.approx(np.sqrt(0.5) - 0.1 * (np.sqrt(2) - 1) - 0.6, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -39,9 +39,9 @@ def test_no_point_of_a_body_lies_deeper(name: str) -> None:
     body, rng = BODIES[name], np.random.default_rng(3)
     others = [each for each in ALL.values() if each.dim == body.dim]
     X = rng.uniform(-1, 1, (60_000, body.dim))
-    X = np.concatenate([X[body.distance(X) < 0][:20_000], body.outline()[0]])
+    X = np.concatenate([X[body.distance(X) < 0][:20_000], body.tessellate()[0]])
     for other in others:
         here = at(body, rng.uniform(-0.8, 0.8, body.dim).tolist(), rng.normal(size=1 if body.dim == 2 else 3).tolist())
         there = at(other, [0.0] * body.dim)
         strewn = -there.distance(here.pose.points_to_space(X)).min()
-        assert strewn - 1e-5 < depth(here, there) < strewn + 0.04
+        assert strewn - 1e-5 < overlap_depth(here, there) < strewn + 0.04

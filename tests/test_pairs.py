@@ -13,8 +13,8 @@ from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
-from fracsim.contact.crack_wall_offset import receded
-from fracsim.contact.ipc_pairs import VERTICES, Pairs
+from fracsim.contact.crack_wall_offset import offset_crack_faces
+from fracsim.contact.ipc_pairs import VERTICES, IpcPairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -61,12 +61,12 @@ def stacked(dim: int, gap: float, counts: tuple[int, int] = (4, 4), seeds: tuple
     return points, np.concatenate([lower[1], upper[1] + len(lower[0])]), np.arange(len(points)) >= len(lower[0])
 
 
-def rough(dim: int) -> tuple[Pairs, Values, npt.NDArray[np.bool_]]:
+def rough(dim: int) -> tuple[IpcPairs, Values, npt.NDArray[np.bool_]]:
     """Two bodies pressed together aslant; where their points are, and which are the upper one's."""
     points, elements, upper = stacked(dim, 0.7 * REACH, (3, 4))
     rng = np.random.default_rng(3)
     points = points + upper[:, None] * np.array([0.21, 0.13, 0.0])[3 - dim :] + rng.normal(size=points.shape) * 3e-3
-    pairs = Pairs(points, elements, distance=REACH, stiffness=STIFF, friction=0.5)
+    pairs = IpcPairs(points, elements, distance=REACH, stiffness=STIFF, friction=0.5)
     if dim == 3:  # near enough for edges against edges too
         points = points - upper[:, None] * np.array([0, 0, 0.35 * REACH])
     return pairs, points, upper
@@ -129,7 +129,7 @@ def test_pressure_does_not_depend_on_the_mesh(dim, share):
     expected = pressure(gap) + area * pressure(gap, VERTICES * REACH)
     for counts, seeds in (((4, 4), (1, 2)), ((4, 4), (3, 3)), ((5, 13), (5, 6)), ((16, 16), (7, 8))):
         x, elements, upper = stacked(dim, gap, counts, seeds)
-        force = -Pairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper]
+        force = -IpcPairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper]
         assert force[:, -1].sum() == pytest.approx(expected, rel=1e-6)
 
 
@@ -137,7 +137,7 @@ def test_pressure_does_not_depend_on_the_mesh(dim, share):
 def test_faces_with_rims_above_one_another_press_along_their_normal(dim):
     """Shifted by less than a centroid's distance from the rim, too. By vertices it was 0.18 F dx / g across."""
     x, elements, upper = stacked(dim, 0.9 * REACH)
-    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
+    pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
     for shift in (0.0, 1e-6, 1e-3, -0.02):
         force = -pairs.gradient(x + upper[:, None] * np.eye(dim)[0] * shift)[upper].sum(axis=0)
         assert abs(force[:-1]).max() < 1e-12 * force[-1]
@@ -148,7 +148,7 @@ def test_edges_carry_more_when_pressed_below_half_of_the_distance():
     found = []
     for seeds in ((1, 2), (3, 3), (5, 6)):
         x, elements, upper = stacked(3, 0.3 * REACH, (8, 8), seeds)
-        found.append(-Pairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper, -1].sum())
+        found.append(-IpcPairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper, -1].sum())
     assert max(found) < 1.15 * min(found)
     assert min(found) > pressure(0.3 * REACH)
 
@@ -163,7 +163,7 @@ def test_energy_is_the_work_on_the_way(dim):
     rate = np.array([np.sum(pairs.gradient(x + each * way) * way) for each in share])
     work = (rate[1:] + rate[:-1]) / 2 * np.diff(share)
     assert np.abs(np.diff(energy) - work).max() < 1e-3 * np.abs(work).max()
-    again = Pairs(x, stacked(dim, 0.7 * REACH, (3, 4))[1], distance=REACH, stiffness=STIFF)
+    again = IpcPairs(x, stacked(dim, 0.7 * REACH, (3, 4))[1], distance=REACH, stiffness=STIFF)
     assert again.energy(x + way) == pytest.approx(energy[-1], rel=1e-10)
 
 
@@ -171,12 +171,12 @@ def test_energy_is_the_work_on_the_way(dim):
 def test_nothing_passes(dim):
     pairs, x, _ = rough(dim)
     rng = np.random.default_rng(5)
-    assert pairs.longest_step(x, x) == 1
+    assert pairs.free_fraction(x, x) == 1
     for size in np.repeat([1e-3, 1e-1, 10.0], 30):
         to = x + rng.normal(size=x.shape) * size
-        step = pairs.longest_step(x, to)
+        step = pairs.free_fraction(x, to)
         assert 0 < step <= 1
-        assert len(pairs.overlaps(x + step * (to - x))) == 0
+        assert len(pairs.intersections(x + step * (to - x))) == 0
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -185,14 +185,14 @@ def test_ways_too_short_to_meet_ask_no_collision_detection(dim, gap, monkeypatch
     """The upper box comes down, whole: on either side of the length from which detection is asked, a tenth of the gap
     is left."""
     x, elements, upper = stacked(dim, gap)
-    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
+    pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
     asked = []
-    free = pairs._near.free
-    monkeypatch.setattr(pairs._near, "free", lambda *ends: asked.append(1) or free(*ends))
+    free = pairs._near.free_fraction
+    monkeypatch.setattr(pairs._near, "free_fraction", lambda *ends: asked.append(1) or free(*ends))
     for length in np.linspace(0.02, 1.5, 60) * gap:
         asked.clear()
         way = -length * upper[:, None] * np.eye(dim)[-1]
-        share = pairs.longest_step(x, x + way)
+        share = pairs.free_fraction(x, x + way)
         assert gap - share * length >= 0.09 * gap
         assert share == 1 or asked
         assert asked or length < 0.91 * min(gap, 0.5 * REACH) / max(upper.mean(), 1 - upper.mean()) / 2
@@ -203,19 +203,19 @@ def test_ways_too_short_to_meet_ask_no_collision_detection(dim, gap, monkeypatch
 def test_a_fast_body_is_stopped(dim):
     """The upper one thrown through the lower one, from far off: at the end of the way they are apart again."""
     x, elements, upper = stacked(dim, 3.0)
-    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
+    pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
     to = x - upper[:, None] * np.array([0, 0, 7.0])[3 - dim :]
-    assert len(pairs.overlaps(to)) == 0
-    assert 3 / 7 * 0.8 < pairs.longest_step(x, to) < 3 / 7
-    assert pairs.longest_step(x, x + (x - to)) == 1
+    assert len(pairs.intersections(to)) == 0
+    assert 3 / 7 * 0.8 < pairs.free_fraction(x, to) < 3 / 7
+    assert pairs.free_fraction(x, x + (x - to)) == 1
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_overlap_at_the_start_is_found(dim):
     x, elements, upper = stacked(dim, 0.02)
-    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF)
-    assert len(pairs.overlaps(x)) == 0
-    found = pairs.overlaps(x - upper[:, None] * np.array([0.03, 0.05, 0.07])[3 - dim :])
+    pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
+    assert len(pairs.intersections(x)) == 0
+    found = pairs.intersections(x - upper[:, None] * np.array([0.03, 0.05, 0.07])[3 - dim :])
     assert len(found) > 0
     assert found.shape[1] == 2
 
@@ -224,7 +224,7 @@ def test_overlap_at_the_start_is_found(dim):
 def test_friction_is_coulombs(dim):
     """Full slip: mu N against the sliding, and half of it or less where it sticks."""
     x, elements, upper = stacked(dim, 0.7 * REACH)
-    pairs = Pairs(x, elements, distance=REACH, stiffness=STIFF, friction=0.3)
+    pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF, friction=0.3)
     normal = -pairs.gradient(x)[upper, -1].sum()
     friction = pairs.lag_friction(x, x, 1e-3)
     for slid, share in ((5e-3, 1.0), (-5e-3, -1.0), (1e-4, 0.19)):
@@ -241,7 +241,7 @@ def test_points_of_no_element_are_let_alone():
     """As the inner nodes of a 2D mesh: at the very place of a segment."""
     x, elements, _ = stacked(2, 0.7 * REACH)
     more = np.concatenate([x, [[0.5, 0.2]]])
-    pairs, other = (Pairs(each, elements, distance=REACH, stiffness=STIFF) for each in (x, more))
+    pairs, other = (IpcPairs(each, elements, distance=REACH, stiffness=STIFF) for each in (x, more))
     assert np.array_equal(other.gradient(more), np.append(pairs.gradient(x), [[0, 0]], axis=0))
     assert other.hessian(more).shape == (2 * len(more),) * 2
 
@@ -273,9 +273,9 @@ def test_no_force_at_the_moment_of_breaking(name, dim):
     edge = shortest(mesh)
     for broken in cracks(mesh).values():
         made = torn(mesh, broken)
-        x = receded(made, 2 * 0.03 * edge)
-        pairs = Pairs(x, made.elements, distance=0.03 * edge, stiffness=1.0)
-        assert len(pairs.overlaps(x)) == 0
+        x = offset_crack_faces(made, 2 * 0.03 * edge)
+        pairs = IpcPairs(x, made.elements, distance=0.03 * edge, stiffness=1.0)
+        assert len(pairs.intersections(x)) == 0
         assert pairs.energy(x) == 0
         assert np.all(pairs.gradient(x) == 0)
 
@@ -287,14 +287,14 @@ def test_closed_crack_carries_load(dim):
     skeleton = EntityNumbering(mesh)
     made = torn(mesh, separated(skeleton, mesh.points[:, 0] > 0.6))
     reach = 0.03 * 0.25
-    x = receded(made, 1.1 * reach)
-    pairs = Pairs(x, made.elements, distance=reach, stiffness=1.0)
+    x = offset_crack_faces(made, 1.1 * reach)
+    pairs = IpcPairs(x, made.elements, distance=reach, stiffness=1.0)
     right = mesh.points[made.parents.first_parent, 0] > 0.6
     assert pairs.energy(x) == 0
     closed = [x - right[:, None] * np.eye(dim)[0] * share * reach for share in (0.3, 0.6, 0.9)]
     force = [-pairs.gradient(each)[right, 0].sum() for each in closed]
     assert 0 < 3 * force[0] < 2 * force[1] < force[2]
-    assert all(len(pairs.overlaps(each)) == 0 for each in closed)
+    assert all(len(pairs.intersections(each)) == 0 for each in closed)
 
 
 def shortest(mesh: MeshData) -> float:

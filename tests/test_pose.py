@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fracsim.contact.pose import Placed, Pose, second_order_turn, turning
+from fracsim.contact.pose import Pose, PosedShape, rotation_derivative, rotation_second_derivative
 from fracsim.contact.shapes import Shape
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
@@ -36,7 +36,7 @@ def test_increments_are_exponentials(dim: int, seed: int) -> None:
     """c + t and exp(W) R against SciPy's matrix exponential; the rotation stays one."""
     pose = somewhere(dim, seed)
     q = np.random.default_rng(seed).uniform(-2, 2, 3 if dim == 2 else 6)
-    moved = pose.moved(q)
+    moved = pose.incremented(q)
     np.testing.assert_allclose(moved.centre, pose.centre + q[:dim], atol=10 * EPS)
     np.testing.assert_allclose(moved.rotation, expm(generator(q[dim:])) @ pose.rotation, atol=200 * EPS)
 
@@ -44,10 +44,10 @@ def test_increments_are_exponentials(dim: int, seed: int) -> None:
 @both
 def test_many_turns_leave_a_rotation(dim: int) -> None:
     """A thousand increments: R^T R = I to round-off of one, and in 2D (or about one axis) angles add up."""
-    pose, q = Pose.at(np.zeros(dim)), np.zeros(3 if dim == 2 else 6)
+    pose, q = Pose.at_point(np.zeros(dim)), np.zeros(3 if dim == 2 else 6)
     q[-1] = 0.01
     for _ in range(1000):
-        pose = pose.moved(q)
+        pose = pose.incremented(q)
     np.testing.assert_allclose(pose.rotation.T @ pose.rotation, np.eye(dim), atol=10 * EPS)
     np.testing.assert_allclose(pose.rotation[:2, :2], expm(generator(np.array([10.0]))), atol=1e-11)
 
@@ -67,7 +67,7 @@ def test_to_the_body_and_back(dim: int) -> None:
 def test_fixed_points_turn_the_other_way(dim: int) -> None:
     """G(y) w = -w x y."""
     y, w = np.random.default_rng(2).normal(size=(5, dim)), np.array([0.3, -0.5, 0.7][: 1 if dim == 2 else 3])
-    np.testing.assert_allclose(turning(y) @ w, -y @ generator(w).T, atol=10 * EPS)
+    np.testing.assert_allclose(rotation_derivative(y) @ w, -y @ generator(w).T, atol=10 * EPS)
 
 
 def smooth(shape: Shape, x: Values) -> Values:
@@ -81,17 +81,17 @@ def test_derivatives_by_the_pose(shape: Shape) -> None:
     """First and second derivatives of D(exp(-w) (x - c - t)) by central differences of increments of the pose."""
     pose = somewhere(shape.dim, 5)
     x = pose.points_to_space(smooth(shape, points(shape, 60, seed=4)))
-    placed, p = Placed(shape, pose), 3 if shape.dim == 2 else 6
+    placed, p = PosedShape(shape, pose), 3 if shape.dim == 2 else 6
     assert len(x) > 20
 
-    def after(q: Values) -> Placed:
-        return Placed(shape, pose.moved(q))
+    def after(q: Values) -> PosedShape:
+        return PosedShape(shape, pose.incremented(q))
 
     h, steps = 1e-6, np.eye(p)
     by_pose = np.stack([(after(h * e).distance(x) - after(-h * e).distance(x)) / (2 * h) for e in steps], axis=-1)
-    np.testing.assert_allclose(placed.by_pose(x), by_pose, atol=1e-8)
+    np.testing.assert_allclose(placed.pose_gradient(x), by_pose, atol=1e-8)
     mixed = np.stack([(after(h * e).normal(x) - after(-h * e).normal(x)) / (2 * h) for e in steps], axis=-1)
-    np.testing.assert_allclose(placed.by_point_and_pose(x), mixed, atol=1e-6)
+    np.testing.assert_allclose(placed.mixed_hessian(x), mixed, atol=1e-6)
     np.testing.assert_allclose(placed.normal(x), differences(placed.distance, x), atol=1e-8)
     np.testing.assert_allclose(placed.curvature(x), differences(placed.normal, x), atol=1e-6)
 
@@ -100,7 +100,7 @@ def test_derivatives_by_the_pose(shape: Shape) -> None:
 def test_the_second_derivative_of_a_turn(dim: int) -> None:
     """Of n . exp(-w) y by w, by central differences: round-off 1e-16 / h^2, truncation h^2."""
     n, y = np.random.default_rng(6).normal(size=(2, 20, dim))
-    H, h, p = second_order_turn(n, y), 1e-4, 1 if dim == 2 else 3
+    H, h, p = rotation_second_derivative(n, y), 1e-4, 1 if dim == 2 else 3
     np.testing.assert_allclose(H, H.transpose(0, 2, 1), atol=1e-13)
 
     def turned(w: Values) -> Values:
@@ -117,5 +117,5 @@ def test_the_sign_of_the_moment() -> None:
 
     dd/dw = -((x - c) x n)_z = -(0.3 * 1) with x - c = (0.3, 1) and n = (0, 1).
     """
-    placed = Placed(ALL["rectangle"], Pose.at(np.array([5.0, 2.0])))
-    np.testing.assert_allclose(placed.by_pose(np.array([[5.3, 3.0]])), [[0, -1, -0.3]], atol=10 * EPS)
+    placed = PosedShape(ALL["rectangle"], Pose.at_point(np.array([5.0, 2.0])))
+    np.testing.assert_allclose(placed.pose_gradient(np.array([[5.3, 3.0]])), [[0, -1, -0.3]], atol=10 * EPS)

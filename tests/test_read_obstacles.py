@@ -11,13 +11,19 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from fracsim.contact.mesh_obstacles import Facings, Standing
-from fracsim.contact.mesh_rigid_body import FreeSolid
-from fracsim.contact.mesh_rigid_term import FreeSolids
+from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle
+from fracsim.contact.mesh_rigid_body import FreeMesh
+from fracsim.contact.mesh_rigid_term import FreeMeshTerm
 from fracsim.contact.pose import Pose
-from fracsim.contact.rigid_body import of_points
-from fracsim.contact.shapes import Box
-from fracsim.contact.triangle_mesh_shape import Solid, depth, distances, is_inside, refined
+from fracsim.contact.rigid_body import point_set_derivatives
+from fracsim.contact.shapes import RoundedBox
+from fracsim.contact.triangle_mesh_shape import (
+    TriangleMeshShape,
+    is_inside,
+    penetration_depth,
+    refine_triangles,
+    surface_distances,
+)
 from fracsim.errors import InputError
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -60,12 +66,12 @@ def mean_velocity(scene: Scene, state: Walk) -> Values:
 def test_refined_triangles_are_small_and_enclose_the_same() -> None:
     """No side is longer than asked for; the surface is closed, of the same area and volume, and holds its corners."""
     X = CORNERS * [3.0, 2.0, 0.1]
-    points, triangles = refined(X, SIDES, 0.23)
+    points, triangles = refine_triangles(X, SIDES, 0.23)
     sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
     assert np.linalg.norm(sides, axis=2).max() <= 0.23
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
     assert area == pytest.approx(2 * (3 * 2 + 3 * 0.1 + 2 * 0.1))
-    assert Solid(points, triangles).volume == pytest.approx(3 * 2 * 0.1)
+    assert TriangleMeshShape(points, triangles).volume == pytest.approx(3 * 2 * 0.1)
     edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
     assert np.array_equal(points[:8], X)
@@ -74,32 +80,32 @@ def test_refined_triangles_are_small_and_enclose_the_same() -> None:
 def test_distance_and_depth_are_those_of_a_box() -> None:
     """To a box of triangles, against the signed distance of the box (all but sharp); by how far two boxes overlap."""
     x = np.random.default_rng(1).uniform(-1.0, 1.0, (400, 3))
-    box = Box((1.0, 0.6, 0.8), rounding=1e-9)
+    box = RoundedBox((1.0, 0.6, 0.8), rounding=1e-9)
     corners = (CORNERS * [1.0, 0.6, 0.8])[SIDES]
-    signed = np.where(is_inside(x, corners), -1.0, 1.0) * distances(x, corners)
+    signed = np.where(is_inside(x, corners), -1.0, 1.0) * surface_distances(x, corners)
     np.testing.assert_allclose(signed, box.distance(x), atol=1e-8)
-    fine = refined(CORNERS, SIDES, 0.3)
+    fine = refine_triangles(CORNERS, SIDES, 0.3)
     for way, cut, deep in (([0.0, 0.3, 0.93], True, 0.07), ([0.0, 0.0, 1.01], False, None)):
-        found = depth((fine[0] + way, fine[1]), (CORNERS, SIDES), cut=cut)
+        found = penetration_depth((fine[0] + way, fine[1]), (CORNERS, SIDES), cut=cut)
         assert found == (None if deep is None else pytest.approx(deep))
-    assert depth((0.2 * CORNERS, SIDES), (CORNERS, SIDES), cut=False) == pytest.approx(0.4)
+    assert penetration_depth((0.2 * CORNERS, SIDES), (CORNERS, SIDES), cut=False) == pytest.approx(0.4)
 
 
 def test_what_acts_on_a_solid_is_the_derivative_by_its_place() -> None:
     """Minus the sum of the forces on the body, against differences of the energy as the solid is moved; and the Hessian
     against those of the gradient."""
-    points, triangles = refined(CORNERS, SIDES, 0.4)
-    solid = Standing("block", *refined(CORNERS * [0.5, 0.4, 0.3] + [0.1, 0.05, 0.68], SIDES, 0.3), 0.0)
-    facings = Facings(points, triangles, [solid], distance=0.1, stiffness=50.0)
+    points, triangles = refine_triangles(CORNERS, SIDES, 0.4)
+    solid = MeshObstacle("block", *refine_triangles(CORNERS * [0.5, 0.4, 0.3] + [0.1, 0.05, 0.68], SIDES, 0.3), 0.0)
+    facings = AllMeshPairs(points, triangles, [solid], distance=0.1, stiffness=50.0)
     x, step = points + 0.01 * np.sin(30 * points), 1e-6
     moved = []
     for axis in range(3):
         ends = []
         for sign in (-1.0, 1.0):
-            solid.put(Pose.at(sign * step * np.eye(3)[axis]))
+            solid.move_to(Pose.at_point(sign * step * np.eye(3)[axis]))
             ends.append(facings.energy(x))
         moved.append((ends[1] - ends[0]) / (2 * step))
-    solid.put(Pose.at(np.zeros(3)))
+    solid.move_to(Pose.at_point(np.zeros(3)))
     push = -facings.gradient(x).sum(axis=0)
     assert abs(push[2]) > 1.0
     np.testing.assert_allclose(moved, push, atol=1e-6 * np.abs(push).max())
@@ -176,7 +182,7 @@ def test_a_striker_far_faster_than_its_steps_does_not_tunnel(tmp_path: Path) -> 
     )  # fmt: skip
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     for _ in each_step(scene, state):
-        assert len(term._surface.pairs.each[0].cut(term._places())) == 0
+        assert len(term._surface.pairs.pairs[0].cut_elements(term._end_positions())) == 0
     x = positions(scene) + state.u.reshape(-1, 3)
     assert x[:, 2].mean() < 0.5 - 0.9 and mean_velocity(scene, state)[2] < -50
 
@@ -211,11 +217,11 @@ def test_walls_that_come_to_light_are_outside(order: int) -> None:
     broken, drawn_in = 0, 0
     for report in each_step(scene, state):
         broken += report.broken
-        x, facing = term._places(), term._surface.pairs.each[0]
-        assert len(facing.cut(x)) == 0
-        used = np.unique(np.delete(term._surface.made.elements, term._surface._out, axis=0))
-        assert not is_inside(x[used], facing.solid.here[facing.solid.triangles]).any()
-        drawn_in += int((term._surface.at.share < 1).sum())
+        x, facing = term._end_positions(), term._surface.pairs.pairs[0]
+        assert len(facing.cut_elements(x)) == 0
+        used = np.unique(np.delete(term._surface.split.elements, term._surface._excluded, axis=0))
+        assert not is_inside(x[used], facing.mesh.positions[facing.mesh.triangles]).any()
+        drawn_in += int((term._surface.point_map.share < 1).sum())
     assert broken > 5 and drawn_in > 0
 
 
@@ -237,7 +243,7 @@ def test_beside_contact_of_the_body_with_itself(itself: bool | str) -> None:
     terms = {each.name: each for each in scene.balance.terms}
     for _ in each_step(scene, state):
         for name in ("solids", "contact"):
-            assert len(terms[name]._surface.pairs.overlaps(terms[name]._places())) == 0
+            assert len(terms[name]._surface.pairs.intersections(terms[name]._end_positions())) == 0
 
 
 # --- free, and turning ----------------------------------------------------------------------------------------------
@@ -246,7 +252,7 @@ def test_beside_contact_of_the_body_with_itself(itself: bool | str) -> None:
 def test_moments_are_those_of_a_box() -> None:
     """Centre and inertia of twelve triangles about a point elsewhere: m (b^2 + c^2) / 12, and Steiner's share."""
     size, off = np.array([0.5, 0.4, 0.3]), np.array([0.7, -0.2, 0.1])
-    solid = Solid(CORNERS * size + off, SIDES)
+    solid = TriangleMeshShape(CORNERS * size + off, SIDES)
     mass = 7.0 * size.prod()
     own = np.diag(mass / 12 * (size @ size - size**2))
     np.testing.assert_allclose(solid.centre, off, atol=1e-14)
@@ -254,14 +260,14 @@ def test_moments_are_those_of_a_box() -> None:
     np.testing.assert_allclose(solid.inertia(7.0), own + away, atol=1e-13)
 
 
-def free_solid(scene: Scene) -> tuple[FreeSolids, FreeSolid]:
-    (term,) = [each for each in scene.balance.terms if isinstance(each, FreeSolids)]
+def free_solid(scene: Scene) -> tuple[FreeMeshTerm, FreeMesh]:
+    (term,) = [each for each in scene.balance.terms if isinstance(each, FreeMeshTerm)]
     return term, term.free[0]
 
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
     """(3,) linear and angular momentum about the origin of body and obstacle."""
-    flight, m = free_solid(scene)[1].flight, scene.balance.mass.lumped.reshape(-1, 3)
+    flight, m = free_solid(scene)[1].motion, scene.balance.mass.lumped.reshape(-1, 3)
     x, v, p = positions(scene) + state.u.reshape(-1, 3), state.v.reshape(-1, 3), flight.momentum
     return (m * v).sum(axis=0) + p[:3], np.cross(x, m * v).sum(axis=0) + np.cross(flight.pose.centre, p[:3]) + p[3:]
 
@@ -280,16 +286,16 @@ def test_what_is_pushed_by_a_body_is_the_derivative_by_its_pose(tmp_path: Path) 
     scene.balance.begin_step(state.t + 0.01, 0.01, state.u, state.v, state.a)
     scene.balance.set_displacement(state.u)
     term, solid = free_solid(scene)
-    before = term._before(0, term._places())
+    before = term._surroundings(0, term._end_positions())
     z, h = 1e-3 * np.array([1.0, -2.0, 1.0, 3.0, 1.0, -2.0]), 1e-6
-    solid.put(z)
-    here, pose = solid.push(before, z), solid.pose
+    solid.move_to(z)
+    here, pose = solid.pose_derivatives(before, z), solid.pose
     assert here.energy > 0 and before.friction is not None and np.abs(here.gradient).min() > 0
     ends = []
     for q in np.concatenate([h * np.eye(6), -h * np.eye(6)]):
-        solid.pose = pose.moved(q)
+        solid.pose = pose.incremented(q)
         energy, g, *_, arm = solid._parts(before)  # type: ignore[misc]
-        ends.append((energy, of_points(energy, g, *_, arm).gradient))
+        ends.append((energy, point_set_derivatives(energy, g, *_, arm).gradient))
     slope = np.array([(ends[k][0] - ends[k + 6][0]) / (2 * h) for k in range(6)])
     np.testing.assert_allclose(here.gradient, slope, atol=1e-5 * np.abs(slope).max())
     bent = np.array([(ends[k][1] - ends[k + 6][1]) / (2 * h) for k in range(6)])
@@ -309,7 +315,7 @@ def test_an_isolated_pair_keeps_its_momenta(tmp_path: Path) -> None:
         np.testing.assert_allclose(now[1], angular, atol=4e-3 * np.linalg.norm(angular))
         assert report.kinetic + report.elastic < held * (1 + 1e-9)
         held = report.kinetic + report.elastic
-        assert len(term._surface.pairs.each[0].cut(term._places())) == 0
+        assert len(term._surface.pairs.pairs[0].cut_elements(term._end_positions())) == 0
     found = last(scene)
     assert found["velocity_block_z"] > -0.5 and abs(found["spin_block_y"] - 0.5) > 0.3
     assert found["position_block_x"] == pytest.approx(0.55 + 0.08 * 0.2, rel=0.05)
@@ -367,8 +373,8 @@ def test_a_free_solid_rests_on_a_floor_and_hangs_on_a_hinge(tmp_path: Path) -> N
     assert turned > 0.9
 
 
-def _lowest(solid: FreeSolid) -> float:
-    return float(solid.flight.pose.points_to_space(solid.body.shape.outline()[0])[:, 2].min())
+def _lowest(solid: FreeMesh) -> float:
+    return float(solid.motion.pose.points_to_space(solid.body.shape.tessellate()[0])[:, 2].min())
 
 
 @pytest.mark.slow
@@ -400,7 +406,7 @@ def test_a_free_striker_far_faster_than_its_steps_does_not_tunnel(tmp_path: Path
     term, _ = free_solid(scene)
     for _ in each_step(scene, state):
         np.testing.assert_allclose(momenta(scene, state)[0], [0.0, 0.0, -1e4], atol=1e-4)
-        assert len(term._surface.pairs.each[0].cut(term._places())) == 0
+        assert len(term._surface.pairs.pairs[0].cut_elements(term._end_positions())) == 0
     assert mean_velocity(scene, state)[2] < -40
 
 
@@ -415,13 +421,13 @@ def test_a_driven_one_turns_and_drags(tmp_path: Path) -> None:
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     forces = []
     for report in each_step(scene, state):
-        assert len(term._surface.pairs.each[0].cut(term._places())) == 0
+        assert len(term._surface.pairs.pairs[0].cut_elements(term._end_positions())) == 0
         forces.append([last(scene)[f"contact_block_{axis}"] for axis in "xz"])
         assert report.kinetic + report.elastic + state.dissipated <= state.work * (1 + 1e-6) + 1e-9
     pressed = np.array(forces)
     assert pressed[:, 1].max() > 500 and abs(pressed[:, 0]).max() > 0.2 * pressed[:, 1].max()
-    pose = term.where(state.t)[0].pose
-    np.testing.assert_allclose(pose.turned(), [0.0, 1.6, 0.0], atol=1e-12)
+    pose = term.posed_obstacles(state.t)[0].pose
+    np.testing.assert_allclose(pose.rotation_vector(), [0.0, 1.6, 0.0], atol=1e-12)
     assert last(scene)["gap_block"] > 0.1  # it is through
 
 

@@ -9,7 +9,7 @@ import meshio
 import numpy as np
 import pytest
 
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Sphere
+from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Sphere
 from fracsim.errors import InputError
 from support.scenes import Walk, displacement, make_scene, march
 
@@ -116,9 +116,10 @@ def test_free_obstacles_are_set_down_on_others() -> None:
     assert told["position_ball_z"] == pytest.approx(-0.05 + 2e-5, abs=1e-12)
 
 
-@pytest.mark.parametrize("shape", [Sphere(0.1), Sphere(0.1, hollow=True), Capsule(0.1, 0.3), Cylinder(0.1, 0.3),
-                                   Cylinder(0.1, 0.3, hollow=True), Box((0.2, 0.3, 0.4), 0.03), Box((0.2, 0.3)),
-                                   Box((0.2, 0.3, 0.4), hollow=True)])  # fmt: skip
+@pytest.mark.parametrize("shape", [Sphere(0.1), Sphere(0.1, hollow=True), Capsule(0.1, 0.3), RoundedCylinder(0.1, 0.3),
+                                   RoundedCylinder(0.1, 0.3, hollow=True), RoundedBox((0.2, 0.3, 0.4), 0.03),
+                                   RoundedBox((0.2, 0.3)),
+                                   RoundedBox((0.2, 0.3, 0.4), hollow=True)])  # fmt: skip
 def test_an_inset_shape_is_further_off_by_as_much(shape: Any) -> None:
     """At points outside the obstacle: never less, as much where they see a face or a ball (but where they see an edge
     of the inset one), and before rounded edges less than twice as much."""
@@ -132,7 +133,7 @@ def test_an_inset_shape_is_further_off_by_as_much(shape: Any) -> None:
         if isinstance(shape, Sphere | Capsule):
             along[:] = True
         assert along.sum() > 5 and np.median(more[along]) == pytest.approx(by, abs=1e-12)
-    assert shape.hollow == (shape.most_inset == np.inf)
+    assert shape.hollow == (shape.max_inset == np.inf)
 
 
 def stl_of_a_box(path: Path, lower: list[float], upper: list[float]) -> str:

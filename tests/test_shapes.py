@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from fracsim.contact.shapes import SHAPES, Box, Capsule, Cylinder, Plane, Shape, Sphere
+from fracsim.contact.shapes import SHAPES, Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from fracsim.errors import InputError
 from support.shapes import ALL, BODIES, HOLLOW, differences, enclosed, facing, points, sampled
 
@@ -28,7 +28,7 @@ def test_distance_is_that_to_the_closest_point_of_the_surface(shape: Shape) -> N
     They lie up to r (1 - cos 3.75 degrees) < 2e-3 below arcs of radius r < 0.7, and about 0.02 apart, which adds
     0.02^2 / (2 d) < 2e-3 at distances d > 0.1.
     """
-    at, elements = shape.outline()
+    at, elements = shape.tessellate()
     x = points(shape, 2000)
     exact = shape.distance(x)
     clear = abs(exact) > 0.1
@@ -107,7 +107,7 @@ def test_middle_planes_and_axes_are_no_exception(shape: Shape) -> None:
 
 def test_a_core_without_thickness_curves_on_its_middle_plane() -> None:
     """A box as round as can be is a stadium, on the plane z = 0 too."""
-    box, stadium = Box((1.6, 0.6), rounding=0.3), Capsule(0.3, 1.0, axis=(1.0, 0.0))
+    box, stadium = RoundedBox((1.6, 0.6), rounding=0.3), Capsule(0.3, 1.0, axis=(1.0, 0.0))
     x = np.concatenate([points(box, 100), [[1.0, 0.0], [0.0, 1.0], [0.5, 0.7]]])
     np.testing.assert_allclose(box.distance(x), stadium.distance(x), atol=10 * EPS)
     np.testing.assert_allclose(box.curvature(x), stadium.curvature(x), atol=1e-9)
@@ -128,7 +128,7 @@ def test_distance_is_c1_over_a_rounded_edge() -> None:
 @closed
 def test_outline_is_closed_faces_out_and_has_the_volume(shape: Shape) -> None:
     """Every edge (2D: point) once in either direction; volume by the divergence theorem within 1 %."""
-    at, elements = shape.outline()
+    at, elements = shape.tessellate()
     sides = [(0, 1), (1, 2), (2, 0)] if shape.dim == 3 else [(0,), (1,)]
     if shape.dim == 3:
         edges = Counter(tuple(element[list(side)]) for element in elements for side in sides)
@@ -147,8 +147,8 @@ def test_outline_is_closed_faces_out_and_has_the_volume(shape: Shape) -> None:
 @pytest.mark.parametrize("direction", ((0.0, 0.0, 2.0), (1.0, -2.0, 3.0), (0.0, 1.0), (1.0, -2.0)))
 def test_outline_of_a_plane_is_a_patch(direction: tuple[float, ...]) -> None:
     """On the plane, of the given size, facing out."""
-    plane = Plane(direction, extent=3.0)
-    at, elements = plane.outline()
+    plane = HalfSpace(direction, extent=3.0)
+    at, elements = plane.tessellate()
     normals, middles = facing(at, elements)
     np.testing.assert_allclose(plane.distance(at), 0, atol=20 * EPS)
     np.testing.assert_allclose(normals, plane.normal(middles), atol=20 * EPS)
@@ -182,12 +182,12 @@ def test_closed_forms_of_the_books() -> None:
     np.testing.assert_allclose(sphere.inertia(3.0), 3 * sphere.volume * 0.4 * 0.25 * np.eye(3), rtol=1e-14)
     assert sphere.volume == pytest.approx(np.pi / 6) and disk.volume == pytest.approx(np.pi / 4)
     assert float(disk.inertia(3.0)) == pytest.approx(3 * disk.volume * 0.125, rel=1e-14)
-    box = Box((1.0, 2.0, 3.0), rounding=1e-9)
+    box = RoundedBox((1.0, 2.0, 3.0), rounding=1e-9)
     np.testing.assert_allclose(box.inertia(1.0), 6 / 12 * np.diag([13, 10, 5]), atol=1e-7)
-    cylinder = Cylinder(0.5, 2.0, rounding=1e-9)
+    cylinder = RoundedCylinder(0.5, 2.0, rounding=1e-9)
     mass, across = np.pi / 2, 0.25 / 4 + 4 / 12
     np.testing.assert_allclose(cylinder.inertia(1.0), mass * np.diag([across, across, 0.125]), atol=1e-7)
-    np.testing.assert_allclose(Box((1.0, 1.0, 1.0), rounding=0.5).inertia(3.0), sphere.inertia(3.0), atol=1e-14)
+    np.testing.assert_allclose(RoundedBox((1.0, 1.0, 1.0), rounding=0.5).inertia(3.0), sphere.inertia(3.0), atol=1e-14)
     assert Capsule(0.5, 2.0).volume == pytest.approx(sphere.volume + np.pi / 4 * 2)
 
 
@@ -214,8 +214,8 @@ def test_no_points(shape: Shape) -> None:
 
 
 def test_names() -> None:
-    assert {name: each.__name__.lower() for name, each in SHAPES.items()} == {name: name for name in SHAPES}
-    assert {Box, Capsule, Cylinder, Plane, Sphere} == set(SHAPES.values())
+    assert {name: each.kind for name, each in SHAPES.items()} == {name: name for name in SHAPES}
+    assert {RoundedBox, Capsule, RoundedCylinder, HalfSpace, Sphere} == set(SHAPES.values())
 
 
 @pytest.mark.parametrize(
@@ -224,14 +224,14 @@ def test_names() -> None:
         (lambda: Sphere(-1.0), "radius of a sphere is -1.0"),
         (lambda: Sphere(1.0, dim=4), "4 dimensions"),
         (lambda: Capsule(1.0, float("inf")), "length of a capsule is inf"),
-        (lambda: Plane((0.0, 0.0)), "no direction"),
-        (lambda: Box((1.0,)), "2 or 3"),
-        (lambda: Box((1.0, 0.0)), "size of a box is 0.0"),
-        (lambda: Box((1.0, 2.0), rounding=0.6), "at most 0.5 m"),
-        (lambda: Box((1.0, 2.0), rounding=0.0), "rounding of a box is 0.0"),
-        (lambda: Cylinder(1.0, 1.0, axis=(1.0, 0.0)), "3 numbers"),
-        (lambda: Cylinder(1.0, 4.0, rounding=1.0), "take a capsule"),
-        (lambda: Plane((0.0, 1.0)).inertia(1.0), "hold it or drive it"),
+        (lambda: HalfSpace((0.0, 0.0)), "no direction"),
+        (lambda: RoundedBox((1.0,)), "2 or 3"),
+        (lambda: RoundedBox((1.0, 0.0)), "size of a box is 0.0"),
+        (lambda: RoundedBox((1.0, 2.0), rounding=0.6), "at most 0.5 m"),
+        (lambda: RoundedBox((1.0, 2.0), rounding=0.0), "rounding of a box is 0.0"),
+        (lambda: RoundedCylinder(1.0, 1.0, axis=(1.0, 0.0)), "3 numbers"),
+        (lambda: RoundedCylinder(1.0, 4.0, rounding=1.0), "take a capsule"),
+        (lambda: HalfSpace((0.0, 1.0)).inertia(1.0), "hold it or drive it"),
     ),
 )
 def test_what_is_no_shape_is_said(wrong: object, message: str) -> None:

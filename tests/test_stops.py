@@ -10,23 +10,23 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.barrier import Barrier
-from fracsim.contact.initial_overlap import depth
-from fracsim.contact.obstacle import Obstacle
-from fracsim.contact.obstacle_pairs import Stops
-from fracsim.contact.pose import Placed, Pose
-from fracsim.contact.rigid_obstacle_term import FreeObstacles
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from fracsim.contact.initial_overlap import overlap_depth
+from fracsim.contact.obstacle import RigidObstacle
+from fracsim.contact.obstacle_pairs import ObstaclePairs
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
+from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import each_step, make_scene
 
 Values = npt.NDArray[np.float64]
 SCHEMES = ("backward-euler", "newmark", "generalized-alpha")
 
 BESIDE: list[tuple[Shape, Shape]] = [
-    (Box((0.6, 0.4, 0.5), rounding=0.05), Plane((0.0, 0.0, 1.0))),
-    (Sphere(0.3), Box((0.6, 0.4, 0.5), rounding=0.05)),
-    (Cylinder(0.2, 0.5, rounding=0.05), Sphere(0.3)),
+    (RoundedBox((0.6, 0.4, 0.5), rounding=0.05), HalfSpace((0.0, 0.0, 1.0))),
+    (Sphere(0.3), RoundedBox((0.6, 0.4, 0.5), rounding=0.05)),
+    (RoundedCylinder(0.2, 0.5, rounding=0.05), Sphere(0.3)),
     (Capsule(0.1, 0.5, axis=(1.0, 0.0, 0.0)), Capsule(0.1, 0.5, axis=(0.0, 1.0, 0.0))),
-    (Box((0.6, 0.4), rounding=0.05), Box((0.5, 0.3), rounding=0.05)),
+    (RoundedBox((0.6, 0.4), rounding=0.05), RoundedBox((0.5, 0.3), rounding=0.05)),
 ]
 
 
@@ -37,19 +37,25 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None
     little further away."""
     shape, other = both
     d, turns = shape.dim, 1 if shape.dim == 2 else 3
-    there = Placed(other, Pose.at(np.zeros(d)))
-    start = Pose.at(np.zeros(d)).moved(np.concatenate([np.array([0.05, 0.03, 1.0][-d:]), np.linspace(0.3, 0.5, turns)]))
-    gap = -depth(Placed(shape, start), there)
+    there = PosedShape(other, Pose.at_point(np.zeros(d)))
+    start = Pose.at_point(np.zeros(d)).incremented(
+        np.concatenate([np.array([0.05, 0.03, 1.0][-d:]), np.linspace(0.3, 0.5, turns)])
+    )
+    gap = -overlap_depth(PosedShape(shape, start), there)
     down = -there.normal(start.centre[None])[0] if d == 3 else np.array([0.0, -1.0])
-    here = start.moved(np.concatenate([(gap - 0.02) * down, np.zeros(turns)]))
-    stops = Stops(Obstacle("it", shape, np.zeros(d)), {1: Obstacle("other", other, np.zeros(d))}, Barrier(50.0, 0.2))
-    stops.begin(here.moved(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)])), [there, there], along=along)
+    here = start.incremented(np.concatenate([(gap - 0.02) * down, np.zeros(turns)]))
+    stops = ObstaclePairs(
+        RigidObstacle("it", shape, np.zeros(d)), {1: RigidObstacle("other", other, np.zeros(d))}, Barrier(50.0, 0.2)
+    )
+    stops.begin_step(
+        here.incremented(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)])), [there, there], along=along
+    )
     placed = [there, there]
-    found, h = stops.push(here, placed), 1e-6
+    found, h = stops.pose_derivatives(here, placed), 1e-6
     steps = h * np.eye(d + turns)
 
     def potential(q: Values) -> float:
-        return stops.energies(here.moved(q), placed)[1]
+        return stops.energies(here.incremented(q), placed)[1]
 
     assert stops.are_open(here, placed) and found.energy > 1e-3
     slope = np.array([potential(e) - potential(-e) for e in steps]) / (2 * h)
@@ -78,10 +84,10 @@ def thrown(
         contact={"distance": 0.03, "stiffness": 3e3, "itself": False}, solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         time={"scheme": scheme, "step": step, "end": end},
     )  # fmt: skip
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacles)]
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
     for report in each_step(scene, state):
-        placed = contact.where(state.t)
-        assert depth(placed[-1], placed[0]) < 0
+        placed = contact.posed_obstacles(state.t)
+        assert overlap_depth(placed[-1], placed[0]) < 0
         row = dict(zip(scene.probes.names, scene.probes(), strict=True))
         yield row | {"energy": report.kinetic + report.elastic + state.dissipated - state.work}
 

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.contact.obstacle import Obstacle
+from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.shapes import Sphere
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
@@ -194,7 +194,7 @@ def test_a_body_broken_at_rest_stays_where_it_is() -> None:
 
 def test_an_obstacle_strikes_what_it_is_driven_into() -> None:
     """A ball driven sideways into a bar that floats: the bar breaks where it is hit, and the ball has done work."""
-    ball = Obstacle("ball", Sphere(0.2, 3), np.array([1.5, -0.3, 0.5]), lambda t: np.array([0.0, 8.0 * t, 0.0]))
+    ball = RigidObstacle("ball", Sphere(0.2, 3), np.array([1.5, -0.3, 0.5]), lambda t: np.array([0.0, 8.0 * t, 0.0]))
     stepper = stepper_of(bar(0.0), 2e5, 1e-3, gravity=0 * DOWN, obstacles=[ball])
     state, broken, worked = stepper.start(), 0, 0.0
     for _ in range(25):

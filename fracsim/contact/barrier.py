@@ -62,7 +62,7 @@ class Barrier:
         return np.where(g > 0, inside, closed) + 0.0  # no -0.0
 
 
-def longest_step(gap: Callable[[Values], Values], speed: Callable[[Values], Values], count: int) -> Values:
+def safe_fractions(gap: Callable[[Values], Values], speed: Callable[[Values], Values], count: int) -> Values:
     """(count,) shares in (0, 1] of a motion that leave every gap at least KEPT of what it is now, all along the way.
 
     `gap`: shares (n,) of the motion -> distances (n,) of the points there, obstacles having moved by the same shares;

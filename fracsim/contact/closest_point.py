@@ -31,7 +31,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from .pose import Placed
+from .pose import PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -42,7 +42,7 @@ STILL = 1e-13  # of all shares: a step that is none
 FOUND = 1e-11  # of the size of a facet: what is left of a derivative by shares
 
 
-def least_over_shares(Q: Values, slope: Values, share: Values) -> Values:
+def minimise_on_simplex(Q: Values, slope: Values, share: Values) -> Values:
     """(k, c) shares m where slope . (m - l) + (m - l) . Q (m - l) / 2 is least, m >= 0, sum m = 1, l = `share` (k, c);
     of segments (c = 2) or triangles (c = 3), Q (k, c, c) positive definite for changes that sum to 0.
 
@@ -74,75 +74,79 @@ def least_over_shares(Q: Values, slope: Values, share: Values) -> Values:
 
 
 @dataclass(frozen=True, eq=False)
-class Deepest:
+class FacetClosestPoints:
     """The places on facets with corners x (k, c, d).
 
     Attributes:
         placed: the obstacle.    soften: mu, m.    share: (k, c) l.
     """
 
-    placed: Placed
+    posed: PosedShape
     x: Values
-    soften: float
-    share: Values
+    smoothing: float
+    barycentric: Values
 
     @cached_property
-    def place(self) -> Values:
+    def position(self) -> Values:
         """(k, d) y, m."""
-        return np.asarray(np.einsum("kc,kcd->kd", self.share, self.x))
+        return np.asarray(np.einsum("kc,kcd->kd", self.barycentric, self.x))
 
     @cached_property
     def gap(self) -> Values:
         """(k,) G less the most that it can be above the least distance, m."""
-        return _height(self.placed, self.x, self.share, self.soften) - most_above(self.x.shape[1], self.soften)
+        return _height(self.posed, self.x, self.barycentric, self.smoothing) - smoothing_error(
+            self.x.shape[1], self.smoothing
+        )
 
     @cached_property
     def normal(self) -> Values:
         """(k, d) n."""
-        return self.placed.normal(self.place)
+        return self.posed.normal(self.position)
 
     @property
-    def by_corner(self) -> Values:
+    def gradient(self) -> Values:
         """(k, c, d) dG/dx."""
-        return np.asarray(self.share[:, :, None] * self.normal[:, None, :])
+        return np.asarray(self.barycentric[:, :, None] * self.normal[:, None, :])
 
     @cached_property
-    def slack(self) -> Values:
+    def corner_rise(self) -> Values:
         """(k, c) by how much the tangent of L rises from the place to each corner, m: where a place is found roughly it
         may fall."""
-        slope = _slope(self.x, self.normal, self.share, self.soften)
-        return np.asarray(slope - np.einsum("kc,kc->k", self.share, slope)[:, None])
+        slope = _slope(self.x, self.normal, self.barycentric, self.smoothing)
+        return np.asarray(slope - np.einsum("kc,kc->k", self.barycentric, slope)[:, None])
 
     def curvature(self) -> Values:
         """(k, c d, c d) d2G/dx2, 1/m."""
         k, c, d = self.x.shape
-        H, free = self.placed.curvature(self.place), self.share > 0
-        out = np.einsum("kij,kcj->kci", H, self.x - self.place[:, None])
-        Q = np.einsum("kci,kei->kce", self.x - self.place[:, None], out) + self.soften * np.eye(c)
+        H, free = self.posed.curvature(self.position), self.barycentric > 0
+        out = np.einsum("kij,kcj->kci", H, self.x - self.position[:, None])
+        Q = np.einsum("kci,kei->kce", self.x - self.position[:, None], out) + self.smoothing * np.eye(c)
         both = free[:, :, None] & free[:, None, :]
         bordered = np.zeros((k, c + 1, c + 1))
         bordered[:, :c, :c] = np.where(both, Q, np.eye(c) * ~free[:, :, None])
         bordered[:, :c, c] = bordered[:, c, :c] = free
         S = np.where(both, np.linalg.inv(bordered)[:, :c, :c], 0.0)
-        mixed = np.einsum("kc,kei->kcie", self.share, out) + np.einsum("ce,ki->kcie", np.eye(c), self.normal)
+        mixed = np.einsum("kc,kei->kcie", self.barycentric, out) + np.einsum("ce,ki->kcie", np.eye(c), self.normal)
         mixed = mixed.reshape(k, c * d, c)
-        direct = np.einsum("kc,ke,kij->kciej", self.share, self.share, H).reshape(k, c * d, c * d)
+        direct = np.einsum("kc,ke,kij->kciej", self.barycentric, self.barycentric, H).reshape(k, c * d, c * d)
         return np.asarray(direct - mixed @ S @ mixed.transpose(0, 2, 1))
 
 
-def most_above(corners: int, soften: float) -> float:
+def smoothing_error(corners: int, soften: float) -> float:
     """m, the most that G can be above the least distance."""
     return soften / 2 * (1 - 1 / corners)
 
 
-def deepest(placed: Placed, x: Values, soften: float, start: Values | None = None, found: float = FOUND) -> Deepest:
+def find_closest_points(
+    placed: PosedShape, x: Values, soften: float, start: Values | None = None, found: float = FOUND
+) -> FacetClosestPoints:
     """Of facets with corners x (k, c, d); `start`: shares (k, c) to look first at, `found`: what is left of derivatives
     by shares, of the size of a facet.
 
     By Newton's method, each step of which goes towards the least of a quadratic over all shares, as far as L goes down.
     """
     small = found * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
-    share = before_the_core(placed, x, soften) if start is None else start.copy()
+    share = initial_barycentric(placed, x, soften) if start is None else start.copy()
     slope, left = _Slope(placed, x, soften)(share), np.arange(len(x))
     for _ in range(ITERATIONS):
         rise = _over(slope[left], share[left])
@@ -150,27 +154,27 @@ def deepest(placed: Placed, x: Values, soften: float, start: Values | None = Non
         if not len(left):
             break
         now, corners = share[left], x[left]
-        step = least_over_shares(_bent(placed, corners, now, soften), slope[left], now) - now
+        step = minimise_on_simplex(_bent(placed, corners, now, soften), slope[left], now) - now
         part, slope[left] = _down(_Slope(placed, corners, soften), now, step, slope[left])
         share[left] = now + part[:, None] * step
         left = left[part * abs(step).max(axis=1) > STILL]
-    return Deepest(placed, x, soften, share)
+    return FacetClosestPoints(placed, x, soften, share)
 
 
-def before_the_core(placed: Placed, x: Values, soften: float) -> Values:
+def initial_barycentric(placed: PosedShape, x: Values, soften: float) -> Values:
     """(k, c) shares of the places of facets nearest to that point of the core of an obstacle, which its least radius
     rounds, that is nearest to their middles: before a ball the deepest, but for what is softened."""
     k, c, _ = x.shape
     middle = x.mean(axis=1)
     arms = x - middle[:, None]
     size = np.linalg.norm(arms, axis=2).max(axis=1, initial=0.0)
-    away = np.minimum(placed.distance(middle) + placed.shape.least_radius, FAR * size)
+    away = np.minimum(placed.distance(middle) + placed.shape.min_radius, FAR * size)
     bent = np.einsum("kci,kei->kce", arms, arms) + soften * (abs(away) + soften)[:, None, None] * np.eye(c)
     fall = away[:, None] * np.einsum("kcd,kd->kc", arms, placed.normal(middle))
-    return least_over_shares(bent, fall, np.full((k, c), 1 / c))
+    return minimise_on_simplex(bent, fall, np.full((k, c), 1 / c))
 
 
-def _bent(placed: Placed, x: Values, share: Values, soften: float) -> Values:
+def _bent(placed: PosedShape, x: Values, share: Values, soften: float) -> Values:
     """(k, c, c) second derivative of L by the shares, but for what is the same of all."""
     place = np.einsum("kc,kcd->kd", share, x)
     arms = x - place[:, None]
@@ -181,7 +185,7 @@ def _bent(placed: Placed, x: Values, share: Values, soften: float) -> Values:
 class _Slope:
     """Derivative of L by shares (k, c), but for what is the same of all."""
 
-    placed: Placed
+    placed: PosedShape
     x: Values
     soften: float
 
@@ -217,7 +221,7 @@ def _down(look: _Slope, share: Values, step: Values, slope: Values) -> tuple[Val
     return part, after
 
 
-def _height(placed: Placed, x: Values, share: Values, soften: float) -> Values:
+def _height(placed: PosedShape, x: Values, share: Values, soften: float) -> Values:
     """(k,) D(y) + mu/2 |l - 1/c|^2."""
     away = share - 1 / x.shape[1]
     return placed.distance(np.einsum("kc,kcd->kd", share, x)) + soften / 2 * np.einsum("kc,kc->k", away, away)
@@ -229,29 +233,29 @@ def _slope(x: Values, normal: Values, share: Values, soften: float) -> Values:
 
 
 @dataclass(frozen=True, eq=False)
-class IfFlat:
+class SoftMinGap:
     """Of facets whose corners have `gaps` (k, c), m; `soften`: mu, m."""
 
     gaps: Values
-    soften: float
+    smoothing: float
 
     @cached_property
-    def share(self) -> Values:
+    def barycentric(self) -> Values:
         """(k, c) l."""
         k, c = self.gaps.shape
-        return least_over_shares(np.tile(self.soften * np.eye(c), (k, 1, 1)), self.gaps, np.full((k, c), 1 / c))
+        return minimise_on_simplex(np.tile(self.smoothing * np.eye(c), (k, 1, 1)), self.gaps, np.full((k, c), 1 / c))
 
     @property
     def gap(self) -> Values:
         """(k,) G' less the most that it can be above the least, m."""
         c = self.gaps.shape[1]
-        off = self.share - 1 / c
-        above = self.soften / 2 * np.einsum("kc,kc->k", off, off) - most_above(c, self.soften)
-        return np.asarray(np.einsum("kc,kc->k", self.share, self.gaps) + above)
+        off = self.barycentric - 1 / c
+        above = self.smoothing / 2 * np.einsum("kc,kc->k", off, off) - smoothing_error(c, self.smoothing)
+        return np.asarray(np.einsum("kc,kc->k", self.barycentric, self.gaps) + above)
 
     def curvature(self) -> Values:
         """(k, c, c) d2G'/dg2, 1/m."""
-        free = self.share > 0
+        free = self.barycentric > 0
         both = free[:, :, None] & free[:, None, :]
         count = free.sum(axis=1)[:, None, None]
-        return np.asarray(np.where(both, 1 / count - np.eye(self.gaps.shape[1]), 0.0) / self.soften)
+        return np.asarray(np.where(both, 1 / count - np.eye(self.gaps.shape[1]), 0.0) / self.smoothing)

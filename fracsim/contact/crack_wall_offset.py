@@ -25,7 +25,7 @@ Flags = npt.NDArray[np.bool_]
 MOST = 0.4  # of the way to the nodes: what slivers allow
 
 
-def receded(made: SplitSurface, gap: float) -> Values:
+def offset_crack_faces(made: SplitSurface, gap: float) -> Values:
     """(n, d) reference places, m, whose opposite walls are `gap` m apart, where the shape of the cells allows it."""
     start = made.parents.start
     arm = np.add.reduceat(made.parents.arm, start[:-1], axis=0) / np.diff(start)[:, None]
@@ -41,13 +41,13 @@ def receded(made: SplitSurface, gap: float) -> Values:
 def _least_cosine(made: SplitSurface, outward: Values) -> Values:
     """(n,) the least cosine between `outward` (n, d) and the normals of the crack's walls at each point; inf: none."""
     corners = made.elements[made.origin == CRACK]
-    cosine = np.einsum("ekj,ej->ek", outward[corners], normals(made.points[corners]))
+    cosine = np.einsum("ekj,ej->ek", outward[corners], unit_normals(made.points[corners]))
     least = np.full(len(outward), np.inf)
     np.minimum.at(least, corners, cosine)
     return least
 
 
-def normals(corners: Values) -> Values:
+def unit_normals(corners: Values) -> Values:
     """(m, d) unit normals, outwards, of segments or triangles (m, d, d)."""
     side = corners[:, 1:] - corners[:, :1]
     normal = np.cross(side[:, 0], side[:, 1]) if side.shape[1] == 2 else side[:, 0, ::-1] * [1.0, -1.0]

@@ -38,10 +38,10 @@ import numpy as np
 import numpy.typing as npt
 
 from .barrier import KEPT
-from .closest_point import Deepest, IfFlat, before_the_core, deepest, most_above
-from .laws import Along, Repulsion
-from .node_contact import Grip, Touch, positive
-from .pose import Placed
+from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, initial_barycentric, smoothing_error
+from .laws import GapPotential, TimeAveragedPotential
+from .node_contact import ContactForces, LaggedContact, positive_part
+from .pose import PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -52,63 +52,65 @@ FLAT = 0.1  # of the width: facets that bend away from an obstacle by less are a
 
 
 @dataclass(frozen=True)
-class _Look:
+class _SearchState:
     """Where points (n, d) and an obstacle were, and the facets (k,) that were within a distance of it, m, but for
     `margin`."""
 
     x: Values
-    placed: Placed
-    within: float
+    posed: PosedShape
+    distance: float
     margin: float
-    found: Ints
+    facets: Ints
 
-    def holds(self, placed: Placed, x: Values, within: float) -> bool:
+    def is_valid(self, placed: PosedShape, x: Values, within: float) -> bool:
         """Whether no facet within that distance, m, can be missing."""
         off = x - self.x
         moved = float(np.sqrt(np.einsum("nd,nd->n", off, off).max(initial=0.0)))
-        now, then = placed.pose, self.placed.pose
+        now, then = placed.pose, self.posed.pose
         turned = float(np.linalg.norm(now.rotation - then.rotation))
         carried = float(np.linalg.norm(now.centre - then.centre)) + (turned and turned * _radius(placed))
-        return within - self.within + moved + carried <= self.margin
+        return within - self.distance + moved + carried <= self.margin
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class FacetCandidates:
     """Of facets with these corners (m, c)."""
 
     corners: Ints
-    _looks: dict[int, _Look] = field(default_factory=dict)
+    _states: dict[int, _SearchState] = field(default_factory=dict)
 
-    def __call__(self, placed: Placed, x: Values, within: float) -> Ints:
+    def __call__(self, placed: PosedShape, x: Values, within: float) -> Ints:
         """(k,) all that have a place nearer than `within` m to an obstacle with points at x (n, d), and others."""
-        last = self._looks.get(id(placed.shape))
-        if last is None or last.placed.shape is not placed.shape or not last.holds(placed, x, within):
-            last = self._looks[id(placed.shape)] = self._look(placed, x, within)
-        return last.found
+        last = self._states.get(id(placed.shape))
+        if last is None or last.posed.shape is not placed.shape or not last.is_valid(placed, x, within):
+            last = self._states[id(placed.shape)] = self._search(placed, x, within)
+        return last.facets
 
-    def _look(self, placed: Placed, x: Values, within: float) -> _Look:
+    def _search(self, placed: PosedShape, x: Values, within: float) -> _SearchState:
         corners = x[self.corners]
         middle = corners.mean(axis=1)
         arms = corners - middle[:, None]
         around = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
         margin = max(float(around.mean()) if len(around) else 0.0, within)
-        return _Look(x, placed, within, margin, np.flatnonzero(placed.distance(middle) - around < within + margin))
+        return _SearchState(
+            x, placed, within, margin, np.flatnonzero(placed.distance(middle) - around < within + margin)
+        )
 
 
-def _radius(placed: Placed) -> float:
+def _radius(placed: PosedShape) -> float:
     """m, of a shape about its reference point."""
-    points, _ = placed.shape.outline()
+    points, _ = placed.shape.tessellate()
     return OUTLINE * float(np.linalg.norm(points, axis=1).max())
 
 
-def matters(radius: float, edge: float, width: float) -> bool:
+def facets_matter(radius: float, edge: float, width: float) -> bool:
     """Whether facets with edges of that length, m, may come nearer to an obstacle of that least radius of curvature,
     m, than their corners: by a^2 / (6 R) in the middle of a triangle."""
     return edge**2 > 6 * radius * FLAT * width
 
 
 @dataclass(frozen=True, eq=False)
-class Facets:
+class ContactFacets:
     """Facets of a surface: numbers of their corners (m, c) among its points, and their areas (m,), m^2 (2D: m).
 
     `soften`: m, of their deepest places; shares of these, where they were last, are where they are looked for first.
@@ -116,37 +118,39 @@ class Facets:
 
     corners: Ints
     area: Values
-    soften: float
+    smoothing: float
 
     @cached_property
-    def _last(self) -> Values:
+    def _last_barycentric(self) -> Values:
         """(m, c) shares; nan: not known yet."""
         return np.full(self.corners.shape, np.nan)
 
     @cached_property
-    def _candidates(self) -> Candidates:
-        return Candidates(self.corners)
+    def _candidates(self) -> FacetCandidates:
+        return FacetCandidates(self.corners)
 
     @property
-    def kept(self) -> float:
+    def max_gap_error(self) -> float:
         """m, by how much a gap is taken for smaller than it is, at most."""
-        return most_above(self.corners.shape[1], self.soften)
+        return smoothing_error(self.corners.shape[1], self.smoothing)
 
-    def look(self, placed: Placed, x: Values, which: Ints) -> Deepest:
+    def closest_points(self, placed: PosedShape, x: Values, which: Ints) -> FacetClosestPoints:
         """The deepest places of facets (k,) with points at x (n, d), m."""
-        corners, start = x[self.corners[which]], self._last[which]
+        corners, start = x[self.corners[which]], self._last_barycentric[which]
         if (new := np.isnan(start[:, 0])).any():
-            start[new] = before_the_core(placed, corners[new], self.soften)
-        at = deepest(placed, corners, self.soften, start)
-        self._last[which] = at.share
+            start[new] = initial_barycentric(placed, corners[new], self.smoothing)
+        at = find_closest_points(placed, corners, self.smoothing, start)
+        self._last_barycentric[which] = at.barycentric
         return at
 
-    def near(self, placed: Placed, x: Values, reach: float) -> Ints:
+    def within_reach(self, placed: PosedShape, x: Values, reach: float) -> Ints:
         """(k,) those that may come nearer than `reach` m to an obstacle, with points at x (n, d), m."""
         near, _, over, _ = self._tangents(placed, x, np.full(1, reach))
         return near[over.min(axis=1, initial=np.inf) < reach]
 
-    def closing(self, placed: Placed, x: Values, relative: Values, swept: Values | None, reach: Values) -> Ints:
+    def closing_facets(
+        self, placed: PosedShape, x: Values, relative: Values, swept: Values | None, reach: Values
+    ) -> Ints:
         """(k,) those whose gaps a motion may close by more than is safe (barrier), on the ways `relative` (n, d) of the
         points to an obstacle, m, that its turn adds `swept` (n,) to at most; all no longer than `reach` (n,)."""
         near, distance, over, normal = self._tangents(placed, x, reach)
@@ -155,43 +159,48 @@ class Facets:
             after = after - swept[self.corners[near]]
         return near[np.minimum(over, after).min(axis=1, initial=np.inf) < KEPT * distance]
 
-    def _tangents(self, placed: Placed, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
+    def _tangents(self, placed: PosedShape, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
         """Facets (k,) within `reach` m of an obstacle, of all or of points (n,), as far as their sizes tell;
         distances (k,) and normals (k, d) at their middles, and those (k, c) of their corners less `kept` were it flat:
         the distance to what is convex is more."""
         (_, c), d = self.corners.shape, x.shape[1]
-        if placed.beyond(x) >= reach.max(initial=0.0) + self.kept:
+        if placed.distance_bound(x) >= reach.max(initial=0.0) + self.max_gap_error:
             return np.empty(0, np.int64), np.empty(0), np.empty((0, c)), np.empty((0, d))
-        near = self._candidates(placed, x, float(reach.max(initial=0.0)) + self.kept)
-        within = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.kept
+        near = self._candidates(placed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
+        within = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
         corners = x[self.corners[near]]
         middle = corners.mean(axis=1)
         around, distance = np.linalg.norm(corners - middle[:, None], axis=2), placed.distance(middle)
         left = distance < around.max(axis=1, initial=0.0) + within
         distance, normal, arms = distance[left], placed.normal(middle[left]), (corners - middle[:, None])[left]
-        return near[left], distance, distance[:, None] - self.kept + np.einsum("kcd,kd->kc", arms, normal), normal
+        return (
+            near[left],
+            distance,
+            distance[:, None] - self.max_gap_error + np.einsum("kcd,kd->kc", arms, normal),
+            normal,
+        )
 
-    def distances(self, placed: Placed, x: Values, reach: float) -> Values:
+    def distances(self, placed: PosedShape, x: Values, reach: float) -> Values:
         """(k,) of the deepest places of those that are near, m."""
-        return placed.distance(self.look(placed, x, self.near(placed, x, reach)).place)
+        return placed.distance(self.closest_points(placed, x, self.within_reach(placed, x, reach)).position)
 
-    def are_open(self, every: Sequence[Placed], x: Values) -> Flags:
+    def are_open(self, every: Sequence[PosedShape], x: Values) -> Flags:
         """(m,) those that none of several obstacles cuts."""
         found = np.ones(len(self.area), bool)
         for placed in every:
-            near = self.near(placed, x, 0.0)
-            found[near] &= self.look(placed, x, near).gap > 0
+            near = self.within_reach(placed, x, 0.0)
+            found[near] &= self.closest_points(placed, x, near).gap > 0
         return found
 
-    def gaps(self, placed: Placed, x: Values, reach: float) -> Values:
+    def gaps(self, placed: PosedShape, x: Values, reach: float) -> Values:
         """(m,) to an obstacle, m; infinite of those that are not near."""
-        near, found = self.near(placed, x, reach), np.full(len(self.area), np.inf)
-        found[near] = self.look(placed, x, near).gap
+        near, found = self.within_reach(placed, x, reach), np.full(len(self.area), np.inf)
+        found[near] = self.closest_points(placed, x, near).gap
         return found
 
 
 @dataclass(frozen=True, eq=False)
-class Between:
+class FacetForces:
     """F of facets near an obstacle.
 
     Attributes:
@@ -201,97 +210,103 @@ class Between:
 
     corners: Ints
     area: Values
-    at: Deepest
-    law: Repulsion | Along
-    if_flat: Repulsion | Along
-    of_corners: Repulsion | Along
+    closest: FacetClosestPoints
+    potential: GapPotential | TimeAveragedPotential
+    plane_potential: GapPotential | TimeAveragedPotential
+    corner_potential: GapPotential | TimeAveragedPotential
 
     @cached_property
-    def _gaps(self) -> Values:
+    def _corner_gaps(self) -> Values:
         """(k, c) of the corners, m."""
-        k, c, d = self.at.x.shape
-        return self.at.placed.distance(self.at.x.reshape(-1, d)).reshape(k, c)
+        k, c, d = self.closest.x.shape
+        return self.closest.posed.distance(self.closest.x.reshape(-1, d)).reshape(k, c)
 
     @cached_property
-    def _normals(self) -> Values:
+    def _corner_normals(self) -> Values:
         """(k, c, d) at the corners."""
-        k, c, d = self.at.x.shape
-        return self.at.placed.normal(self.at.x.reshape(-1, d)).reshape(k, c, d)
+        k, c, d = self.closest.x.shape
+        return self.closest.posed.normal(self.closest.x.reshape(-1, d)).reshape(k, c, d)
 
     @cached_property
-    def _flat(self) -> IfFlat:
-        return IfFlat(self._gaps, self.at.soften)
+    def _plane_gap(self) -> SoftMinGap:
+        return SoftMinGap(self._corner_gaps, self.closest.smoothing)
 
     @property
     def energy(self) -> Values:
         """(k,) J; infinite where a facet is cut."""
-        inner, flat = self.law.energy(self.at.gap), self.if_flat.energy(self._flat.gap)
+        inner, flat = self.potential.energy(self.closest.gap), self.plane_potential.energy(self._plane_gap.gap)
         cut = ~np.isfinite(inner)
         return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - np.where(cut, 0.0, flat)))
 
     @cached_property
     def forces(self) -> Values:
         """(k, c, d) on the corners, N."""
-        own = self.law.slope(self.at.gap)[:, None, None] * self.at.by_corner
-        slope = self.if_flat.slope(self._flat.gap)[:, None]
-        return np.asarray(-self.area[:, None, None] * (own - (slope * self._flat.share)[:, :, None] * self._normals))
+        own = self.potential.slope(self.closest.gap)[:, None, None] * self.closest.gradient
+        slope = self.plane_potential.slope(self._plane_gap.gap)[:, None]
+        return np.asarray(
+            -self.area[:, None, None] * (own - (slope * self._plane_gap.barycentric)[:, :, None] * self._corner_normals)
+        )
 
     @cached_property
-    def exact(self) -> Values:
+    def hessian(self) -> Values:
         """(k, c d, c d) second derivative of F, N/m."""
-        k, c, d = self.at.x.shape
-        n = self.at.by_corner.reshape(k, c * d)
-        own = self.law.curvature(self.at.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        own = own + self.law.slope(self.at.gap)[:, None, None] * self.at.curvature()
-        return np.asarray(self.area[:, None, None] * (own - self._bent_if_flat()))
+        k, c, d = self.closest.x.shape
+        n = self.closest.gradient.reshape(k, c * d)
+        own = self.potential.curvature(self.closest.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        own = own + self.potential.slope(self.closest.gap)[:, None, None] * self.closest.curvature()
+        return np.asarray(self.area[:, None, None] * (own - self._plane_hessian()))
 
-    def _bent_if_flat(self) -> Values:
+    def _plane_hessian(self) -> Values:
         """(k, c d, c d) second derivative of b(gap'), Pa/m."""
-        k, c, d = self.at.x.shape
-        flat, n = self._flat, self._normals
-        slope, share = self.if_flat.slope(flat.gap)[:, None, None], flat.share
-        twice = self.if_flat.curvature(flat.gap)[:, None, None] * share[:, :, None] * share[:, None, :]
+        k, c, d = self.closest.x.shape
+        flat, n = self._plane_gap, self._corner_normals
+        slope, share = self.plane_potential.slope(flat.gap)[:, None, None], flat.barycentric
+        twice = self.plane_potential.curvature(flat.gap)[:, None, None] * share[:, :, None] * share[:, None, :]
         bent = np.einsum("kce,kci,kej->kciej", twice + slope * flat.curvature(), n, n)
-        H = self.at.placed.curvature(self.at.x.reshape(-1, d)).reshape(k, c, d, d)
+        H = self.closest.posed.curvature(self.closest.x.reshape(-1, d)).reshape(k, c, d, d)
         bent[:, range(c), :, range(c), :] += (slope[..., None] * share[:, :, None, None] * H).transpose(1, 0, 2, 3)
         return np.asarray(bent.reshape(k, c * d, c * d))
 
-    def _of_corners(self) -> Values:
+    def _corner_hessians(self) -> Values:
         """(k, c, d, d) second derivative of b at each corner, Pa/m."""
-        k, c, d = self.at.x.shape
-        gap = self._gaps.reshape(-1)
-        n, H = self._normals.reshape(-1, d), self.at.placed.curvature(self.at.x.reshape(-1, d))
-        bent = self.of_corners.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        return np.asarray(bent + self.of_corners.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
+        k, c, d = self.closest.x.shape
+        gap = self._corner_gaps.reshape(-1)
+        n, H = self._corner_normals.reshape(-1, d), self.closest.posed.curvature(self.closest.x.reshape(-1, d))
+        bent = self.corner_potential.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        return np.asarray(bent + self.corner_potential.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
 
     @cached_property
     def stiffness(self) -> Values:
         """(k, c d, c d) for a tangent: positive semi-definite together with the share of the facet in the stiffness of
         its corners, which have that already (node_contact)."""
-        k, c, d = self.at.x.shape
-        own = (self.area / c)[:, None, None, None] * self._of_corners()
-        kept = positive(own.reshape(-1, d, d)).reshape(k, c, d, d)
-        return np.asarray(positive(self.exact + _diagonal(own)) - _diagonal(kept))
+        k, c, d = self.closest.x.shape
+        own = (self.area / c)[:, None, None, None] * self._corner_hessians()
+        kept = positive_part(own.reshape(-1, d, d)).reshape(k, c, d, d)
+        return np.asarray(positive_part(self.hessian + _diagonal(own)) - _diagonal(kept))
 
 
-def between(
-    facets: Facets, placed: Placed, x: Values, law: Repulsion, start: tuple[Placed, Values] | None = None
-) -> tuple[Between, float]:
+def evaluate_facets(
+    facets: ContactFacets,
+    placed: PosedShape,
+    x: Values,
+    law: GapPotential,
+    start: tuple[PosedShape, Values] | None = None,
+) -> tuple[FacetForces, float]:
     """What acts on facets with points at x (n, d), and the energy that it stores, J; `start`: the obstacle and the
     points as the step began, where the barrier acts along the way (laws)."""
-    near = facets.near(placed, x, law.width)
+    near = facets.within_reach(placed, x, law.width)
     if start is not None:
-        near = np.union1d(near, facets.near(*start, law.width))
+        near = np.union1d(near, facets.within_reach(*start, law.width))
     corners, area = facets.corners[near], facets.area[near]
-    at = facets.look(placed, x, near)
-    stored = Between(corners, area, at, law, law, law)
+    at = facets.closest_points(placed, x, near)
+    stored = FacetForces(corners, area, at, law, law, law)
     if start is None:
         return stored, float(stored.energy.sum())
-    then = deepest(start[0], start[1][corners], facets.soften, at.share).gap
+    then = find_closest_points(start[0], start[1][corners], facets.smoothing, at.barycentric).gap
     of_corners = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
-    flat = IfFlat(of_corners.reshape(corners.shape), facets.soften).gap
-    laws = (Along(law, gap) for gap in (then, flat, of_corners))
-    return Between(corners, area, at, *laws), float(stored.energy.sum())
+    flat = SoftMinGap(of_corners.reshape(corners.shape), facets.smoothing).gap
+    laws = (TimeAveragedPotential(law, gap) for gap in (then, flat, of_corners))
+    return FacetForces(corners, area, at, *laws), float(stored.energy.sum())
 
 
 def _diagonal(blocks: Values) -> Values:
@@ -302,7 +317,7 @@ def _diagonal(blocks: Values) -> Values:
     return full.reshape(k, c * d, c * d)
 
 
-def gripped_between(held: Grip, inner: Between, x: Values) -> Grip:
+def add_facet_friction(held: LaggedContact, inner: FacetForces, x: Values) -> LaggedContact:
     """`held`: points alone, of the start of a step at x (n, d), m; with what acts on facets then."""
     corners, d = inner.corners.reshape(-1), x.shape[1]
     points = np.union1d(held.points, corners)
@@ -311,18 +326,18 @@ def gripped_between(held: Grip, inner: Between, x: Values) -> Grip:
     at, of = np.searchsorted(points, held.points), np.searchsorted(points, corners)
     force, weight, under = np.zeros((len(points), d)), np.zeros(len(points)), np.zeros((len(points), d))
     force[at], weight[at] = held.force[:, None] * held.normal, held.force
-    under[at] = held.force[:, None] * held.start
+    under[at] = held.force[:, None] * held.position
     np.add.at(force, of, inner.forces.reshape(-1, d))
     pressed = np.linalg.norm(inner.forces, axis=2)
     np.add.at(weight, of, pressed.reshape(-1))
-    np.add.at(under, of, (pressed[:, :, None] * inner.at.place[:, None, :]).reshape(-1, d))
+    np.add.at(under, of, (pressed[:, :, None] * inner.closest.position[:, None, :]).reshape(-1, d))
     size = np.linalg.norm(force, axis=1)
     kept = np.flatnonzero(size > 0)
     points, size, start = points[kept], size[kept], x[points[kept]]
-    return Grip(points, size, force[kept] / size[:, None], start, under[kept] / weight[kept, None])
+    return LaggedContact(points, size, force[kept] / size[:, None], start, under[kept] / weight[kept, None])
 
 
-def joined(found: Touch, inner: Between, stored: float) -> Touch:
+def merge_forces(found: ContactForces, inner: FacetForces, stored: float) -> ContactForces:
     """A touch with what facets feel, which store J, added to their corners, and their stiffness between these."""
     if not len(inner.area):
         return found
@@ -334,8 +349,8 @@ def joined(found: Touch, inner: Between, stored: float) -> Touch:
 
     def parts() -> tuple[Values, Values]:
         exact, stick = np.zeros((2, len(points), d, d))
-        exact[place], stick[place] = found.exact, found.stick
+        exact[place], stick[place] = found.normal_hessian, found.friction_hessian
         return exact, stick
 
     potential = found.potential + float(inner.energy.sum())
-    return Touch(points, found.energy + stored, normal, rubbed, potential, parts, inner)
+    return ContactForces(points, found.energy + stored, normal, rubbed, potential, parts, inner)

@@ -13,7 +13,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Friction:
+class CoulombFriction:
     """mu lambda f0(|s|) a point, J: lambda (N) the lagged normal force, s = (1 - n n^T) moved the slip of a step, m.
 
     `moved` (n, d): way of the point less that of the obstacle under it; n the lagged normal. f0' = f1 grows from 0 to
@@ -22,18 +22,18 @@ class Friction:
     """
 
     coefficient: float
-    sticking: float
+    sticking_slip: float
 
     def __post_init__(self) -> None:
         """InputError where it is no friction."""
         if not 0 <= self.coefficient < np.inf:
             raise InputError(f"the coefficient of friction is {self.coefficient}: it must be 0 or positive")
-        if not 0 < self.sticking < np.inf:
-            raise InputError(f"the slip that passes for sticking is {self.sticking} m: it must be positive")
+        if not 0 < self.sticking_slip < np.inf:
+            raise InputError(f"the slip that passes for sticking is {self.sticking_slip} m: it must be positive")
 
     def energy(self, force: Values, normal: Values, moved: Values) -> Values:
         """(n,) mu lambda f0, J: -y^3 / (3 h^2) + y^2 / h + h / 3 below y = |s| = h, and y above."""
-        h, y = self.sticking, np.linalg.norm(tangential(normal, moved), axis=1)
+        h, y = self.sticking_slip, np.linalg.norm(tangential(normal, moved), axis=1)
         z = np.minimum(y / h, 1.0)
         return self.coefficient * force * np.where(y < h, h * (z**2 - z**3 / 3 + 1 / 3), y)
 
@@ -55,7 +55,7 @@ class Friction:
 
     def _stiffness(self, y: Values) -> tuple[Values, Values]:
         """f1 / y and f1', 1/m."""
-        h = self.sticking
+        h = self.sticking_slip
         sticks = y < h
         return np.where(sticks, (2 - y / h) / h, 1 / np.maximum(y, h)), np.where(sticks, 2 * (1 - y / h) / h, 0.0)
 

@@ -12,30 +12,30 @@ from itertools import product
 
 import numpy as np
 
-from .offset_shape import Shifted
-from .shape_base import Body, Shape, Values, frame, unit
-from .shapes import Box, Capsule, Cylinder, Sphere
-from .triangle_mesh_shape import Solid
+from .offset_shape import TranslatedShape
+from .shape_base import ConvexBody, Shape, Values, frame_about, unit_vector
+from .shapes import Capsule, RoundedBox, RoundedCylinder, Sphere
+from .triangle_mesh_shape import TriangleMeshShape
 
 SAMPLES = 9  # of an edge or a side
 ROUND = 24  # of a circle
 
 
 @dataclass(frozen=True, eq=False)
-class Skeleton:
+class InsetPoints:
     """Points (n, d) in the frame of a shape, m, the radius about them, m, and the share of each in the surface, m^2."""
 
     points: Values
     radius: float
-    share: float = 0.0
+    area: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Grown:
+class OffsetShape:
     """A shape and all within `by` of it, m: the distance less that."""
 
     shape: Shape
-    by: float
+    offset: float
 
     @property
     def convex(self) -> bool:
@@ -43,13 +43,13 @@ class Grown:
         return self.shape.convex
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """As the shape is."""
-        return self.shape.round
+        return self.shape.rotation_invariant
 
     def distance(self, x: Values) -> Values:
         """(n,) m."""
-        return self.shape.distance(x) - self.by
+        return self.shape.distance(x) - self.offset
 
     def normal(self, x: Values) -> Values:
         """(n, d)."""
@@ -60,34 +60,34 @@ class Grown:
         return self.shape.curvature(x)
 
 
-def skeleton(shape: Shape) -> Skeleton:
+def inset_points(shape: Shape) -> InsetPoints:
     """Of a shape; without points where it is without end or hollow."""
-    if isinstance(shape, Shifted):
-        inner = skeleton(shape.shape)
-        return Skeleton(inner.points + shape.offset, inner.radius, inner.share)
-    if isinstance(shape, Solid):
-        return Skeleton(shape.points, 0.0, surface(shape) / len(shape.points))
+    if isinstance(shape, TranslatedShape):
+        inner = inset_points(shape.shape)
+        return InsetPoints(inner.points + shape.offset, inner.radius, inner.area)
+    if isinstance(shape, TriangleMeshShape):
+        return InsetPoints(shape.points, 0.0, surface_measure(shape) / len(shape.points))
     points, radius = _bones(shape)
-    return Skeleton(points, radius, surface(shape) / max(len(points), 1))
+    return InsetPoints(points, radius, surface_measure(shape) / max(len(points), 1))
 
 
 def _bones(shape: Shape) -> tuple[Values, float]:
-    if isinstance(shape, Body) and not shape.hollow:
+    if isinstance(shape, ConvexBody) and not shape.hollow:
         if isinstance(shape, Sphere):
             return np.zeros((1, shape.dim)), shape.radius
         if isinstance(shape, Capsule):
             along = np.linspace(-0.5, 0.5, SAMPLES) * shape.length
-            return along[:, None] * unit(shape.axis), shape.radius
-        if isinstance(shape, Box):
+            return along[:, None] * unit_vector(shape.axis), shape.radius
+        if isinstance(shape, RoundedBox):
             return _edges(np.array(shape.size) / 2 - shape.fillet), shape.fillet
-        if isinstance(shape, Cylinder):
+        if isinstance(shape, RoundedCylinder):
             return _rings(shape), shape.fillet
     return np.empty((0, shape.dim)), 0.0
 
 
-def surface(shape: Shape) -> float:
+def surface_measure(shape: Shape) -> float:
     """Measure of its outline, m^2 (2D: m)."""
-    points, elements = shape.outline()
+    points, elements = shape.tessellate()
     side = points[elements[:, 1:]] - points[elements[:, :1]]
     if shape.dim == 2:
         return float(np.linalg.norm(side[:, 0], axis=1).sum())
@@ -105,10 +105,10 @@ def _edges(half: Values) -> Values:
     return np.unique(np.array(lines), axis=0) * half
 
 
-def _rings(shape: Cylinder) -> Values:
+def _rings(shape: RoundedCylinder) -> Values:
     """Points on circles over the side of a cylinder."""
     turn = np.arange(ROUND) * (2 * np.pi / ROUND)
     radius, half = shape.radius - shape.fillet, shape.length / 2 - shape.fillet
     circle = radius * np.column_stack([np.cos(turn), np.sin(turn)])
     rings = [np.column_stack([circle, np.full(ROUND, height)]) for height in np.linspace(-half, half, SAMPLES)]
-    return np.concatenate(rings) @ frame(unit(shape.axis)).T
+    return np.concatenate(rings) @ frame_about(unit_vector(shape.axis)).T

@@ -21,7 +21,7 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Friction:
+class IpcFriction:
     """Friction of lagged pairs; x (n, d) as in Pairs."""
 
     mesh: ipctk.CollisionMesh

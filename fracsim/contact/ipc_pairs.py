@@ -36,7 +36,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .ipc_friction import Friction, projection
+from .ipc_friction import IpcFriction, projection
 from .sample_points import Centroids, Vertices, measures
 
 Values = npt.NDArray[np.float64]
@@ -55,7 +55,7 @@ MOST, WIDE = 128, 3.0  # pieces of a step, and the measure of the boxes in one
 
 
 @dataclass(frozen=True)
-class Kind:
+class PairKind:
     """The barrier of one kind of pairs, from `distance` m on with `stiffness` Pa, between sample points or edges and
     elements; `name` of the list of ipctk's candidates, "" for centroids, which have candidates of their own."""
 
@@ -69,7 +69,7 @@ class Kind:
         """That of ipctk."""
         return ipctk.BarrierPotential(self.distance, self.stiffness, True)
 
-    def touching(self, candidates: ipctk.Candidates, x: Values) -> Touching:
+    def active_pairs(self, candidates: ipctk.Candidates, x: Values) -> ActivePairs:
         """Those of the candidates on which the barrier acts with vertices at x (n, d)."""
         pairs = ipctk.NormalCollisions()
         pairs.use_area_weighting = True
@@ -77,14 +77,14 @@ class Kind:
         positions = self.samples.positions(x)
         pairs.build(candidates, self.samples.mesh, positions, self.distance)
         self.samples.weight(pairs)
-        return Touching(self, pairs, positions)
+        return ActivePairs(self, pairs, positions)
 
 
 @dataclass(frozen=True)
-class Touching:
+class ActivePairs:
     """Pairs on which the barrier of a kind acts, with the sample points at `positions` (p, d), m."""
 
-    kind: Kind
+    kind: PairKind
     pairs: ipctk.NormalCollisions
     positions: Values
 
@@ -107,32 +107,32 @@ class Touching:
         return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
 
 
-class Near:
+class PairSearch:
     """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points.
 
     They are looked for on the whole way of a step of Newton's method, and serve all that stays within `margin` of it:
     where the line search stops, the steps after it, and the way of the next one, which mostly goes on along it.
     """
 
-    def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[Kind], distance: float, margin: float) -> None:
+    def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[PairKind], distance: float, margin: float) -> None:
         self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
-        self.forget()
+        self.clear_caches()
 
-    def forget(self) -> None:
+    def clear_caches(self) -> None:
         """Nothing is known of any place."""
         self._candidates: list[ipctk.Candidates] = []
-        self._found: list[Touching] = []
+        self._found: list[ActivePairs] = []
         self._from = self._way = self._found_at = np.full(self._mesh.rest_positions.shape, np.nan)
 
-    def touching(self, x: Values) -> list[Touching]:
+    def active_pairs(self, x: Values) -> list[ActivePairs]:
         """The pairs of each kind on which its barrier acts; those of the last x are kept."""
         if not np.array_equal(x, self._found_at):
             each = zip(self._kinds, self.candidates(x), strict=True)
-            self._found = [kind.touching(candidates, x) for kind, candidates in each]
+            self._found = [kind.active_pairs(candidates, x) for kind, candidates in each]
             self._found_at = x.copy()
         return self._found
 
-    def stiffen(self, stiffness: Sequence[float]) -> None:
+    def set_stiffness(self, stiffness: Sequence[float]) -> None:
         """Barriers have this stiffness of each kind, Pa, from here on; what touches stays."""
         self._kinds = [replace(kind, stiffness=k) for kind, k in zip(self._kinds, stiffness, strict=True)]
         self._found = [replace(met, kind=kind) for kind, met in zip(self._kinds, self._found, strict=False)]
@@ -143,14 +143,14 @@ class Near:
             self._look(x, x)
         return self._candidates
 
-    def free(self, x: Values, to: Values) -> float:
+    def free_fraction(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the way from x to `to` on which nothing meets: KEPT of each gap is left."""
-        self.look_along(x, to)
+        self.search_along(x, to)
         own = [each for kind, each in zip(self._kinds, self._candidates, strict=True) if kind.name]
         steps = (each.compute_collision_free_stepsize(self._mesh, x, to, 0.0, CCD) for each in own)
         return float(min(steps))
 
-    def look_along(self, x: Values, to: Values) -> None:
+    def search_along(self, x: Values, to: Values) -> None:
         """Have candidates for all the way from x to `to`."""
         if not (self._holds(x) and self._holds(to)):
             self._look(x, to)
@@ -163,7 +163,7 @@ class Near:
         self._candidates = [self._of_kind(kind, found, start, end) for kind in self._kinds[:-1]] + [found]
         self._from, self._way = start, end - start
 
-    def _of_kind(self, kind: Kind, found: ipctk.Candidates, start: Values, end: Values) -> ipctk.Candidates:
+    def _of_kind(self, kind: PairKind, found: ipctk.Candidates, start: Values, end: Values) -> ipctk.Candidates:
         if isinstance(kind.samples, Centroids):
             return kind.samples.candidates(start, end, self._radius)
         return _taken(found, kind.name)
@@ -172,7 +172,7 @@ class Near:
         """Whether no pair within reach can be missing: points are near the way on which was looked."""
         off, squares = centred(x) - self._from, np.sum(self._way**2, axis=1)
         along = np.clip(np.sum(off * self._way, axis=1) / np.where(squares > 0, squares, 1.0), 0.0, 1.0)
-        return longest(off - along[:, None] * self._way) <= self._margin
+        return max_length(off - along[:, None] * self._way) <= self._margin
 
 
 def _taken(found: ipctk.Candidates, name: str) -> ipctk.Candidates:
@@ -189,12 +189,12 @@ def centred(x: Values) -> Values:
     return result
 
 
-def longest(vectors: Values) -> float:
+def max_length(vectors: Values) -> float:
     """The greatest length of the rows."""
     return float(np.sqrt(np.max(np.sum(vectors**2, axis=1), initial=0.0)))
 
 
-def crossings(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
+def intersecting_elements(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
     """(k, 2) elements at x (n, d), m, of which neither is a neighbour of the other."""
     phase = ipctk.LBVH()
     phase.build(x, mesh.edges, mesh.faces, 0.0)
@@ -248,7 +248,7 @@ def _pairs(found: list[tuple[int, int]]) -> Ints:
     return np.array(found, np.int64).reshape(-1, 2)
 
 
-class Pairs:
+class IpcPairs:
     """Barrier and lagged Coulomb friction between the elements of a surface.
 
     x is always (n, d): where the points are, m. Candidates are kept until a point has moved by MARGIN `distance`.
@@ -272,68 +272,68 @@ class Pairs:
         kinds += [(1.0 + solid, VERTICES, "fv_candidates" if solid else "ev_candidates", vertices)]
         kinds += [(1.0, EDGES, "ee_candidates", vertices)] if solid else []
         self._times = [times for times, *_ in kinds]
-        made = [Kind(share * distance, times * stiffness, name, of) for times, share, name, of in kinds]
-        self._near = Near(self._mesh, made, distance, MARGIN * distance)
+        made = [PairKind(share * distance, times * stiffness, name, of) for times, share, name, of in kinds]
+        self._near = PairSearch(self._mesh, made, distance, MARGIN * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
-        self._area = areas(rest, elements)
+        self._area = vertex_areas(rest, elements)
 
     # --- the barrier ---
 
     def energy(self, x: Values) -> float:
         """E(x), J."""
         on = self._mesh.vertices(x)
-        return sum(met.energy() for met in self._near.touching(on))
+        return sum(met.energy() for met in self._near.active_pairs(on))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: the force on the points is its negative."""
         on = self._mesh.vertices(x)
-        found = sum(met.gradient() for met in self._near.touching(on))
+        found = sum(met.gradient() for met in self._near.active_pairs(on))
         return np.asarray(self._mesh.to_full_dof(found)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, the share of each pair without its negative eigenvalues."""
         on, how = self._mesh.vertices(x), projection(exact=exact)
-        found = sum(met.hessian(how) for met in self._near.touching(on))
+        found = sum(met.hessian(how) for met in self._near.active_pairs(on))
         return csr_matrix(self._mesh.to_full_dof(found))
 
-    def stiffen(self, stiffness: float) -> None:
+    def set_stiffness(self, stiffness: float) -> None:
         """The barrier has this stiffness, Pa, from here on."""
-        self._near.stiffen([times * stiffness for times in self._times])
+        self._near.set_stiffness([times * stiffness for times in self._times])
 
-    def forget(self) -> None:
+    def clear_caches(self) -> None:
         """Forget which elements were near."""
-        self._near.forget()
+        self._near.clear_caches()
 
-    def least_gap(self, x: Values) -> float:
+    def min_gap(self, x: Values) -> float:
         """The least distance between elements on which the barrier acts, m; infinite where there is none."""
         return self._gap_at(self._mesh.vertices(x))
 
     def _gap_at(self, on: Values) -> float:
-        return float(np.sqrt(min(met.least_squared_distance() for met in self._near.touching(on))))
+        return float(np.sqrt(min(met.least_squared_distance() for met in self._near.active_pairs(on))))
 
-    def look_along(self, x: Values, to: Values) -> None:
+    def search_along(self, x: Values, to: Values) -> None:
         """Have candidates for all the way from x to `to` (n, d), m."""
-        self._near.look_along(self._mesh.vertices(x), self._mesh.vertices(to))
+        self._near.search_along(self._mesh.vertices(x), self._mesh.vertices(to))
 
     # --- friction ---
 
-    def lag_friction(self, x: Values, start: Values, slip: float) -> Friction:
+    def lag_friction(self, x: Values, start: Values, slip: float) -> IpcFriction:
         """Friction with the pressures and directions at x, as points move away from `start` (n, d), m.
 
         `slip`, m: from this sliding on it has its full size; a speed times the time step.
         """
         on = self._mesh.vertices(x)
         parts = []
-        for met in self._near.touching(on):
+        for met in self._near.active_pairs(on):
             part = ipctk.TangentialCollisions()
             part.build(met.kind.samples.mesh, met.positions, met.pairs, met.kind.barrier, self._friction)
             parts.append((met.kind.samples, part))
-        return Friction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
+        return IpcFriction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 
-    def longest_step(self, x: Values, to: Values) -> float:
+    def free_fraction(self, x: Values, to: Values) -> float:
         """The share in (0, 1] of the straight way from x to `to` on which nothing meets.
 
         The way is walked in pieces, MOST at most (boxes around longer ones would all meet), and the pair that would
@@ -345,7 +345,7 @@ class Pairs:
             return 1.0
         pieces = self._pieces(way)
         for piece in range(min(pieces, MOST)):
-            share = self._near.free(on + piece / pieces * way, on + (piece + 1) / pieces * way)
+            share = self._near.free_fraction(on + piece / pieces * way, on + (piece + 1) / pieces * way)
             if share < 1.0:
                 return (piece + share) / pieces
         return min(pieces, MOST) / pieces
@@ -355,7 +355,7 @@ class Pairs:
 
         A pair on which no barrier acts is no nearer than that of edges begins.
         """
-        most = 2.0 * longest(way) / (1.0 - KEPT)
+        most = 2.0 * max_length(way) / (1.0 - KEPT)
         return most <= EDGES * self._distance and most <= self._gap_at(on)
 
     def _pieces(self, way: Values) -> int:
@@ -366,10 +366,10 @@ class Pairs:
             pieces *= 2
         return pieces
 
-    def overlaps(self, x: Values) -> Ints:
+    def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that cut each other."""
         on = self._mesh.vertices(x)
-        return crossings(self._mesh, on) if ipctk.has_intersections(self._mesh, on, ipctk.LBVH()) else NONE
+        return intersecting_elements(self._mesh, on) if ipctk.has_intersections(self._mesh, on, ipctk.LBVH()) else NONE
 
     def pressure(self, x: Values) -> Values:
         """(n,) the barrier's force on each point by its share of the reference surface, Pa; 0 where it has none."""
@@ -377,7 +377,7 @@ class Pairs:
         return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
 
 
-def areas(x: Values, elements: Ints) -> Values:
+def vertex_areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
     measure, d = measures(x, elements), x.shape[1]
     return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)

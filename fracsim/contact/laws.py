@@ -43,7 +43,7 @@ EARLIER = 0.75 * 0.8  # 3 c / 4: weight of the force after a third of the way
 TIGHT, EASY = 3e-3, 0.1  # of the barrier's width. By itself contact came down to 0.016 in a torn loaf that recoils
 
 
-class Repulsion(Protocol):
+class GapPotential(Protocol):
     """An energy per area of gaps g (n,), m, that are less than a width: what pushes apart (barrier, penalty)."""
 
     @property
@@ -61,19 +61,19 @@ class Repulsion(Protocol):
 
 
 @dataclass(frozen=True)
-class Law:
+class ObstacleLaw:
     """The barrier, and the speed of slip, m/s, below which friction passes for sticking."""
 
-    barrier: Repulsion
-    creep: float
+    barrier: GapPotential
+    sticking_speed: float
 
 
 @dataclass(frozen=True)
-class Along:
+class TimeAveragedPotential:
     """A barrier over steps that begin with gaps `start` (n,), m: a function of the gaps g (n,) at their ends."""
 
-    barrier: Repulsion
-    start: Values
+    barrier: GapPotential
+    start_gap: Values
 
     def energy(self, g: Values) -> Values:
         """(n,) its potential, J/m^2; infinite where a gap is closed."""
@@ -92,10 +92,10 @@ class Along:
 
     def _both(self, law: Callable[[Values], Values], g: Values) -> tuple[Values, Values]:
         """(n,) after a third of the way, where gaps are open if they are at its end, and there."""
-        return law(np.where(g > 0, (2 * self.start + g) / 3, g)), law(g)
+        return law(np.where(g > 0, (2 * self.start_gap + g) / 3, g)), law(g)
 
 
-def stiffening(share: float) -> float:
+def stiffness_factor(share: float) -> float:
     """Factor of kappa with which the pressure at a gap of `share` of the width stands at EASY; 1 where it is not
     TIGHT."""
     if not 0 < share < TIGHT:

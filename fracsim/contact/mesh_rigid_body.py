@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .ipc_friction import Friction
-from .mesh_obstacles import Facing
-from .obstacle import Flight, FreeObstacle
-from .obstacle_pairs import Stops
-from .pose import Placed, Pose
-from .rigid_body import Push, RigidStep, Taken, of_points, resultant, ways_of_points
-from .step_limit import Going
+from .ipc_friction import IpcFriction
+from .mesh_obstacles import MeshObstaclePairs
+from .obstacle import FreeObstacle, RigidMotion
+from .obstacle_pairs import ObstaclePairs
+from .pose import Pose, PosedShape
+from .rigid_body import PoseDerivatives, PosePredictor, RigidStep, point_jacobian, point_set_derivatives, resultant
+from .step_limit import PoseMotion
 
 Values = npt.NDArray[np.float64]
 
@@ -26,7 +26,7 @@ ON_THE_WAY = 1e-9  # of the length of a step of Newton's method: places that are
 
 
 @dataclass(frozen=True)
-class Before:
+class MeshSurroundings:
     """What a solid is before in a step.
 
     Attributes:
@@ -34,14 +34,14 @@ class Before:
         others: where other obstacles are, by their numbers.    start: (n, 3) where the body was as the step began.
     """
 
-    facing: Facing | None
-    friction: Friction | None
-    x: Values | None
-    others: Mapping[int, Placed]
+    pairs: MeshObstaclePairs | None
+    friction: IpcFriction | None
+    positions: Values | None
+    obstacles: Mapping[int, PosedShape]
     start: Values | None = None
 
 
-class FreeSolid:
+class FreeMesh:
     """A free solid, and its pose.
 
     Attributes:
@@ -51,101 +51,107 @@ class FreeSolid:
 
     step: RigidStep
     z: Values
-    stops: Stops
+    obstacle_pairs: ObstaclePairs
 
     def __init__(self, body: FreeObstacle) -> None:
-        self.body, self.flight = body, body.at_first()
-        self.pose = self.flight.pose
-        self._of: Flight | None = None  # that the step began with
-        self._found: Values | None = None  # z of the last solution of this step
-        self._way: Taken | None = None
-        self._at: tuple[Values | None, Pose] | None = None  # where it was settled last in the step
+        self.body, self.motion = body, body.start_motion()
+        self.pose = self.motion.pose
+        self._step_motion: RigidMotion | None = None  # that the step began with
+        self._solution: Values | None = None  # z of the last solution of this step
+        self._predictor: PosePredictor | None = None
+        self._equilibrium: tuple[Values | None, Pose] | None = None  # where it was settled last in the step
 
     # --- a step ---
 
-    def look(self) -> None:
+    def reset_pose(self) -> None:
         """Between two steps."""
-        self.pose = self.flight.pose
+        self.pose = self.motion.pose
 
-    def begin(self, step: RigidStep) -> None:
+    def begin_step(self, step: RigidStep) -> None:
         """A step begins, for the first time or once more."""
-        if self._of is not self.flight:
-            self._found = None
-        self._of, self.step, self._at = self.flight, step, None
-        self.forget_way()
-        self.put(np.zeros(self.body.ways.shape[1]))
+        if self._step_motion is not self.motion:
+            self._solution = None
+        self._step_motion, self.step, self._equilibrium = self.motion, step, None
+        self.discard_predictor()
+        self.move_to(np.zeros(self.body.motion_basis.shape[1]))
 
     @property
-    def is_under_way(self) -> bool:
+    def in_step(self) -> bool:
         """Whether the step that began is not over yet."""
-        return self._of is self.flight
+        return self._step_motion is self.motion
 
-    def put(self, z: Values) -> None:
+    def move_to(self, z: Values) -> None:
         """At z (k,)."""
         self.z, self.pose = z, self.step.pose(z)
 
-    def forget_way(self) -> None:
+    def discard_predictor(self) -> None:
         """Newton's method starts anew."""
-        self._way = None
+        self._predictor = None
 
-    def found(self) -> None:
+    def store_solution(self) -> None:
         """The step is over: where it is first looked for if it is taken again."""
-        self._found = self.z
+        self._solution = self.z
 
     # --- where it is ---
 
-    def settle(self, before: Before) -> Values:
+    def equilibrate(self, before: MeshSurroundings) -> Values:
         """The way z that belongs to the body where it is."""
         here = self.z
         for z in self._candidates(before):
             if self._may_be_at(before, z):
-                z, _ = self.step.settle(z, lambda z: self.push(before, z), lambda z, dz: self.free(before, z, dz))
-                self._at = before.x, self.step.pose(z)
+                z, _ = self.step.minimise(
+                    z, lambda z: self.pose_derivatives(before, z), lambda z, dz: self.free_fraction(before, z, dz)
+                )
+                self._equilibrium = before.positions, self.step.pose(z)
                 return z
         return here  # the body or a stop is in its way: Newton's method fails, and the step is halved
 
-    def _candidates(self, before: Before) -> Iterator[Values]:
-        if (way := self._way) is not None and before.x is not None:
-            yield way.at(way.share(before.x))
+    def _candidates(self, before: MeshSurroundings) -> Iterator[Values]:
+        if (way := self._predictor) is not None and before.positions is not None:
+            yield way.way_at(way.fraction_at(before.positions))
         yield self.z
-        if self._found is not None:
-            yield self._found
+        if self._solution is not None:
+            yield self._solution
         yield np.zeros_like(self.z)
 
-    def _may_be_at(self, before: Before, z: Values) -> bool:
+    def _may_be_at(self, before: MeshSurroundings, z: Values) -> bool:
         """Whether it gets there, and the body where that is, with nothing between them on their ways."""
         pose = self.step.pose(z)
-        if not self.stops.are_open(pose, before.others):
+        if not self.obstacle_pairs.are_open(pose, before.obstacles):
             return False
-        if before.facing is None or before.x is None or before.start is None:
+        if before.pairs is None or before.positions is None or before.start is None:
             return True
-        if (way := self._way) is not None:
-            off = before.x - way.x - (share := way.share(before.x)) * way.moved
-            on_it = abs(off).max() <= ON_THE_WAY * abs(way.moved).max()
-            if on_it and np.array_equal(z, way.at(share)):
+        if (way := self._predictor) is not None:
+            off = before.positions - way.positions - (share := way.fraction_at(before.positions)) * way.motion
+            on_it = abs(off).max() <= ON_THE_WAY * abs(way.motion).max()
+            if on_it and np.array_equal(z, way.way_at(share)):
                 return True  # longest_step has looked
         x, then = before.start, self.step.start.pose
-        if self._at is not None and self._at[0] is not None:
-            x, then = self._at[0], self._at[1]
-        before.facing.solid.put(pose)
-        return before.facing.free_along(x, before.x, then) == 1
+        if self._equilibrium is not None and self._equilibrium[0] is not None:
+            x, then = self._equilibrium[0], self._equilibrium[1]
+        before.pairs.mesh.move_to(pose)
+        return before.pairs.moving_free_fraction(x, before.positions, then) == 1
 
-    def push(self, before: Before, z: Values) -> Push:
+    def pose_derivatives(self, before: MeshSurroundings, z: Values) -> PoseDerivatives:
         """What the body and stops do to it at z."""
-        self.put(z)
-        found = self.stops.push(self.pose, before.others)
+        self.move_to(z)
+        found = self.obstacle_pairs.pose_derivatives(self.pose, before.obstacles)
         parts = self._parts(before)
-        return found if parts is None else found + of_points(*parts)
+        return found if parts is None else found + point_set_derivatives(*parts)
 
-    def _met(self, before: Before) -> tuple[Facing, Values, int] | None:
+    def _met(self, before: MeshSurroundings) -> tuple[MeshObstaclePairs, Values, int] | None:
         """The body's facets, with the solid where it is, the points (n + m, 3) of both and n; None: far."""
-        facing = before.facing
-        if facing is None or before.x is None:
+        facing = before.pairs
+        if facing is None or before.positions is None:
             return None
-        facing.solid.put(self.pose)
-        return None if facing.is_far(before.x) else (facing, facing.with_solid(before.x), len(before.x))
+        facing.mesh.move_to(self.pose)
+        return (
+            None
+            if facing.is_far(before.positions)
+            else (facing, facing.with_mesh(before.positions), len(before.positions))
+        )
 
-    def _parts(self, before: Before) -> tuple[float, Values, csr_matrix, csr_matrix, Values] | None:
+    def _parts(self, before: MeshSurroundings) -> tuple[float, Values, csr_matrix, csr_matrix, Values] | None:
         """Energy, its derivative by the points of the solid, second ones, exact and positive, and arms; None: far."""
         if (met := self._met(before)) is None:
             return None
@@ -157,22 +163,22 @@ class FreeSolid:
             exact = exact + before.friction.hessian(both, exact=True)
             stiff = stiff + before.friction.hessian(both)
         own = slice(3 * n, None)
-        return energy, g[n:], exact[own, own], stiff[own, own], facing.solid.here - self.pose.centre
+        return energy, g[n:], exact[own, own], stiff[own, own], facing.mesh.positions - self.pose.centre
 
-    def free(self, before: Before, z: Values, dz: Values) -> float:
+    def free_fraction(self, before: MeshSurroundings, z: Values, dz: Values) -> float:
         """Share of the way from z by dz that closes no gap, with the body where it is."""
-        self.put(z)
-        start, q = self.pose, self.step.onward(z, dz)
-        still = {number: (placed, np.zeros_like(q)) for number, placed in before.others.items()}
-        share = self.stops.safe_share(start, q, still)
-        if before.facing is None or before.x is None:
+        self.move_to(z)
+        start, q = self.pose, self.step.pose_change(z, dz)
+        still = {number: (placed, np.zeros_like(q)) for number, placed in before.obstacles.items()}
+        share = self.obstacle_pairs.safe_fraction(start, q, still)
+        if before.pairs is None or before.positions is None:
             return share
-        before.facing.solid.put(self.step.pose(z + dz))
-        return min(share, before.facing.free_along(before.x, before.x, start))
+        before.pairs.mesh.move_to(self.step.pose(z + dz))
+        return min(share, before.pairs.moving_free_fraction(before.positions, before.positions, start))
 
     # --- how it gives way ---
 
-    def given_way(self, before: Before) -> tuple[Values, Values] | None:
+    def condensation(self, before: MeshSurroundings) -> tuple[Values, Values] | None:
         """(3 n, k) Phi_xz by the body's points and (k, k) Phi_zz^-1, its positive definite part; None: nothing of the
         body is near."""
         if (met := self._met(before)) is None:
@@ -181,37 +187,39 @@ class FreeSolid:
         H = facing.hessian(both)
         if before.friction is not None:
             H = H + before.friction.hessian(both)
-        J = ways_of_points(facing.solid.here - self.pose.centre).reshape(-1, 6)
-        mixed = self.step.factor * (H[: 3 * n, 3 * n :] @ J) @ self.step.by_way(self.z)
+        J = point_jacobian(facing.mesh.positions - self.pose.centre).reshape(-1, 6)
+        mixed = self.step.factor * (H[: 3 * n, 3 * n :] @ J) @ self.step.pose_jacobian(self.z)
         if not mixed.any():
             return None
-        resistance = self.step.system(self.z, self.push(before, self.z))[2]
+        resistance = self.step.system(self.z, self.pose_derivatives(before, self.z))[2]
         return mixed, np.asarray(np.linalg.inv(resistance))
 
-    def taken_along(self, before: Before, moved: Values) -> Pose:
+    def predict_pose(self, before: MeshSurroundings, moved: Values) -> Pose:
         """Where Newton's method takes it together with the points, which go by `moved` (n, 3), m."""
-        given, dz = self.given_way(before), np.zeros_like(self.z)
+        given, dz = self.condensation(before), np.zeros_like(self.z)
         if given is not None:
             mixed, compliance = given
             dz = -compliance @ (mixed.T @ moved.reshape(-1))
-        assert before.x is not None
-        self._way = Taken(before.x, moved, self.z, dz)
+        assert before.positions is not None
+        self._predictor = PosePredictor(before.positions, moved, self.z, dz)
         return self.step.pose(self.z + dz)
 
-    def pushed(self, before: Before) -> Values:
+    def wrench(self, before: MeshSurroundings) -> Values:
         """(6,) force and moment of body and stops on it, N and N m."""
-        force = self.stops.force(self.pose, before.others)
+        force = self.obstacle_pairs.wrench(self.pose, before.obstacles)
         parts = self._parts(before)
         return force if parts is None else force + resultant(-parts[1], parts[4])
 
     # --- first guesses ---
 
-    def guess(self, before: Before, to: Values, led: list[Values]) -> tuple[Values, float]:
+    def first_guess(self, before: MeshSurroundings, to: Values, led: list[Values]) -> tuple[Values, float]:
         """Where it goes by itself, stays or is taken along by another one on its way (6,), whichever is free first with
         the body on its way `to` (n, 3) from the start, and the share of that way which closes no gap."""
         d, first = 3, 0.0
-        along = [np.asarray(np.linalg.lstsq(self.body.ways[:d], way[:d], rcond=None)[0]) for way in led if way.any()]
-        ways: list[Values] = [self.step.ahead, 0 * self.step.ahead, *along]
+        along = [
+            np.asarray(np.linalg.lstsq(self.body.motion_basis[:d], way[:d], rcond=None)[0]) for way in led if way.any()
+        ]
+        ways: list[Values] = [self.step.free_flight, 0 * self.step.free_flight, *along]
         for z in ways:
             share = self._safe_share(before, to, z)
             if share == 1:
@@ -219,11 +227,11 @@ class FreeSolid:
             first = first or share
         return ways[0], first
 
-    def _safe_share(self, before: Before, to: Values, z: Values) -> float:
+    def _safe_share(self, before: MeshSurroundings, to: Values, z: Values) -> float:
         start = self.step.start.pose
-        others: dict[int, Going] = {number: (placed, np.zeros(6)) for number, placed in before.others.items()}
-        share = self.stops.safe_share(start, self.step.increment(z), others)
-        if before.facing is None or before.start is None:
+        others: dict[int, PoseMotion] = {number: (placed, np.zeros(6)) for number, placed in before.obstacles.items()}
+        share = self.obstacle_pairs.safe_fraction(start, self.step.increment(z), others)
+        if before.pairs is None or before.start is None:
             return share
-        before.facing.solid.put(self.step.pose(z))
-        return min(share, before.facing.free_along(before.start, to, start))
+        before.pairs.mesh.move_to(self.step.pose(z))
+        return min(share, before.pairs.moving_free_fraction(before.start, to, start))

@@ -24,9 +24,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .friction import Friction
-from .laws import Along, Repulsion
-from .pose import Placed, Pose
+from .friction import CoulombFriction
+from .laws import GapPotential, TimeAveragedPotential
+from .pose import Pose, PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ HUGE_STIFFNESS = 1e150  # N/m, of a gap that is closed or as good as that
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class StepStart:
     """Points as a step began.
 
     Attributes:
@@ -42,31 +42,31 @@ class Start:
     """
 
     gap: Values
-    known: Ints
+    active: Ints
     normal: Values
-    place: Values
+    position: Values
 
     @classmethod
-    def straight(cls, gap: Values, dim: int) -> Start:
+    def from_gaps(cls, gap: Values, dim: int) -> StepStart:
         """Of points of which nothing but gaps (n,), m, is known: f = g."""
         return cls(gap, np.empty(0, np.int64), np.empty((0, dim)), np.empty((0, dim)))
 
-    def seen(self, then: Pose, now: Pose) -> Start:
+    def carried_with(self, then: Pose, now: Pose) -> StepStart:
         """As it is where the obstacle has gone from one pose to another."""
         normal = now.vectors_to_space(self.normal @ then.rotation)
-        return Start(self.gap, self.known, normal, now.points_to_space(then.to_body(self.place)))
+        return StepStart(self.gap, self.active, normal, now.points_to_space(then.to_body(self.position)))
 
-    def bent(self, points: Ints, gap: Values, normal: Values, x: Values) -> Bent:
+    def curved_gap(self, points: Ints, gap: Values, normal: Values, x: Values) -> CurvedGap:
         """f of some points (m,), those that are known among them, with gaps (m,) and normals (m, d) at places x."""
         e, turned, has = np.zeros(len(points)), np.zeros_like(x), np.zeros(len(points), bool)
-        at = np.searchsorted(points, self.known)
-        e[at] = gap[at] - self.gap[self.known] - np.einsum("ni,ni->n", self.normal, x[at] - self.place)
+        at = np.searchsorted(points, self.active)
+        e[at] = gap[at] - self.gap[self.active] - np.einsum("ni,ni->n", self.normal, x[at] - self.position)
         turned[at], has[at] = normal[at] - self.normal, True
-        return Bent.of(gap, e, normal, turned, has)
+        return CurvedGap.from_gaps(gap, e, normal, turned, has)
 
 
 @dataclass(frozen=True, eq=False)
-class Bent:
+class CurvedGap:
     """f of points before an obstacle.
 
     Attributes:
@@ -76,11 +76,11 @@ class Bent:
 
     value: Values
     gradient: Values
-    of_curvature: Values
-    rest: Values
+    curvature_factor: Values
+    remainder: Values
 
     @classmethod
-    def of(cls, g: Values, e: Values, n: Values, m: Values, has: npt.NDArray[np.bool_]) -> Bent:
+    def from_gaps(cls, g: Values, e: Values, n: Values, m: Values, has: npt.NDArray[np.bool_]) -> CurvedGap:
         """Of gaps g and excesses e (k,) with gradients n and m (k, d); f = g but where it `has` an excess.
 
         Before hollow obstacles e is negative, and f = g - e / 2.
@@ -97,7 +97,7 @@ class Bent:
 
 
 @dataclass(frozen=True)
-class Grip:
+class LaggedContact:
     """Where a step began: points in touch then, whose friction of the step is lagged.
 
     Attributes:
@@ -108,11 +108,11 @@ class Grip:
     points: Ints
     force: Values
     normal: Values
-    start: Values
-    under: Values
+    position: Values
+    obstacle_point: Values
 
 
-class Jointly(Protocol):
+class FacetCoupling(Protocol):
     """What acts between points and not at each alone (facet_contact)."""
 
     @property
@@ -120,7 +120,7 @@ class Jointly(Protocol):
         """(k, c) points."""
 
     @property
-    def exact(self) -> Values:
+    def hessian(self) -> Values:
         """(k, c d, c d) minus the derivative of the forces, N/m."""
 
     @property
@@ -129,7 +129,7 @@ class Jointly(Protocol):
 
 
 @dataclass(frozen=True)
-class Touch:
+class ContactForces:
     """Points in touch with one obstacle, and what acts on them.
 
     Attributes:
@@ -145,27 +145,27 @@ class Touch:
     normal: Values
     friction: Values
     potential: float
-    make_parts: Callable[[], tuple[Values, Values]]
-    between: Jointly | None = None
+    make_hessians: Callable[[], tuple[Values, Values]]
+    facets: FacetCoupling | None = None
 
     @cached_property
-    def _parts(self) -> tuple[Values, Values]:
-        return self.make_parts()
+    def _hessians(self) -> tuple[Values, Values]:
+        return self.make_hessians()
 
     @property
-    def exact(self) -> Values:
+    def normal_hessian(self) -> Values:
         """(k, d, d) minus the derivative of the normal forces, N/m."""
-        return self._parts[0]
+        return self._hessians[0]
 
     @property
-    def stick(self) -> Values:
+    def friction_hessian(self) -> Values:
         """(k, d, d) that of friction, positive semi-definite, N/m."""
-        return self._parts[1]
+        return self._hessians[1]
 
     @cached_property
-    def pressed(self) -> Values:
+    def normal_stiffness(self) -> Values:
         """(k, d, d) the part of `exact` that is positive semi-definite, N/m."""
-        return positive(self.exact)
+        return positive_part(self.normal_hessian)
 
     @property
     def stiffness(self) -> Values:
@@ -174,25 +174,25 @@ class Touch:
 
     def tangent(self, *, exact: bool) -> Values:
         """(k, d, d) the same, or `exact`, N/m."""
-        return (self.exact if exact else self.pressed) + self.stick
+        return (self.normal_hessian if exact else self.normal_stiffness) + self.friction_hessian
 
 
-def grip(x: Values, gap: Values, area: Values, placed: Placed, barrier: Repulsion) -> Grip:
+def lag_contact(x: Values, gap: Values, area: Values, placed: PosedShape, barrier: GapPotential) -> LaggedContact:
     """Normal forces at places x (n, d) of the start of a step, with gaps (n,), m."""
     near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
-    return Grip(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near], x[near])
+    return LaggedContact(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near], x[near])
 
 
-def touch(
+def evaluate_points(
     x: Values,
     area: Values,
-    placed: Placed,
-    barrier: Repulsion,
-    held: Grip | None,
-    friction: Friction | None,
+    placed: PosedShape,
+    barrier: GapPotential,
+    held: LaggedContact | None,
+    friction: CoulombFriction | None,
     way: Values,
-    start: Start | None = None,
-) -> Touch:
+    start: StepStart | None = None,
+) -> ContactForces:
     """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, or (k, d) of its places under
     the points that are held, m; `start`: all as they were then, where the barrier acts along the way (along, bent).
 
@@ -205,13 +205,13 @@ def touch(
     points = np.flatnonzero(near)
     gap, share, at = gap[points], area[points], x[points]
     normal = placed.normal(at)
-    acting = barrier if start is None else Along(barrier, start.gap[points])
-    bent = None if start is None else start.bent(points, gap, normal, at)
+    acting = barrier if start is None else TimeAveragedPotential(barrier, start.gap[points])
+    bent = None if start is None else start.curved_gap(points, gap, normal, at)
     along, value = (normal, gap) if bent is None else (bent.gradient, bent.value)
     slope = acting.slope(value)
     rubbed, rubbing = np.zeros_like(at), 0.0
     if friction is not None and held is not None and len(held.points):
-        moved = x[held.points] - held.start - way
+        moved = x[held.points] - held.position - way
         rubbed[np.searchsorted(points, held.points)] = -friction.gradient(held.force, held.normal, moved)
         rubbing = float(friction.energy(held.force, held.normal, moved).sum())
 
@@ -219,7 +219,7 @@ def touch(
         stiff = acting.curvature(value)[:, None, None] * along[:, :, None] * along[:, None, :]
         curved = placed.curvature(at)
         if bent is not None:
-            curved = bent.of_curvature[:, None, None] * curved + bent.rest
+            curved = bent.curvature_factor[:, None, None] * curved + bent.remainder
         exact = share[:, None, None] * (stiff + slope[:, None, None] * curved)
         stick = np.zeros_like(exact)
         if friction is not None and held is not None and len(held.points):
@@ -227,16 +227,16 @@ def touch(
         return exact, stick
 
     energy, potential = float(share @ barrier.energy(gap)), float(share @ acting.energy(value))
-    return Touch(points, energy, -(share * slope)[:, None] * along, rubbed, potential + rubbing, parts)
+    return ContactForces(points, energy, -(share * slope)[:, None] * along, rubbed, potential + rubbing, parts)
 
 
-def nothing(d: int) -> Touch:
+def no_contact(d: int) -> ContactForces:
     """What an obstacle does that is far away."""
     none = np.empty((0, d))
-    return Touch(np.empty(0, np.int64), 0.0, none, none, 0.0, lambda: (np.empty((0, d, d)),) * 2)
+    return ContactForces(np.empty(0, np.int64), 0.0, none, none, 0.0, lambda: (np.empty((0, d, d)),) * 2)
 
 
-def positive(blocks: Values) -> Values:
+def positive_part(blocks: Values) -> Values:
     """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with. Nothing of gaps
     that are closed (barrier.HUGE): there is no step from there."""
     is_open = np.all(abs(blocks) < HUGE_STIFFNESS, axis=(1, 2), keepdims=True)

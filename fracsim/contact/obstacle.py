@@ -13,12 +13,12 @@ from typing import ClassVar
 import numpy as np
 
 from ..mechanics.time_functions import TimeFunction
-from .pose import Placed, Pose, Values, second_order_turn, turning
+from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative
 from .shape_base import Shape
 
 
 @dataclass(frozen=True, eq=False)
-class Obstacle:
+class RigidObstacle:
     """A rigid obstacle without a mass of its own.
 
     Attributes:
@@ -30,33 +30,37 @@ class Obstacle:
 
     name: str
     shape: Shape
-    at: Values
-    moved: TimeFunction | None = None
+    start_point: Values
+    prescribed_displacement: TimeFunction | None = None
     friction: float = 0.0
     spin: Values | None = None
     free: ClassVar[bool] = False  # whether it has a mass, and moves by itself
 
-    def placed(self, t: float) -> Placed:
+    def posed_at(self, t: float) -> PosedShape:
         """Where it is at time t, s."""
-        pose = Pose.at(self.at + self.displacement(t))
-        return Placed(self.shape, pose if self.spin is None else pose.moved(np.append(0 * self.at, t * self.spin)))
+        pose = Pose.at_point(self.start_point + self.displacement(t))
+        return PosedShape(
+            self.shape, pose if self.spin is None else pose.incremented(np.append(0 * self.start_point, t * self.spin))
+        )
 
     def displacement(self, t: float) -> Values:
         """(d,) m."""
-        return np.zeros(len(self.at)) if self.moved is None else self.moved(t)
+        return (
+            np.zeros(len(self.start_point)) if self.prescribed_displacement is None else self.prescribed_displacement(t)
+        )
 
-    def way(self, start: float, end: float) -> Values:
+    def pose_increment(self, start: float, end: float) -> Values:
         """(p,) increment q of its pose from one time to another."""
         shift = self.displacement(end) - self.displacement(start)
         return np.concatenate([shift, np.zeros(self._turns) if self.spin is None else (end - start) * self.spin])
 
     @cached_property
     def _turns(self) -> int:
-        return 1 if len(self.at) == 2 else 3
+        return 1 if len(self.start_point) == 2 else 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FreeObstacle(Obstacle):
+class FreeObstacle(RigidObstacle):
     """An obstacle with a mass. Its reference point is its centre, or the hinge that it hangs on.
 
     Attributes:
@@ -68,55 +72,55 @@ class FreeObstacle(Obstacle):
 
     mass: float
     inertia: Values
-    ways: Values
-    centre: Values
+    motion_basis: Values
+    mass_centre: Values
     gravity: Values
-    rate: Values
+    start_rate: Values
     free: ClassVar[bool] = True
 
     @cached_property
-    def count(self) -> int:
+    def pose_size(self) -> int:
         """p."""
-        return len(self.at) + self._turns
+        return len(self.start_point) + self._turns
 
-    def matrix(self, rotation: Values) -> Values:
+    def mass_matrix(self, rotation: Values) -> Values:
         """(k, k) mass matrix of z with the body turned by `rotation`.
 
         Where the centre of mass is not the reference point that point is held: no motion couples the two.
         """
-        d, full = len(self.at), np.zeros((self.count, self.count))
+        d, full = len(self.start_point), np.zeros((self.pose_size, self.pose_size))
         full[:d, :d] = self.mass * np.eye(d)
         full[d:, d:] = rotation @ self.inertia @ rotation.T if d == 3 else self.inertia
-        return np.asarray(self.ways.T @ full @ self.ways)
+        return np.asarray(self.motion_basis.T @ full @ self.motion_basis)
 
-    def weight(self, pose: Pose) -> tuple[float, Values, Values]:
+    def gravity_potential(self, pose: Pose) -> tuple[float, Values, Values]:
         """-m g . x of the centre of mass, J, with its derivatives (p,), (p, p) by an increment of the pose."""
-        d, arm, force = len(self.at), pose.rotation @ self.centre, self.mass * self.gravity
-        gradient, hessian = np.zeros(self.count), np.zeros((self.count, self.count))
-        gradient[:d], gradient[d:] = -force, force @ turning(arm[None])[0]
-        hessian[d:, d:] = -second_order_turn(force[None], arm[None])[0]
+        d, arm, force = len(self.start_point), pose.rotation @ self.mass_centre, self.mass * self.gravity
+        gradient, hessian = np.zeros(self.pose_size), np.zeros((self.pose_size, self.pose_size))
+        gradient[:d], gradient[d:] = -force, force @ rotation_derivative(arm[None])[0]
+        hessian[d:, d:] = -rotation_second_derivative(force[None], arm[None])[0]
         return -float(force @ (pose.centre + arm)), gradient, hessian
 
-    def told(self, flight: Flight) -> Values:
+    def history_values(self, flight: RigidMotion) -> Values:
         """(2 d + 2 r + 1,) place and velocity of the centre of mass, turn and spin, energy of motion; m, m/s, rad,
         rad/s, J."""
-        pose, d = flight.pose, len(self.at)
-        rate = np.linalg.solve(self.matrix(pose.rotation), flight.momentum)
-        arm, q = pose.rotation @ self.centre, self.ways @ rate
-        velocity = q[:d] - turning(arm[None])[0] @ q[d:]
+        pose, d = flight.pose, len(self.start_point)
+        rate = np.linalg.solve(self.mass_matrix(pose.rotation), flight.momentum)
+        arm, q = pose.rotation @ self.mass_centre, self.motion_basis @ rate
+        velocity = q[:d] - rotation_derivative(arm[None])[0] @ q[d:]
         energy = 0.5 * float(flight.momentum @ rate)
-        return np.concatenate([pose.centre + arm, velocity, flight.turned, q[d:], [energy]])
+        return np.concatenate([pose.centre + arm, velocity, flight.rotation, q[d:], [energy]])
 
-    def at_first(self) -> Flight:
+    def start_motion(self) -> RigidMotion:
         """How it moves at t = 0, before anything touches it."""
-        pose = Pose.at(self.at)
-        momentum = self.matrix(pose.rotation) @ self.rate
-        force = -self.ways.T @ self.weight(pose)[1]
-        return Flight(pose, momentum, force, np.zeros(self._turns))
+        pose = Pose.at_point(self.start_point)
+        momentum = self.mass_matrix(pose.rotation) @ self.start_rate
+        force = -self.motion_basis.T @ self.gravity_potential(pose)[1]
+        return RigidMotion(pose, momentum, force, np.zeros(self._turns))
 
 
 @dataclass(frozen=True, eq=False)
-class Flight:
+class RigidMotion:
     """How an obstacle is moving.
 
     Attributes:
@@ -128,23 +132,23 @@ class Flight:
     pose: Pose
     momentum: Values
     force: Values
-    turned: Values = field(default_factory=lambda: np.zeros(1))
+    rotation: Values = field(default_factory=lambda: np.zeros(1))
 
-    def flat(self) -> Values:
+    def to_array(self) -> Values:
         """All its numbers in a row."""
         return np.concatenate(
-            [self.pose.centre, self.pose.rotation.reshape(-1), self.momentum, self.force, self.turned]
+            [self.pose.centre, self.pose.rotation.reshape(-1), self.momentum, self.force, self.rotation]
         )
 
-    def like(self, numbers: Values) -> Flight:
+    def from_array(self, numbers: Values) -> RigidMotion:
         """The flight whose `flat` gave these numbers, of the same obstacle."""
-        d, k, r = self.pose.dim, len(self.momentum), len(self.turned)
+        d, k, r = self.pose.dim, len(self.momentum), len(self.rotation)
         centre, rotation, momentum, force, turned, _ = np.split(numbers, np.cumsum([d, d * d, k, k, r]))
-        return Flight(Pose(centre, rotation.reshape(d, d)), momentum, force, turned)
+        return RigidMotion(Pose(centre, rotation.reshape(d, d)), momentum, force, turned)
 
 
-def rows_of(flights: Iterable[Flight]) -> Values:
+def motion_rows(flights: Iterable[RigidMotion]) -> Values:
     """(n, m) the numbers of flights, a row each; shorter rows, as of what turns about a hinge, end with zeros."""
-    rows = [flight.flat() for flight in flights]
+    rows = [flight.to_array() for flight in flights]
     longest = max(map(len, rows), default=0)
     return np.array([np.pad(row, (0, longest - len(row))) for row in rows])

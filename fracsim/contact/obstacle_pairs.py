@@ -16,22 +16,22 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import longest_step
-from .inset_points import Grown, Skeleton, skeleton
-from .laws import Repulsion
-from .node_contact import Start, Touch, touch
-from .obstacle import Obstacle
-from .pose import Placed, Pose, turned
-from .rigid_body import Push, carried, push
+from .barrier import safe_fractions
+from .inset_points import InsetPoints, OffsetShape, inset_points
+from .laws import GapPotential
+from .node_contact import ContactForces, StepStart, evaluate_points
+from .obstacle import RigidObstacle
+from .pose import Pose, PosedShape, rotate_vectors
+from .rigid_body import PoseDerivatives, carried_point_derivatives, pose_derivatives
 from .shape_base import Shape
-from .step_limit import Going
-from .triangle_mesh_shape import Solid
+from .step_limit import PoseMotion
+from .triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Stop:
+class ObstaclePair:
     """Of a free obstacle, the first, and another one.
 
     Attributes:
@@ -39,68 +39,70 @@ class Stop:
             other, grown by their radius.
     """
 
-    bones: tuple[Skeleton, Skeleton]
+    points: tuple[InsetPoints, InsetPoints]
     areas: tuple[Values, Values]
-    seen: tuple[Shape, Shape]
+    targets: tuple[Shape, Shape]
 
     @classmethod
-    def of(cls, body: Obstacle, other: Obstacle) -> Stop:
+    def between(cls, body: RigidObstacle, other: RigidObstacle) -> ObstaclePair:
         """Between two obstacles."""
-        mine, its = skeleton(body.shape), skeleton(other.shape)
-        if isinstance(body.shape, Solid):  # which has no distance: it feels others at its points
-            nobody = Skeleton(np.empty((0, 3)), 0.0)
-            return cls((mine, nobody), (np.full(len(mine.points), mine.share), np.empty(0)), (other.shape,) * 2)
-        areas = np.full(len(mine.points), mine.share), np.full(len(its.points), its.share)
-        seen = Grown(other.shape, mine.radius), Grown(body.shape, its.radius)
+        mine, its = inset_points(body.shape), inset_points(other.shape)
+        if isinstance(body.shape, TriangleMeshShape):  # which has no distance: it feels others at its points
+            nobody = InsetPoints(np.empty((0, 3)), 0.0)
+            return cls((mine, nobody), (np.full(len(mine.points), mine.area), np.empty(0)), (other.shape,) * 2)
+        areas = np.full(len(mine.points), mine.area), np.full(len(its.points), its.area)
+        seen = OffsetShape(other.shape, mine.radius), OffsetShape(body.shape, its.radius)
         return cls((mine, its), areas, cast("tuple[Shape, Shape]", seen))  # what `touch` asks of a shape they have
 
-    def sides(self, body: Pose, other: Pose) -> Iterator[tuple[Values, Placed]]:
+    def sides(self, body: Pose, other: Pose) -> Iterator[tuple[Values, PosedShape]]:
         """(n, d) points of each in space, m, and what they see of the other one."""
-        yield body.points_to_space(self.bones[0].points), Placed(self.seen[0], other)
-        yield other.points_to_space(self.bones[1].points), Placed(self.seen[1], body)
+        yield body.points_to_space(self.points[0].points), PosedShape(self.targets[0], other)
+        yield other.points_to_space(self.points[1].points), PosedShape(self.targets[1], body)
 
     def gaps(self, body: Pose, other: Pose) -> list[Values]:
         """(n,) of the points of each, m."""
         return [placed.distance(x) for x, placed in self.sides(body, other)]
 
-    def touches(
-        self, body: Pose, other: Pose, barrier: Repulsion, start: list[Values] | None
-    ) -> list[tuple[Touch, Values]]:
+    def contact_forces(
+        self, body: Pose, other: Pose, barrier: GapPotential, start: list[Values] | None
+    ) -> list[tuple[ContactForces, Values]]:
         """What acts on the points of each, and where these are; `start`: gaps as the step began (laws)."""
-        begun: list[Start | None] = [None, None] if start is None else [Start.straight(gap, body.dim) for gap in start]
+        begun: list[StepStart | None] = (
+            [None, None] if start is None else [StepStart.from_gaps(gap, body.dim) for gap in start]
+        )
         still = np.zeros(body.dim)
         return [
-            (touch(x, area, placed, barrier, None, None, still, gap), x)
+            (evaluate_points(x, area, placed, barrier, None, None, still, gap), x)
             for (x, placed), area, gap in zip(self.sides(body, other), self.areas, begun, strict=True)
         ]
 
-    def safe_share(self, body: Pose, q: Values, other: Pose, its: Values) -> float:
+    def safe_fraction(self, body: Pose, q: Values, other: Pose, its: Values) -> float:
         """Share of the ways q and `its` (p,) of the body and the other one that leaves a tenth of each gap."""
         (x, there), (y, here) = self.sides(body, other)
         ways = [
-            _Way(there, x - body.centre, body.centre, q, there.felt(its)),
-            _Way(here, y - other.centre, other.centre, its, here.felt(q)),
+            _PairMotion(there, x - body.centre, body.centre, q, there.effective_increment(its)),
+            _PairMotion(here, y - other.centre, other.centre, its, here.effective_increment(q)),
         ]
-        return min(way.safe_share() for way in ways)
+        return min(way.safe_fraction() for way in ways)
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _PairMotion:
     """Points go with a body, arms (n, d) about its centre, by q (p,), and an obstacle before them by `its` (p,)."""
 
-    obstacle: Placed
+    obstacle: PosedShape
     arm: Values
     centre: Values
-    q: Values
-    its: Values
+    increment: Values
+    obstacle_increment: Values
 
-    def safe_share(self) -> float:
+    def safe_fraction(self) -> float:
         """Of the way, that leaves a tenth of each gap; 0 where one is closed."""
         if not len(self.arm):
             return 1.0
         if not (self.gap(np.zeros(len(self.arm))) > 0).all():
             return 0.0
-        return float(longest_step(self.gap, self.speed, len(self.arm)).min())
+        return float(safe_fractions(self.gap, self.speed, len(self.arm)).min())
 
     def gap(self, share: Values) -> Values:
         """(n,) after shares (n,) of the way, m."""
@@ -110,7 +112,11 @@ class _Way:
         """(n,) bounds of how fast gaps close, m per whole way (motion.Motion); a turn of the obstacle closes them by no
         more than its size times the points' distance from its centre."""
         d, arm = len(self.centre), np.linalg.norm(self.arm, axis=1)
-        straight, turn, turned_ = self.q[:d] - self.its[:d], np.linalg.norm(self.q[d:]), np.linalg.norm(self.its[d:])
+        straight, turn, turned_ = (
+            self.increment[:d] - self.obstacle_increment[:d],
+            np.linalg.norm(self.increment[d:]),
+            np.linalg.norm(self.obstacle_increment[d:]),
+        )
         closing: Values = np.full(len(self.arm), float(np.linalg.norm(straight)))
         if self.obstacle.shape.convex:
             v = self._turned(np.tile(straight, (len(self.arm), 1)), share)
@@ -121,65 +127,70 @@ class _Way:
     def _seen(self, share: Values) -> Values:
         """(n, d) the points in the frame of the obstacle."""
         d = len(self.centre)
-        along = share[:, None] * (self.q[:d] - self.its[:d]) + turned(self.arm, share[:, None] * self.q[d:])
+        along = share[:, None] * (self.increment[:d] - self.obstacle_increment[:d]) + rotate_vectors(
+            self.arm, share[:, None] * self.increment[d:]
+        )
         return self._turned(self.centre - self.obstacle.pose.centre + along, share)
 
     def _turned(self, vectors: Values, share: Values) -> Values:
-        return np.asarray(turned(vectors, -share[:, None] * self.its[len(self.centre) :]) @ self.obstacle.pose.rotation)
+        return np.asarray(
+            rotate_vectors(vectors, -share[:, None] * self.obstacle_increment[len(self.centre) :])
+            @ self.obstacle.pose.rotation
+        )
 
 
-type Places = Mapping[int, Placed] | Sequence[Placed]  # by the numbers of obstacles
+type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the numbers of obstacles
 
 
-class Stops:
+class ObstaclePairs:
     """Of one free obstacle; `placed` is where all obstacles are, by their numbers."""
 
-    def __init__(self, body: Obstacle, others: dict[int, Obstacle], barrier: Repulsion) -> None:
+    def __init__(self, body: RigidObstacle, others: dict[int, RigidObstacle], barrier: GapPotential) -> None:
         """`others`: by their numbers."""
-        self._each = {number: Stop.of(body, other) for number, other in others.items()}
-        self._barrier, self._count = barrier, len(body.way(0.0, 0.0))
+        self._pairs = {number: ObstaclePair.between(body, other) for number, other in others.items()}
+        self._barrier, self._count = barrier, len(body.pose_increment(0.0, 0.0))
         self._start: dict[int, list[Values]] = {}
 
-    def begin(self, pose: Pose, placed: Places, *, along: bool) -> None:
+    def begin_step(self, pose: Pose, placed: PosedObstacles, *, along: bool) -> None:
         """A step begins; `along`: barriers act along its way (laws)."""
-        each = self._each.items() if along else []
+        each = self._pairs.items() if along else []
         self._start = {number: stop.gaps(pose, placed[number].pose) for number, stop in each}
 
-    def are_open(self, pose: Pose, placed: Places) -> bool:
+    def are_open(self, pose: Pose, placed: PosedObstacles) -> bool:
         """Whether it lies in none."""
-        found = [stop.gaps(pose, placed[number].pose) for number, stop in self._each.items()]
+        found = [stop.gaps(pose, placed[number].pose) for number, stop in self._pairs.items()]
         return all(gap.min(initial=np.inf) > 0 for both in found for gap in both)
 
-    def safe_share(self, pose: Pose, q: Values, ways: dict[int, Going]) -> float:
+    def safe_fraction(self, pose: Pose, q: Values, ways: dict[int, PoseMotion]) -> float:
         """Share of its way q (p,) that closes no gap, where others are and go by their numbers."""
-        shares = [stop.safe_share(pose, q, ways[n][0].pose, ways[n][1]) for n, stop in self._each.items()]
+        shares = [stop.safe_fraction(pose, q, ways[n][0].pose, ways[n][1]) for n, stop in self._pairs.items()]
         return min(shares, default=1.0)
 
-    def push(self, pose: Pose, placed: Places) -> Push:
+    def pose_derivatives(self, pose: Pose, placed: PosedObstacles) -> PoseDerivatives:
         """What they do to its pose."""
         p = self._count
-        total = Push(0.0, np.zeros(p), np.zeros((p, p)), np.zeros((p, p)))
-        for number in self._each:
-            (own, x), (its, y) = self._touches(number, pose, placed)
-            total = total + carried(own, x, pose) + push(its, y, pose, None, pose)
+        total = PoseDerivatives(0.0, np.zeros(p), np.zeros((p, p)), np.zeros((p, p)))
+        for number in self._pairs:
+            (own, x), (its, y) = self._contact_forces(number, pose, placed)
+            total = total + carried_point_derivatives(own, x, pose) + pose_derivatives(its, y, pose, None, pose)
         return total
 
-    def force(self, pose: Pose, placed: Places) -> Values:
+    def wrench(self, pose: Pose, placed: PosedObstacles) -> Values:
         """(p,) force and moment of all of them on it, N and N m."""
-        return -self.push(pose, placed).gradient
+        return -self.pose_derivatives(pose, placed).gradient
 
-    def energies(self, pose: Pose, placed: Places) -> tuple[float, float]:
+    def energies(self, pose: Pose, placed: PosedObstacles) -> tuple[float, float]:
         """What their barriers store, and what their forces in the step are the derivative of, J."""
-        found = [touch for number in self._each for touch, _ in self._touches(number, pose, placed)]
+        found = [touch for number in self._pairs for touch, _ in self._contact_forces(number, pose, placed)]
         return sum(touch.energy for touch in found), sum(touch.potential for touch in found)
 
-    def work(self, pose: Pose, placed: Places, ways: Mapping[int, Values] | Sequence[Values]) -> float:
+    def work(self, pose: Pose, placed: PosedObstacles, ways: Mapping[int, Values] | Sequence[Values]) -> float:
         """What they have done to it by their own ways (p,) in the step, J."""
         done = 0.0
-        for number in self._each:
-            (own, _), (its, _) = self._touches(number, pose, placed)
+        for number in self._pairs:
+            (own, _), (its, _) = self._contact_forces(number, pose, placed)
             done += float((own.normal.sum(axis=0) - its.normal.sum(axis=0)) @ ways[number][: pose.dim])
         return done
 
-    def _touches(self, number: int, pose: Pose, placed: Places) -> list[tuple[Touch, Values]]:
-        return self._each[number].touches(pose, placed[number].pose, self._barrier, self._start.get(number))
+    def _contact_forces(self, number: int, pose: Pose, placed: PosedObstacles) -> list[tuple[ContactForces, Values]]:
+        return self._pairs[number].contact_forces(pose, placed[number].pose, self._barrier, self._start.get(number))

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from .shape_base import Shape, Values
-from .tessellation import Outline
+from .tessellation import Tessellation
 
 
 @dataclass(frozen=True, eq=False)
-class Shifted:
+class TranslatedShape:
     """A shape centred at `offset` (d,) from the reference point, m."""
 
+    kind: ClassVar[str] = "shape on a hinge"
     shape: Shape
     offset: Values
 
@@ -28,14 +30,14 @@ class Shifted:
         return self.shape.convex
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """Not about a point elsewhere."""
         return False
 
     @property
-    def least_radius(self) -> float:
+    def min_radius(self) -> float:
         """That of the shape."""
-        return self.shape.least_radius
+        return self.shape.min_radius
 
     @property
     def volume(self) -> float:
@@ -54,9 +56,9 @@ class Shifted:
         """(n, d, d) 1/m."""
         return self.shape.curvature(x - self.offset)
 
-    def outline(self) -> Outline:
+    def tessellate(self) -> Tessellation:
         """That of the shape, moved."""
-        points, elements = self.shape.outline()
+        points, elements = self.shape.tessellate()
         return points + self.offset, elements
 
     def inertia(self, density: float) -> Values:

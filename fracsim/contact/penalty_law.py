@@ -64,7 +64,7 @@ class Penalty:
         return np.maximum(self.width - g, 0.0)
 
 
-class Carried:
+class NodalMassShare:
     """What points carry of the nodes that they follow."""
 
     def __init__(self, at: SurfaceMap, follow: ParentMatrix, mass: Values) -> None:
@@ -73,7 +73,7 @@ class Carried:
         self._sum = np.asarray(self._size.sum(axis=1)).ravel()
         self._mass = follow.nodal(mass)[:, 0].copy()
 
-    def rate(self, stiffness: Values) -> Values:
+    def node_rates(self, stiffness: Values) -> Values:
         """(columns,) 1/m_a sum_p |w_pa| k_p S_p at the nodes that points follow, 1/s^2, of k (n,) N/m (collective)."""
         load = self._size.T @ (stiffness * self._sum)
         spread = np.zeros((len(load), self._follow.dim))
@@ -81,13 +81,13 @@ class Carried:
         summed = self._follow.nodal(self._follow.summed(spread))[:, 0]
         return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
 
-    def fastest(self, stiffness: Values) -> float:
+    def max_rate(self, stiffness: Values) -> float:
         """The bound of omega^2 over all ranks, 1/s^2 (collective)."""
-        return float(self._follow.comm.allreduce(float(self.rate(stiffness).max(initial=0.0)), op=MPI.MAX))
+        return float(self._follow.comm.allreduce(float(self.node_rates(stiffness).max(initial=0.0)), op=MPI.MAX))
 
-    def masses(self, area: Values) -> Values:
+    def point_masses(self, area: Values) -> Values:
         """(n,) M_p, kg, of points with shares `area` (n,) of the surface (collective)."""
-        rate, size = self.rate(area), self._size.tocoo()
+        rate, size = self.node_rates(area), self._size.tocoo()
         counts = size.data > SOME * self._sum[size.row]
         most = np.zeros(len(area))
         np.maximum.at(most, size.row[counts], rate[size.col[counts]])

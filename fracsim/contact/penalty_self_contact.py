@@ -31,85 +31,85 @@ from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.point_matching import match_points
 from .friction import tangential
-from .ipc_pairs import areas
-from .ipc_surface import Law, Surface
-from .penalty_point_facet import NONE, Pushing, rates
-from .self_contact import SelfContact, gathering
+from .ipc_pairs import vertex_areas
+from .ipc_surface import SelfContactLaw, SelfContactSurface
+from .penalty_point_facet import NONE, PointFacetPenalty, penalty_stiffness
+from .self_contact import SelfContact, node_gather
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Sticking:
+class SelfFrictionSprings:
     """Friction of `coefficient` between what is pushed and what pushes it.
 
     Attributes:
         start: (n, d) points where the step began, m; None: it is over.
     """
 
-    pairs: Pushing
+    pairs: PointFacetPenalty
     coefficient: float
     start: Values | None
 
     def gradient(self, x: Values) -> Values:
         """(n, d) N: the force on the points is its negative."""
-        met, found = self.pairs.met(x), np.zeros_like(x)
-        pull = met.rate[:, None] * self.slips(x)
-        np.add.at(found, met.at.points, pull)
-        np.add.at(found, met.at.corners, -met.at.share[:, :, None] * pull[:, None])
+        met, found = self.pairs.contacts(x), np.zeros_like(x)
+        pull = met.stiffness[:, None] * self.slips(x)
+        np.add.at(found, met.pairs.points, pull)
+        np.add.at(found, met.pairs.corners, -met.pairs.barycentric[:, :, None] * pull[:, None])
         return found
 
     def energy(self, x: Values) -> float:
         """Of the springs, J."""
-        return 0.5 * float(self.pairs.met(x).rate @ np.sum(self.slips(x) ** 2, axis=1))
+        return 0.5 * float(self.pairs.contacts(x).stiffness @ np.sum(self.slips(x) ** 2, axis=1))
 
     def slips(self, x: Values) -> Values:
         """(k, d) by which the springs of what is pushed are stretched, m. Those that are new are not."""
-        met, before = self.pairs.met(x), self._before(x)
-        slip = tangential(met.at.normal, before + self._moved(x))
-        longest = self.coefficient * (self.pairs.width - met.at.gap)
+        met, before = self.pairs.contacts(x), self._start_slips(x)
+        slip = tangential(met.pairs.normal, before + self._relative_motion(x))
+        longest = self.coefficient * (self.pairs.width - met.pairs.gap)
         length = np.maximum(np.linalg.norm(slip, axis=1), np.finfo(float).tiny)
         return np.asarray(np.minimum(1.0, longest / length)[:, None] * slip)
 
-    def lost(self, x: Values) -> float:
+    def dissipated(self, x: Values) -> float:
         """What friction has taken in the step, J: its work by the trapezoidal rule, less what the springs store."""
-        rate = self.pairs.met(x).rate[:, None]
-        work = -0.5 * float(np.vdot(rate * (self._before(x) + self.slips(x)), self._moved(x)))
-        stored = 0.5 * float(self.pairs.held @ np.sum(self.pairs.slip**2, axis=1))
+        rate = self.pairs.contacts(x).stiffness[:, None]
+        work = -0.5 * float(np.vdot(rate * (self._start_slips(x) + self.slips(x)), self._relative_motion(x)))
+        stored = 0.5 * float(self.pairs.contact_stiffness @ np.sum(self.pairs.slip**2, axis=1))
         return stored - self.energy(x) - work
 
-    def _before(self, x: Values) -> Values:
+    def _start_slips(self, x: Values) -> Values:
         """(k, d) the slips that the step began with, m."""
-        return np.asarray(self.pairs.slip[self.pairs.met(x).at.points])
+        return np.asarray(self.pairs.slip[self.pairs.contacts(x).pairs.points])
 
-    def _moved(self, x: Values) -> Values:
+    def _relative_motion(self, x: Values) -> Values:
         """(k, d) way in the step of points that were pushed as it began, over what pushes them, m."""
-        at = self.pairs.met(x).at
+        at = self.pairs.contacts(x).pairs
         if self.start is None:
             return np.zeros((len(at.points), x.shape[1]))
         way = x - self.start
-        over = way[at.points] - np.einsum("kcd,kc->kd", way[at.corners], at.share)
-        return np.where((self.pairs.held[at.points] > 0)[:, None], over, 0.0)
+        over = way[at.points] - np.einsum("kcd,kc->kd", way[at.corners], at.barycentric)
+        return np.where((self.pairs.contact_stiffness[at.points] > 0)[:, None], over, 0.0)
 
 
 type _Idle = tuple[Values | None, float, int]
 
 
-class Pushes(Surface):
+class PenaltyContactSurface(SelfContactSurface):
     """The surface of a body that a penalty keeps apart (rank 0)."""
 
-    pairs: Pushing
-    close: ClassVar[float] = 0.0  # what presses at all has no room
-    at_once: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
+    pairs: PointFacetPenalty
+    closed_pressure: ClassVar[float] = 0.0  # what presses at all has no room
+    search_all_faces: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
 
     def __init__(
         self,
         skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
-        law: Law,
+        law: SelfContactLaw,
         u: Values,
-        before: Pushes | None,
+        before: PenaltyContactSurface | None,
         cut: Values | None = None,
         *,
         mass: Values,
@@ -121,59 +121,64 @@ class Pushes(Surface):
         super().__init__(skeleton, pattern, law, u, before, cut)
         self._earlier = None
 
-    def _pairs_of(self, elements: Ints) -> Pushing:
+    def _build_pairs(self, elements: Ints) -> PointFacetPenalty:
         if self._rates is None:  # by all elements, and whole arms: they stay as they are while a surface lasts
-            pressure, area = self._law.stiffness / self._law.distance, areas(self._rest, self.made.elements)
-            self._rates = rates(self.at.weights, area, self.mass, pressure, self._most)
-        pairs = Pushing(self._rest, elements, self._rates, distance=self._law.distance)
+            pressure, area = (
+                self._law.stiffness / self._law.distance,
+                vertex_areas(self._rest_positions, self.split.elements),
+            )
+            self._rates = penalty_stiffness(self.point_map.weights, area, self.mass, pressure, self._most)
+        pairs = PointFacetPenalty(self._rest_positions, elements, self._rates, distance=self._law.distance)
         if (last := getattr(self, "pairs", None)) is not None:
-            pairs.hold(last.by, last.held, last.slip)
+            pairs.set_contacts(last.contact_facets, last.contact_stiffness, last.slip)
         elif self._earlier is not None:
-            pairs.hold(*self._pushed_before(self._earlier, self._rates))
+            pairs.set_contacts(*self._pushed_before(self._earlier, self._rates))
         return pairs
 
-    def _pushed_before(self, before: Pushes, most: Values) -> tuple[Ints, Values, Values]:
+    def _pushed_before(self, before: PenaltyContactSurface, most: Values) -> tuple[Ints, Values, Values]:
         """What is pushed still is, and no harder: corners (n, d), k_p (n,) and slips (n, d) of `before` for the points
         of now."""
-        old, new, pairs = before.at.copies, self.at.copies, before.pairs
-        nodes = min(old.min(initial=len(pairs.by)), new.min(initial=len(most)))  # have kept their numbers
-        now = np.full(len(pairs.by), NONE)
+        old, new, pairs = before.point_map.copies, self.point_map.copies, before.pairs
+        nodes = min(old.min(initial=len(pairs.contact_facets)), new.min(initial=len(most)))  # have kept their numbers
+        now = np.full(len(pairs.contact_facets), NONE)
         now[:nodes] = np.arange(nodes)
         again = match_points(before._identity(), self._identity())
         now[old[again >= 0]] = new[again[again >= 0]]
-        held, by = np.zeros(len(most)), np.full((len(most), pairs.by.shape[1]), NONE)
+        held, by = np.zeros(len(most)), np.full((len(most), pairs.contact_facets.shape[1]), NONE)
         slip = np.zeros(by.shape)
-        which = np.flatnonzero((now >= 0) & (pairs.held > 0))
-        corners = pairs.by[which]
-        by[now[which]], held[now[which]] = np.where(corners >= 0, now[corners], NONE), pairs.held[which]
+        which = np.flatnonzero((now >= 0) & (pairs.contact_stiffness > 0))
+        corners = pairs.contact_facets[which]
+        by[now[which]], held[now[which]] = np.where(corners >= 0, now[corners], NONE), pairs.contact_stiffness[which]
         slip[now[which]] = pairs.slip[which]
         return by, np.minimum(held, most), slip
 
 
-class ExplicitSelfContact(SelfContact):
+class PenaltySelfContact(SelfContact):
     """A body that explicit steps keep apart from itself."""
 
-    _surface: Pushes | None
-    _rubbing: Sticking | None  # type: ignore[assignment]
+    _surface: PenaltyContactSurface | None
+    _friction: SelfFrictionSprings | None  # type: ignore[assignment]
     # displacements (owned dofs,) where nothing was near, m; None: something was; and how far from there nothing is, m
-    _since: Values | None = None
-    _room = 0.0
-    _age = 0  # surfaces that there have been
+    _idle_displacement: Values | None = None
+    _idle_clearance = 0.0
+    _surface_count = 0  # surfaces that there have been
     _idle: bool | None = None  # at the current u; None: not known yet
 
-    def __init__(self, domain: Domain, u: fem.Function, law: Law, mass: Values, most: float) -> None:
+    def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw, mass: Values, most: float) -> None:
         """`mass`: (owned dofs,) lumped, kg; `most`: what contact may add to the square of the highest frequency, 1/s^2.
 
         InputError where the surface at rest cuts itself (collective).
         """
-        gathered = gathering(domain, law)(mass.reshape(-1, domain.dim))
+        gathered = node_gather(domain, law)(mass.reshape(-1, domain.dim))
         self._mass, self._most = None if gathered is None else gathered[:, 0].copy(), most
-        self._friction, self._lost = law.friction, 0.0
+        self._coefficient, self._friction_loss = law.friction, 0.0
         super().__init__(domain, u, replace(law, friction=0.0))  # that of implicit steps
 
-    def _made(self, pattern: npt.NDArray[np.uint8], u: Values, cut: Values | None) -> Surface:
+    def _build_surface(self, pattern: npt.NDArray[np.uint8], u: Values, cut: Values | None) -> SelfContactSurface:
         assert self._skeleton is not None and self._mass is not None
-        return Pushes(self._skeleton, pattern, self.law, u, self._surface, cut, mass=self._mass, most=self._most)
+        return PenaltyContactSurface(
+            self._skeleton, pattern, self.law, u, self._surface, cut, mass=self._mass, most=self._most
+        )
 
     def stiffen_contact(self) -> float:
         """A penalty knows no gap that is all but closed."""
@@ -183,14 +188,14 @@ class ExplicitSelfContact(SelfContact):
 
     def begin_step(self, level: TimeLevel) -> None:
         """As of SelfContact."""
-        idle, self._lost = self._is_idle(), 0.0 if level.dt else self._lost
+        idle, self._friction_loss = self._is_idle(), 0.0 if level.dt else self._friction_loss
         if idle:
-            self._level, self._moved, self._idle = level, True, None
+            self._level, self._is_stale, self._idle = level, True, None
         else:
             super().begin_step(level)
-        if self._friction and self._surface is not None:
-            start = self._start if level.dt and not idle else None
-            self._rubbing = Sticking(self._surface.pairs, self._friction, start)
+        if self._coefficient and self._surface is not None:
+            start = self._start_positions if level.dt and not idle else None
+            self._friction = SelfFrictionSprings(self._surface.pairs, self._coefficient, start)
 
     def update_displacement(self) -> None:
         """What touches has to be found anew."""
@@ -200,32 +205,35 @@ class ExplicitSelfContact(SelfContact):
     def _is_idle(self) -> bool:
         """Whether nothing can be in touch with the body where it is (collective)."""
         if self._idle is None:
-            self._idle = self._since is not None and self._gone(self._since) <= self._room
+            self._idle = (
+                self._idle_displacement is not None
+                and self._max_approach(self._idle_displacement) <= self._idle_clearance
+            )
         return self._idle
 
-    def _gone(self, since: Values) -> float:
+    def _max_approach(self, since: Values) -> float:
         """m, by how much any two nodes may have come closer: the diagonal of a box around their ways (collective)."""
         way = (self._u.x.array[: self._owned] - since).reshape(-1, self._domain.dim)
         ends = np.concatenate([way.min(axis=0, initial=np.inf), -way.max(axis=0, initial=-np.inf)])
         self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
         return float(np.linalg.norm(ends.reshape(2, -1).sum(axis=0)))
 
-    def _look(self) -> None:
+    def _measure_clearance(self) -> None:
         """Note by how much nodes may come closer from here on before anything is near (collective)."""
-        x = self._places()
+        x = self._end_positions()
 
         def room() -> float:
             assert self._surface is not None and x is not None
-            share, out, _ = self._surface.memory()
+            share, out, _ = self._surface.snapshot()
             if len(out) or np.any(share < 1):
                 return 0.0
-            return self._surface.pairs.room(x) / float(abs(self._surface.at.weights).sum(axis=1).max())
+            return self._surface.pairs.clearance(x) / float(abs(self._surface.point_map.weights).sum(axis=1).max())
 
-        self._room = from_root(self.comm, room)
-        self._since = self._u.x.array[: self._owned].copy() if self._room else None
+        self._idle_clearance = from_root(self.comm, room)
+        self._idle_displacement = self._u.x.array[: self._owned].copy() if self._idle_clearance else None
 
     def _rebuild(self) -> None:
-        self._since, self._idle, self._age = None, None, self._age + 1
+        self._idle_displacement, self._idle, self._surface_count = None, None, self._surface_count + 1
         super()._rebuild()
 
     # --- what it adds to the balance ---
@@ -235,7 +243,7 @@ class ExplicitSelfContact(SelfContact):
         if self._is_idle():
             return None
         forces = super().contact_forces()
-        self._look()
+        self._measure_clearance()
         return forces
 
     def reference_forces(self) -> Values | None:  # type: ignore[override]
@@ -246,22 +254,22 @@ class ExplicitSelfContact(SelfContact):
         """Energy of the penalty, and of the springs of friction, at the current u, on rank 0, J (collective)."""
         if self._is_idle():
             return 0.0
-        energy, x = super().stored_energy(), self._places()
-        return energy if self._rubbing is None or x is None else energy + self._rubbing.energy(x)
+        energy, x = super().stored_energy(), self._end_positions()
+        return energy if self._friction is None or x is None else energy + self._friction.energy(x)
 
     def step_work(self) -> tuple[float, float]:
         """What friction takes, on rank 0, J."""
-        return 0.0, self._lost
+        return 0.0, self._friction_loss
 
     def frequency_bound(self) -> float:
         """What contact adds at most, were all points in touch that are near, 1/s^2 (collective)."""
         if self._is_idle():
             return 0.0
-        x = self._places()
+        x = self._end_positions()
 
         def found() -> float:
             assert self._surface is not None and x is not None
-            return self._surface.pairs.fastest(x, self._surface.at.weights, self._surface.mass)
+            return self._surface.pairs.max_added_frequency(x, self._surface.point_map.weights, self._surface.mass)
 
         return from_root(self.comm, found)
 
@@ -269,31 +277,35 @@ class ExplicitSelfContact(SelfContact):
         """The step is over: what is pushed is known from here on (collective)."""
         if self._is_idle():
             return
-        x = self._places()
+        x = self._end_positions()
 
         def noted() -> None:
             assert self._surface is not None and x is not None
             slips = None
-            if self._rubbing is not None:
-                slips, self._lost = self._rubbing.slips(x), self._rubbing.lost(x)
-            self._surface.pairs.arrive(x, slips)
+            if self._friction is not None:
+                slips, self._friction_loss = self._friction.slips(x), self._friction.dissipated(x)
+            self._surface.pairs.end_step(x, slips)
 
         on_root(self.comm, noted)
 
     def snapshot(self) -> object:
         """With what is pushed."""
-        pushed = self._surface and (self._surface.pairs.by, self._surface.pairs.held, self._surface.pairs.slip)
-        return super().snapshot(), pushed, (self._since, self._room, self._age)
+        pushed = self._surface and (
+            self._surface.pairs.contact_facets,
+            self._surface.pairs.contact_stiffness,
+            self._surface.pairs.slip,
+        )
+        return super().snapshot(), pushed, (self._idle_displacement, self._idle_clearance, self._surface_count)
 
     def restore(self, memory: object) -> None:
         """Be again what `memory` gave of this surface (not collective)."""
         surface, pushed, idle = cast("tuple[object, tuple[Ints, Values, Values] | None, _Idle]", memory)
         super().restore(surface)
-        if self._surface is not None and pushed is not None and pushed[1] is not self._surface.pairs.held:
-            self._surface.pairs.hold(*pushed)
-        self._since, self._room, age = idle
-        if age != self._age:  # edges have broken since: it is another surface
-            self._since = None
+        if self._surface is not None and pushed is not None and pushed[1] is not self._surface.pairs.contact_stiffness:
+            self._surface.pairs.set_contacts(*pushed)
+        self._idle_displacement, self._idle_clearance, age = idle
+        if age != self._surface_count:  # edges have broken since: it is another surface
+            self._idle_displacement = None
         self._idle = None
 
     def to_checkpoint(self) -> dict[str, Values]:
@@ -301,12 +313,16 @@ class ExplicitSelfContact(SelfContact):
         if self._surface is None:
             return super().to_checkpoint() | {"by": np.empty((0, 0)), "held": np.empty(0), "slip": np.empty((0, 0))}
         pairs = self._surface.pairs
-        return super().to_checkpoint() | {"by": pairs.by.astype(float), "held": pairs.held, "slip": pairs.slip}
+        return super().to_checkpoint() | {
+            "by": pairs.contact_facets.astype(float),
+            "held": pairs.contact_stiffness,
+            "slip": pairs.slip,
+        }
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Be again what `saved` gave."""
-        self._since = self._idle = None
+        self._idle_displacement = self._idle = None
         super().from_checkpoint(saved)
         if self._surface is not None and "by" in saved:
             slip = saved.get("slip", np.zeros(saved["by"].shape))
-            self._surface.pairs.hold(saved["by"].astype(np.int64), saved["held"], slip)
+            self._surface.pairs.set_contacts(saved["by"].astype(np.int64), saved["held"], slip)

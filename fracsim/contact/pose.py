@@ -52,7 +52,7 @@ class Pose:
     rotation: Values
 
     @classmethod
-    def at(cls, centre: Values) -> Pose:
+    def at_point(cls, centre: Values) -> Pose:
         """Not turned."""
         return cls(np.asarray(centre, float), np.eye(len(centre)))
 
@@ -77,13 +77,13 @@ class Pose:
         """(n, d, d) R A R^T."""
         return np.asarray(self.rotation @ A @ self.rotation.T)
 
-    def turned(self) -> Values:
+    def rotation_vector(self) -> Values:
         """(1,) or (3,) angle or rotation vector of R, rad, at most half a turn."""
         if self.dim == 3:
             return np.asarray(Rotation.from_matrix(self.rotation).as_rotvec())
         return np.arctan2(self.rotation[1:, 0], self.rotation[:1, 0])
 
-    def moved(self, q: Values) -> Pose:
+    def incremented(self, q: Values) -> Pose:
         """The pose after an increment q = (t, w); the rotation stays one to round-off however often this is done."""
         t, w = q[: self.dim], q[self.dim :]
         if self.dim == 3:
@@ -93,13 +93,13 @@ class Pose:
         cos, sin = np.cos(angle), np.sin(angle)
         return Pose(self.centre + t, np.array([[cos, -sin], [sin, cos]]))
 
-    def way_to(self, other: Pose) -> Values:
+    def increment_to(self, other: Pose) -> Values:
         """(p,) the increment that leads from here to another pose, with a turn of half a turn at most."""
-        w = Pose(other.centre, other.rotation @ self.rotation.T).turned()
+        w = Pose(other.centre, other.rotation @ self.rotation.T).rotation_vector()
         return np.concatenate([other.centre - self.centre, w])
 
 
-def turned(y: Values, w: Values) -> Values:
+def rotate_vectors(y: Values, w: Values) -> Values:
     """(n, d) exp(w) y of vectors y (n, d), each turned by its own angle w (n, 1) or rotation vector w (n, 3), rad."""
     if y.shape[1] == 3:
         return np.asarray(Rotation.from_rotvec(w).apply(y)) if len(y) else y
@@ -107,7 +107,7 @@ def turned(y: Values, w: Values) -> Values:
     return np.stack([cos * y[:, 0] - sin * y[:, 1], sin * y[:, 0] + cos * y[:, 1]], axis=1)
 
 
-def turning(y: Values) -> Values:
+def rotation_derivative(y: Values) -> Values:
     """(n, d, p) G(y): a body that turns by w sees the fixed points y (n, d) move by G(y) w = -w x y; p = 1 or 3."""
     if y.shape[1] == 2:
         return np.stack([y[:, 1], -y[:, 0]], axis=1)[:, :, None]
@@ -118,15 +118,15 @@ def turning(y: Values) -> Values:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PosedShape:
     """A shape at a pose; all points are points of space, (n, d) in m, p = 3 in 2D and 6 in 3D."""
 
     shape: Shape
     pose: Pose
 
-    def felt(self, q: Values) -> Values:
+    def effective_increment(self, q: Values) -> Values:
         """(p,) what gaps feel of an increment of the pose: no turn of what is round."""
-        if not self.shape.round:
+        if not self.shape.rotation_invariant:
             return q
         return np.concatenate([q[: self.pose.dim], 0 * q[self.pose.dim :]])
 
@@ -142,7 +142,7 @@ class Placed:
         """(n, d, d) Hessian of the distance, 1/m."""
         return self.pose.tensors_to_space(self.shape.curvature(self.pose.to_body(x)))
 
-    def beyond(self, x: Values) -> float:
+    def distance_bound(self, x: Values) -> float:
         """m, no point of x (n, d), nor any place between them, is nearer than this: a convex distance lies above its
         tangent, over the box around the points too."""
         if not len(x):
@@ -155,19 +155,19 @@ class Placed:
         n = self.normal(nearest)
         return float((self.distance(nearest) + np.minimum(n * (lower - nearest), n * (upper - nearest)).sum()).item())
 
-    def by_pose(self, x: Values) -> Values:
+    def pose_gradient(self, x: Values) -> Values:
         """(n, p) derivative of the distance of fixed points with respect to q = (t, w)."""
         n = self.normal(x)
-        by_turn = np.einsum("nip,ni->np", turning(x - self.pose.centre), n)
+        by_turn = np.einsum("nip,ni->np", rotation_derivative(x - self.pose.centre), n)
         return np.concatenate([-n, by_turn], axis=1)
 
-    def by_point_and_pose(self, x: Values) -> Values:
+    def mixed_hessian(self, x: Values) -> Values:
         """(n, d, p) second derivative with respect to the point and q."""
-        H, G = self.curvature(x), turning(x - self.pose.centre)
-        return np.concatenate([-H, H @ G - turning(self.normal(x))], axis=2)
+        H, G = self.curvature(x), rotation_derivative(x - self.pose.centre)
+        return np.concatenate([-H, H @ G - rotation_derivative(self.normal(x))], axis=2)
 
 
-def second_order_turn(n: Values, y: Values) -> Values:
+def rotation_second_derivative(n: Values, y: Values) -> Values:
     """(n, p, p) second derivative of n . exp(-w) y at w = 0."""
     along = np.einsum("ni,ni->n", n, y)[:, None, None]
     if n.shape[1] == 2:
@@ -176,7 +176,7 @@ def second_order_turn(n: Values, y: Values) -> Values:
     return (ny + ny.transpose(0, 2, 1)) / 2 - along * np.eye(3)
 
 
-def least_distance(obstacles: Sequence[Placed], x: Values) -> Values:
+def min_distance(obstacles: Sequence[PosedShape], x: Values) -> Values:
     """(n,) of points x (n, d) to the nearest of several shapes, m."""
     return np.asarray(np.min([placed.distance(x) for placed in obstacles], axis=0))
 
@@ -187,7 +187,7 @@ _A, _B = ([(-1.0) ** k / factorial(2 * k + extra) for k in _POWERS] for extra in
 _A_SLOPE, _B_SLOPE = ([2 * (k + 1) * series[k + 1] for k in _POWERS[:-1]] for series in (_A, _B))
 
 
-def jacobian(w: Values) -> Values:
+def left_jacobian(w: Values) -> Values:
     """(r, r) J(w), r = 1 or 3 numbers of a turn."""
     if len(w) == 1:
         return np.ones((1, 1))
@@ -196,7 +196,7 @@ def jacobian(w: Values) -> Values:
     return result
 
 
-def bend(w: Values, moment: Values) -> Values:
+def left_jacobian_derivative(w: Values, moment: Values) -> Values:
     """(r, r) symmetric part of the derivative of J(w)^T m by w, the moment m (r,) held."""
     if len(w) == 1:
         return np.zeros((1, 1))

@@ -27,21 +27,21 @@ from mpi4py import MPI
 from ..forms.schemes import Scheme
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
-from .laws import Law
-from .node_contact import Touch
-from .obstacle import FreeObstacle, Obstacle
-from .obstacle_pairs import Stops
-from .pose import Placed
-from .rigid_body import RigidStep, is_positive
-from .rigid_obstacle_state import Flights
-from .rigid_pose import Around, FreePose, Mutual
+from .laws import ObstacleLaw
+from .node_contact import ContactForces
+from .obstacle import FreeObstacle, RigidObstacle
+from .obstacle_pairs import ObstaclePairs
+from .pose import PosedShape
+from .rigid_body import RigidStep, is_positive_definite
+from .rigid_obstacle_state import FreeObstacleBase
+from .rigid_pose import BodySurroundings, CondensedPose, FreeObstacleSystem
 
 Values = npt.NDArray[np.float64]
 
 WALKS = 4  # until what is held back is let go, whatever it presses on
 
 
-class FreeObstacles(Flights):
+class FreeObstacleTerm(FreeObstacleBase):
     """Obstacles, at least one of them free.
 
     Attributes:
@@ -49,116 +49,127 @@ class FreeObstacles(Flights):
     """
 
     leaves_tangent_incomplete = True
-    free: dict[int, FreePose]
+    free: dict[int, CondensedPose]
 
     def __init__(
-        self, domain: Domain, u: fem.Function, obstacles: Sequence[Obstacle], law: Law, scheme: Scheme
+        self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw, scheme: Scheme
     ) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""
         others = {number: each for number, each in enumerate(obstacles) if not each.free}
         self.free = {
-            number: FreePose(each, Stops(each, others, law.barrier))
+            number: CondensedPose(each, ObstaclePairs(each, others, law.barrier))
             for number, each in enumerate(obstacles)
             if isinstance(each, FreeObstacle)
         }
-        self._scheme, self._mutual = scheme, Mutual(self.free, law.barrier) if len(self.free) > 1 else None
-        self._settled_at: Values | None = None  # places of the points that poses belong to
-        self._begins = False  # whether Newton's method begins: nothing has given way to anything yet
-        self._waits = 0.0  # share of their way to where they belong that free obstacles are held back from
-        self._walks = 0  # on which they have been held back
+        self._scheme, self._free_system = (
+            scheme,
+            FreeObstacleSystem(self.free, law.barrier) if len(self.free) > 1 else None,
+        )
+        self._equilibrium_positions: Values | None = None  # places of the points that poses belong to
+        self._is_first_evaluation = False  # whether Newton's method begins: nothing has given way to anything yet
+        self._held_fraction = 0.0  # share of their way to where they belong that free obstacles are held back from
+        self._hold_count = 0  # on which they have been held back
         super().__init__(domain, u, obstacles, law)
 
     # --- a step ---
 
-    def _start_of_step(self) -> None:
-        super()._start_of_step()
-        level, self._settled_at = self._level, None
+    def _begin_new_step(self) -> None:
+        super()._begin_new_step()
+        level, self._equilibrium_positions = self._level, None
         for number, each in self.free.items():
             step = RigidStep(
-                each.body, each.flight, self._scheme, level.dt, level.c_a, level.fraction, level.contact_weights.factor
+                each.body, each.motion, self._scheme, level.dt, level.c_a, level.fraction, level.contact_weights.factor
             )
-            self._course.ways[number] = each.begin(step, self._grips[number])
-            each.stops.begin(each.flight.pose, self._course.at_start, along=level.contact_weights.time_averaged)
-        if self._mutual is not None:
-            self._mutual.begin(along=level.contact_weights.time_averaged)
+            self._kinematics.increments[number] = each.begin_step(step, self._lagged[number])
+            along = level.contact_weights.time_averaged
+            each.obstacle_pairs.begin_step(each.motion.pose, self._kinematics.start_posed, along=along)
+        if self._free_system is not None:
+            self._free_system.begin_step(along=level.contact_weights.time_averaged)
 
     def accept_step(self) -> None:
         """The step is over: obstacles have the momentum that it gave them (collective)."""
         super().accept_step()
-        found, others = self.touching(), {} if self._mutual is None else self._mutual.forces()
+        found, others = self.obstacle_forces(), {} if self._free_system is None else self._free_system.wrenches()
         for number, each in self.free.items():
-            each.arrive(found[number], self._around(number), others.get(number, 0.0))
+            each.end_step(found[number], self._surroundings(number), others.get(number, 0.0))
 
     # --- where free obstacles are ---
 
-    def touching(self) -> list[Touch]:
+    def obstacle_forces(self) -> list[ContactForces]:
         """What each obstacle does at the current u, free ones where they belong then (collective)."""
-        if self._touches is None and self._is_under_way():
-            self.x = self.skin.places(self._at_end())
-            if not self.comm.allreduce(_same(self.x, self._settled_at), op=MPI.LAND):
-                self._settled_at = self.x
-                if self._begins:
-                    self._walk()
-                elif not self._waits:
-                    self._settle()
-                self._place()
-        return super().touching()
+        if self._contact_forces is None and self._in_step():
+            self.positions = self.surface.positions(self._end_displacement())
+            if not self.comm.allreduce(_same(self.positions, self._equilibrium_positions), op=MPI.LAND):
+                self._equilibrium_positions = self.positions
+                if self._is_first_evaluation:
+                    self._approach_equilibrium()
+                elif not self._held_fraction:
+                    self._equilibrate()
+                self._update_kinematics()
+        return super().obstacle_forces()
 
-    def _set_off(self) -> None:
+    def _reset_equilibrium(self) -> None:
         """Newton's method begins, with poses that belong to no points yet."""
-        self._settled_at, self._begins, self._waits, self._walks = None, True, 0.0, 0
+        self._equilibrium_positions, self._is_first_evaluation, self._held_fraction, self._hold_count = (
+            None,
+            True,
+            0.0,
+            0,
+        )
 
-    def _walk(self) -> None:
+    def _approach_equilibrium(self) -> None:
         """To where all belong, or as far as closes no gap by more than is safe: before a body that has not given way
         yet what is heavy would come to rest a hair's breadth away, with a force that tells nothing (collective)."""
-        self._begins = False
+        self._is_first_evaluation = False
         began = {number: each.z for number, each in self.free.items()}
-        self._settle()
+        self._equilibrate()
         ways = {number: each.z - began[number] for number, each in self.free.items()}
-        arounds = self._arounds()
-        if self._mutual is not None:
-            share = self._mutual.free(arounds, began, ways)
+        arounds = self._all_surroundings()
+        if self._free_system is not None:
+            share = self._free_system.free_fraction(arounds, began, ways)
         else:
-            share = min(each.free(arounds[k], began[k], ways[k]) for k, each in self.free.items())
-        self._walks += 1
-        if self._walks == WALKS:
+            share = min(each.free_fraction(arounds[k], began[k], ways[k]) for k, each in self.free.items())
+        self._hold_count += 1
+        if self._hold_count == WALKS:
             share = 1.0
-        self._waits = 1 - share
+        self._held_fraction = 1 - share
         for number, each in self.free.items():
-            each.put(began[number] + share * ways[number])
+            each.move_to(began[number] + share * ways[number])
             if share < 1:
-                each.forget_push()
+                each.discard_derivatives()
 
-    def _settle(self) -> None:
+    def _equilibrate(self) -> None:
         """All are where they belong with the points where they are now (collective)."""
-        if self._mutual is not None:
-            return self._mutual.settle(self._arounds())
+        if self._free_system is not None:
+            return self._free_system.equilibrate(self._all_surroundings())
         for number, each in self.free.items():
-            each.settle(self._around(number))
+            each.equilibrate(self._surroundings(number))
 
-    def _arounds(self) -> dict[int, Around]:
-        return {number: self._around(number) for number in self.free}
+    def _all_surroundings(self) -> dict[int, BodySurroundings]:
+        return {number: self._surroundings(number) for number in self.free}
 
-    def _is_under_way(self) -> bool:
+    def _in_step(self) -> bool:
         """Whether this is no mere look, and the step that began is not over yet."""
-        return bool(self._level.dt) and all(each.is_under_way for each in self.free.values())
+        return bool(self._level.dt) and all(each.in_step for each in self.free.values())
 
-    def _around(self, number: int) -> Around:
-        return self._around_at(number, self.x)
+    def _surroundings(self, number: int) -> BodySurroundings:
+        return self._surroundings_at(number, self.positions)
 
-    def _around_at(self, number: int, x: Values) -> Around:
-        return Around(self.skin, x, partial(self._feel, number), self._facets(number), self._course.placed)
+    def _surroundings_at(self, number: int, x: Values) -> BodySurroundings:
+        return BodySurroundings(
+            self.surface, x, partial(self._evaluate_obstacle, number), self._facets_for(number), self._kinematics.posed
+        )
 
-    def _place(self) -> None:
+    def _update_kinematics(self) -> None:
         """All see free obstacles where they are."""
         for number, each in self.free.items():
-            self._course.placed[number] = each.placed
+            self._kinematics.posed[number] = each.posed
 
-    def _under(self, number: int, placed: Placed) -> Values:
-        held = self._grips[number]
+    def _contact_point_motion(self, number: int, placed: PosedShape) -> Values:
+        held = self._lagged[number]
         if number not in self.free or held is None:
-            return super()._under(number, placed)
-        return self.free[number].under(held, placed)
+            return super()._contact_point_motion(number, placed)
+        return self.free[number].contact_point_motion(held, placed)
 
     # --- what they add to the balance ---
 
@@ -167,114 +178,121 @@ class FreeObstacles(Flights):
         energy, level = super().potential(), self._level
         if self.comm.rank == 0 and level.dt:
             for each in self.free.values():
-                _, stopped = each.stops.energies(each.placed.pose, self._course.placed)
-                energy += each.step.own(each.z) + level.contact_weight * level.fraction * stopped
-            if self._mutual is not None:
-                energy += level.contact_weight * level.fraction * self._mutual.energies()[1]
+                _, stopped = each.obstacle_pairs.energies(each.posed.pose, self._kinematics.posed)
+                energy += each.step.free_potential(each.z) + level.contact_weight * level.fraction * stopped
+            if self._free_system is not None:
+                energy += level.contact_weight * level.fraction * self._free_system.energies()[1]
         return energy
 
     def stored_energy(self) -> float:
         """That of all obstacles, with the barriers between them on rank 0, J (collective)."""
         energy = super().stored_energy()
         if self.comm.rank == 0:
-            placed = self._course.placed
-            energy += sum(each.stops.energies(each.placed.pose, placed)[0] for each in self.free.values())
-            energy += 0.0 if self._mutual is None else self._mutual.energies()[0]
+            placed = self._kinematics.posed
+            energy += sum(each.obstacle_pairs.energies(each.posed.pose, placed)[0] for each in self.free.values())
+            energy += 0.0 if self._free_system is None else self._free_system.energies()[0]
         return energy
 
     def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """Phi_xz and Phi_zz^-1 of each obstacle that is touched and under way (collective)."""
-        if not self._is_under_way() or not (touches := self.touching()) or self._waits:
+        if not self._in_step() or not (touches := self.obstacle_forces()) or self._held_fraction:
             return []
         counts = sum_over_ranks(self.comm, np.array([len(touches[number].points) for number in self.free]))
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
-        if self._mutual is not None and touched:
-            U = np.concatenate([self._mixed(number, touches[number]) for number in self.free], axis=1)
-            return [(U, self._mutual.compliance(self._arounds(), exact=self._exact))]
-        return [(self._mixed(number, touches[number]), self._compliance(number)) for number in touched]
+        if self._free_system is not None and touched:
+            U = np.concatenate([self._mixed_block(number, touches[number]) for number in self.free], axis=1)
+            return [(U, self._free_system.compliance(self._all_surroundings(), exact=self._tangent_is_exact))]
+        return [(self._mixed_block(number, touches[number]), self._compliance(number)) for number in touched]
 
-    def _mixed(self, number: int, found: Touch) -> Values:
+    def _mixed_block(self, number: int, found: ContactForces) -> Values:
         """(owned dofs, k) Phi_xz (collective)."""
-        by_z = self.free[number].by_z(found, self.x, exact=self._exact)
-        forces = np.zeros((len(self.x), *by_z.shape[1:]))
+        by_z = self.free[number].mixed_block(found, self.positions, exact=self._tangent_is_exact)
+        forces = np.zeros((len(self.positions), *by_z.shape[1:]))
         forces[found.points] = by_z
-        return np.stack([self.skin.follow.assemble_to_nodes(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
+        to_nodes = self.surface.interpolation.assemble_to_nodes
+        return np.stack([to_nodes(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
 
     def _compliance(self, number: int) -> Values:
         """(k, k) Phi_zz^-1 (collective)."""
-        resistance = self.free[number].resistance(self._around(number), exact=self._exact)
+        resistance = self.free[number].hessian(self._surroundings(number), exact=self._tangent_is_exact)
         return np.asarray(np.linalg.inv(resistance), np.float64)
 
-    def _may_be_exact(self, moved: float) -> bool:
+    def _exact_tangent_allowed(self, moved: float) -> bool:
         """And all free obstacles stand where the potential is least (collective)."""
-        if not super()._may_be_exact(moved):
+        if not super()._exact_tangent_allowed(moved):
             return False
-        if self._mutual is not None:
-            return is_positive(self._mutual.resistance(self._arounds(), exact=True))
-        return all(is_positive(each.resistance(self._around(k), exact=True)) for k, each in self.free.items())
+        if self._free_system is not None:
+            return is_positive_definite(self._free_system.hessian(self._all_surroundings(), exact=True))
+        return all(
+            is_positive_definite(each.hessian(self._surroundings(k), exact=True)) for k, each in self.free.items()
+        )
 
-    def _pressed(self, number: int) -> float:
+    def _normal_work(self, number: int) -> float:
         if number not in self.free:
-            return super()._pressed(number)
-        return self.free[number].pressed(self.touching()[number], self.x)
+            return super()._normal_work(number)
+        return self.free[number].normal_work(self.obstacle_forces()[number], self.positions)
 
     def step_work(self) -> tuple[float, float]:
         """With the work of gravity, and of other obstacles' motion, on free ones (collective)."""
         work, lost = super().step_work()
         if self.comm.rank == 0:
             for number, each in self.free.items():
-                ends = self._course.at_start[number].pose, each.placed.pose
-                work += each.body.weight(ends[0])[0] - each.body.weight(ends[1])[0]
-                work += each.stops.work(ends[1], self._course.placed, self._course.ways)
+                ends = self._kinematics.start_posed[number].pose, each.posed.pose
+                work += each.body.gravity_potential(ends[0])[0] - each.body.gravity_potential(ends[1])[0]
+                work += each.obstacle_pairs.work(ends[1], self._kinematics.posed, self._kinematics.increments)
         return work, lost
 
     # --- how far Newton's method may go ---
 
-    def _taken_along(self, moved: Values) -> list[Values]:
+    def _obstacle_increments(self, moved: Values) -> list[Values]:
         """As Newton's method moves them together with the points (collective)."""
-        ways, found = super()._taken_along(moved), self.touching()
-        if self._waits:
+        ways, found = super()._obstacle_increments(moved), self.obstacle_forces()
+        if self._held_fraction:
             return ways
-        if self._mutual is not None:
-            every = self._mutual.taken_along(dict(enumerate(found)), self._arounds(), moved, exact=self._exact)
+        if self._free_system is not None:
+            every = self._free_system.predict_increments(
+                dict(enumerate(found)), self._all_surroundings(), moved, exact=self._tangent_is_exact
+            )
             for number, q in every.items():
                 ways[number] = q
             return ways
         for number, each in self.free.items():
-            ways[number] = each.taken_along(found[number], self._around(number), moved, exact=self._exact)
+            ways[number] = each.predict_increment(
+                found[number], self._surroundings(number), moved, exact=self._tangent_is_exact
+            )
         return ways
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) a first guess that has passed through nothing on its way from the start: free obstacles stop,
         or the body with them, before they meet (collective)."""
         u, level = super().feasible_guess(u), self._level
-        self._set_off()
+        self._reset_equilibrium()
         for each in self.free.values():
-            each.forget_way()
+            each.discard_predictor()
         if not level.dt:
             return u
-        x = self.skin.places(level.u_n)
-        moved = self.skin.places(level.displacement_at_end(u)) - x
+        x = self.surface.positions(level.u_n)
+        moved = self.surface.positions(level.displacement_at_end(u)) - x
         share, taken = 1.0, {}
         for number, each in self.free.items():
-            taken[number], free = self._first_guess(each, self._around_at(number, x), moved)
+            taken[number], free = self._first_guess(each, self._surroundings_at(number, x), moved)
             share = min(share, free)
-        if self._mutual is not None:
-            share = min(share, self._mutual.safe_guess(taken))
+        if self._free_system is not None:
+            share = min(share, self._free_system.safe_guess(taken))
         for number, z in taken.items():
-            self.free[number].put(share * z)
-        self._place()
+            self.free[number].move_to(share * z)
+        self._update_kinematics()
         return u if share == 1 else np.asarray(level.u_n + share * (u - level.u_n))
 
-    def _first_guess(self, each: FreePose, around: Around, moved: Values) -> tuple[Values, float]:
+    def _first_guess(self, each: CondensedPose, around: BodySurroundings, moved: Values) -> tuple[Values, float]:
         """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
         that way that closes no gap, with points that go by `moved` (n, d) (collective)."""
-        others = self._course.whole()
-        along = [each.led_by(way) for _, way in others.values() if way.any()]
-        ways = [each.step.ahead, 0 * each.step.ahead, *along]
+        others = self._kinematics.full_motions()
+        along = [each.carried_by(way) for _, way in others.values() if way.any()]
+        ways = [each.step.free_flight, 0 * each.step.free_flight, *along]
         first = 0.0
         for z in ways:
-            share = each.safe_share(around, moved, z, others)
+            share = each.safe_fraction(around, moved, z, others)
             if share == 1:
                 return z, 1.0
             first = min(first, share) if first else share
@@ -282,38 +300,40 @@ class FreeObstacles(Flights):
 
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u, those between obstacles as well (collective)."""
-        placed = self._course.placed
-        apart = all(each.stops.are_open(each.placed.pose, placed) for each in self.free.values())
-        return super().is_feasible(u) and apart and (self._mutual is None or self._mutual.are_open())
+        placed = self._kinematics.posed
+        apart = all(each.obstacle_pairs.are_open(each.posed.pose, placed) for each in self.free.values())
+        return super().is_feasible(u) and apart and (self._free_system is None or self._free_system.are_open())
 
     def remaining_motion(self) -> float:
         """And that of free ones which are held back (collective)."""
-        if self._begins:
-            self.touching()
-        return max(super().remaining_motion(), self._waits)
+        if self._is_first_evaluation:
+            self.obstacle_forces()
+        return max(super().remaining_motion(), self._held_fraction)
 
     def continue_motion(self) -> None:
         """Free obstacles as well (collective)."""
         super().continue_motion()
-        if self._waits:
-            self.touching()
-            self._walk()
-            self._place()
-            self._touches = None
+        if self._held_fraction:
+            self.obstacle_forces()
+            self._approach_equilibrium()
+            self._update_kinematics()
+            self._contact_forces = None
 
-    def _go_on(self, x: Values) -> None:
+    def _advance_obstacles(self, x: Values) -> None:
         """As far as free obstacles let others."""
-        rest, still = self._course.rest(), np.zeros_like(self._course.ways[0])
-        shares = [each.stops.safe_share(each.placed.pose, still, rest) for each in self.free.values()]
-        self._course.go_on(x, self._course.known(self._facets), self.skin.safe, min(shares))
-        self._touches = self._settled_at = None
+        rest, still = self._kinematics.remaining_motions(), np.zeros_like(self._kinematics.increments[0])
+        shares = [each.obstacle_pairs.safe_fraction(each.posed.pose, still, rest) for each in self.free.values()]
+        self._kinematics.advance(
+            x, self._kinematics.prescribed_motions(self._facets_for), self.surface.min_fraction, min(shares)
+        )
+        self._contact_forces = self._equilibrium_positions = None
 
     def restrict_motion(self) -> None:
         """All stay where the step began (collective)."""
         for each in self.free.values():
-            each.stay()
-        self._place()
-        self._set_off()
+            each.return_to_start()
+        self._update_kinematics()
+        self._reset_equilibrium()
         super().restrict_motion()
 
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from .tessellation import Outline
+from .tessellation import Tessellation
 
 Values = npt.NDArray[np.float64]
 FILLET = 0.05  # default radius of rounded edges, as a share of the smallest radius or half size
@@ -24,6 +24,8 @@ FILLET = 0.05  # default radius of rounded edges, as a share of the smallest rad
 
 class Shape(Protocol):
     """A shape in its own frame, centred at its reference point; d = 2 or 3, lengths in m."""
+
+    kind: ClassVar[str]  # name in messages
 
     @property
     def dim(self) -> int:
@@ -34,11 +36,11 @@ class Shape(Protocol):
         """Whether the obstacle is convex, and so the distance a convex function."""
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """Whether no turn about its reference point changes it."""
 
     @property
-    def least_radius(self) -> float:
+    def min_radius(self) -> float:
         """Least radius of curvature of its surface where that is convex, m; infinite where it nowhere is."""
 
     @property
@@ -54,7 +56,7 @@ class Shape(Protocol):
     def curvature(self, x: Values) -> Values:
         """(n, d, d) Hessian of the distance, 1/m."""
 
-    def outline(self) -> Outline:
+    def tessellate(self) -> Tessellation:
         """Points (n, d) and triangles (k, 3), in 2D segments (k, 2), that face where `normal` points."""
 
     def inertia(self, density: float) -> Values:
@@ -62,9 +64,10 @@ class Shape(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body(ABC):
+class ConvexBody(ABC):
     """A convex body; `hollow`: the obstacle is all that is outside it, as for what lies in a bowl or a container."""
 
+    kind: ClassVar[str]
     hollow: bool = False
 
     @property
@@ -89,18 +92,18 @@ class Body(ABC):
         """(n, d, d) Hessian of the distance, 1/m."""
         return self._sign * self._curvature(x)
 
-    def outline(self) -> Outline:
+    def tessellate(self) -> Tessellation:
         """Closed surface or polygon; that of a hollow body faces inwards."""
         points, elements = self._outline()
         return points, np.ascontiguousarray(elements[:, ::-1]) if self.hollow else elements
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """A ball alone is."""
         return False
 
     @property
-    def least_radius(self) -> float:
+    def min_radius(self) -> float:
         """Least radius of curvature, m; infinite of a hollow body."""
         return float("inf") if self.hollow else self._radius()
 
@@ -112,9 +115,7 @@ class Body(ABC):
     def inertia(self, density: float) -> Values:
         """rho (tr S 1 - S), S = int x x^T dV (docs/theory.md#rigid-obstacles); in 2D rho tr S."""
         if self.hollow:
-            raise InputError(
-                f"a hollow {type(self).__name__.lower()} has walls without thickness, so no inertia: hold it"
-            )
+            raise InputError(f"a hollow {self.kind} has walls without thickness, so no inertia: hold it")
         S = self._moments()[1]
         return density * (np.trace(S) * np.eye(3) - S if self.dim == 3 else np.asarray(np.trace(S)))
 
@@ -124,7 +125,7 @@ class Body(ABC):
         return self._resized(-self._sign * by)
 
     @property
-    def most_inset(self) -> float:
+    def max_inset(self) -> float:
         """m; infinite of a hollow body."""
         return float("inf") if self.hollow else self._depth() / 2
 
@@ -153,7 +154,7 @@ class Body(ABC):
     def _radius(self) -> float: ...
 
     @abstractmethod
-    def _outline(self) -> Outline: ...
+    def _outline(self) -> Tessellation: ...
 
     @abstractmethod
     def _moments(self) -> tuple[float, Values]:
@@ -169,7 +170,7 @@ def require_lengths(shape: Shape, **lengths: float) -> None:
     """InputError unless every length is positive and finite."""
     for word, value in lengths.items():
         if not 0 < value < np.inf:
-            name = type(shape).__name__.lower()
+            name = shape.kind
             raise InputError(f"the {word} of a {name} is {value}: it must be a positive number of metres")
 
 
@@ -177,11 +178,11 @@ def require_fillet(shape: Shape, rounding: float, most: float) -> None:
     """InputError unless edges have a rounding that fits; a sharp edge has no curvature that Newton could use."""
     require_lengths(shape, rounding=rounding)
     if rounding > most:
-        name = type(shape).__name__.lower()
+        name = shape.kind
         raise InputError(f"the rounding of a {name} is {rounding} m, but at most {most} m fit into it: round it less")
 
 
-def unit(direction: tuple[float, ...]) -> Values:
+def unit_vector(direction: tuple[float, ...]) -> Values:
     """(d,) the direction, of length 1; InputError where it is none."""
     vector = np.array(direction, float)
     length = float(np.linalg.norm(vector))
@@ -190,7 +191,7 @@ def unit(direction: tuple[float, ...]) -> Values:
     return np.asarray(vector / length)
 
 
-def frame(axis: Values) -> Values:
+def frame_about(axis: Values) -> Values:
     """(d, d) a rotation whose last column is the unit vector `axis` (d,)."""
     if len(axis) == 2:
         return np.array([[axis[1], axis[0]], [-axis[0], axis[1]]])
@@ -199,7 +200,7 @@ def frame(axis: Values) -> Values:
     return np.column_stack([across, np.cross(axis, across), axis])
 
 
-class Corner:
+class QuadrantDistance:
     """f(q) = |max(q, 0)| outside, max_i q_i inside, for points q (n, k); its gradient and Hessian.
 
     Offset by the rounding, f - r is exact inside the rounded body as well: a convex body grown by r is nowhere thicker.
@@ -217,18 +218,18 @@ class Corner:
         return np.where(self._inside, self._q.max(axis=1), self._length)
 
     @cached_property
-    def slope(self) -> Values:
+    def gradient(self) -> Values:
         """(n, k) gradient of f, of length 1; inside that of the nearest face."""
         nearest = np.eye(self._q.shape[1])[self._q.argmax(axis=1)]
         return np.where(self._inside[:, None], nearest, self._out / self._divisor[:, None])
 
     @cached_property
-    def curvature(self) -> Values:
+    def hessian(self) -> Values:
         """(n, k, k) Hessian of f: (diag(q >= 0) - n n^T) / f outside, 0 inside, 1/m.
 
         q = 0 counts as outside: where a core has no thickness, q is never negative and 0 on its middle plane.
         """
-        n, active = self.slope, (self._q >= 0).astype(float)
+        n, active = self.gradient, (self._q >= 0).astype(float)
         tangent = active[:, :, None] * np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         return np.where(self._inside[:, None, None], 0.0, tangent / self._divisor[:, None, None])
 

@@ -13,38 +13,39 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from ..errors import InputError
 from .shape_base import (
     FILLET,
-    Body,
-    Corner,
+    ConvexBody,
+    QuadrantDistance,
     Shape,
     Values,
-    frame,
+    frame_about,
     require_fillet,
     require_lengths,
     resized_fillet,
-    unit,
+    unit_vector,
 )
-from .tessellation import Outline, polygon, profile, revolved, rounded_block, rounded_box, surface_of_revolution
+from .tessellation import Tessellation, polygon, profile, revolved, rounded_block, rounded_box, surface_of_revolution
 
-__all__ = ["SHAPES", "Box", "Capsule", "Cylinder", "Plane", "Shape", "Sphere"]
+__all__ = ["SHAPES", "Capsule", "HalfSpace", "RoundedBox", "RoundedCylinder", "Shape", "Sphere"]
 
 
 @dataclass(frozen=True)
-class Plane:
+class HalfSpace:
     """The half space n . x <= 0, n along `direction` (d numbers of any length), which points out of it."""
 
+    kind: ClassVar[str] = "plane"
     direction: tuple[float, ...]
     extent: float = 1.0  # edge of the patch that is drawn, m
 
     def __post_init__(self) -> None:
         """InputError where it is no plane."""
-        unit(self.direction)
+        unit_vector(self.direction)
         require_lengths(self, extent=self.extent)
 
     @property
@@ -58,12 +59,12 @@ class Plane:
         return True
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """It is not."""
         return False
 
     @property
-    def least_radius(self) -> float:
+    def min_radius(self) -> float:
         """Infinite."""
         return float("inf")
 
@@ -74,19 +75,19 @@ class Plane:
 
     def distance(self, x: Values) -> Values:
         """(n,) n . x, m."""
-        return np.asarray(x @ unit(self.direction))
+        return np.asarray(x @ unit_vector(self.direction))
 
     def normal(self, x: Values) -> Values:
         """(n, d) n at every point."""
-        return np.tile(unit(self.direction), (len(x), 1))
+        return np.tile(unit_vector(self.direction), (len(x), 1))
 
     def curvature(self, x: Values) -> Values:
         """(n, d, d) zero."""
         return np.zeros((len(x), self.dim, self.dim))
 
-    def outline(self) -> Outline:
+    def tessellate(self) -> Tessellation:
         """A square patch of two triangles (in 2D one segment) about the reference point; not closed."""
-        R, h = frame(unit(self.direction)), self.extent / 2
+        R, h = frame_about(unit_vector(self.direction)), self.extent / 2
         if self.dim == 2:
             # outward is to the right of a segment, as on a counterclockwise polygon
             return np.array([[h, 0.0], [-h, 0.0]]) @ R.T, np.array([[0, 1]], np.int32)
@@ -99,7 +100,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class _Swept(Body):
+class _Swept(ConvexBody):
     """All within a radius of a segment or point, which the subclasses say."""
 
     @abstractmethod
@@ -121,7 +122,7 @@ class _Swept(Body):
         on_core = length < np.finfo(float).tiny
         if not on_core.any():
             return np.asarray(away / length[:, None])
-        some = frame(self._core()[0])[:, 0]  # on the segment itself every direction across it is as good
+        some = frame_about(self._core()[0])[:, 0]  # on the segment itself every direction across it is as good
         return np.where(on_core[:, None], some, away / np.where(on_core, 1.0, length)[:, None])
 
     def _curvature(self, x: Values) -> Values:
@@ -143,11 +144,11 @@ class _Swept(Body):
     def _resized(self, by: float) -> Self:
         return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
 
-    def _outline(self) -> Outline:
+    def _outline(self) -> Tessellation:
         axis, half, radius = self._core()
         side = profile(0.0, half, radius)
         points, elements = polygon(side) if self.dim == 2 else surface_of_revolution(side)
-        return points @ frame(axis).T, elements
+        return points @ frame_about(axis).T, elements
 
     def _moments(self) -> tuple[float, Values]:
         axis, half, radius = self._core()
@@ -158,6 +159,7 @@ class _Swept(Body):
 class Sphere(_Swept):
     """All within `radius` (m) of the centre; in 2D a disk."""
 
+    kind: ClassVar[str] = "sphere"
     radius: float
     dim: int = 3
 
@@ -168,7 +170,7 @@ class Sphere(_Swept):
             raise InputError(f"a sphere in {self.dim} dimensions is not known: dim is 2 or 3")
 
     @property
-    def round(self) -> bool:
+    def rotation_invariant(self) -> bool:
         """It is."""
         return True
 
@@ -180,13 +182,14 @@ class Sphere(_Swept):
 class Capsule(_Swept):
     """All within `radius` of a segment of `length` along `axis`, m: from end to end length + 2 radius. 2D: stadium."""
 
+    kind: ClassVar[str] = "capsule"
     radius: float
     length: float
     axis: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         """InputError where it is no capsule."""
-        unit(self.axis)
+        unit_vector(self.axis)
         require_lengths(self, radius=self.radius, length=self.length)
 
     @property
@@ -195,17 +198,18 @@ class Capsule(_Swept):
         return len(self.axis)
 
     def _core(self) -> tuple[Values, float, float]:
-        return unit(self.axis), self.length / 2, self.radius
+        return unit_vector(self.axis), self.length / 2, self.radius
 
 
 @dataclass(frozen=True)
-class Box(Body):
+class RoundedBox(ConvexBody):
     """A box of full `size` (d numbers, m), edges rounded with `rounding` (m, default: FILLET of the least half size).
 
     From inside, as of a container, the distance is C1 within the rounding of the wall; further in, where another wall
     becomes the nearest, its gradient jumps: a barrier must be thinner than the rounding.
     """
 
+    kind: ClassVar[str] = "box"
     size: tuple[float, ...]
     rounding: float | None = None
 
@@ -231,18 +235,18 @@ class Box(Body):
         """(d,) half sizes of the sharp core that the fillet grows, m."""
         return np.array(self.size) / 2 - self.fillet
 
-    def _corner(self, x: Values) -> Corner:
-        return Corner(abs(x) - self._half())
+    def _corner(self, x: Values) -> QuadrantDistance:
+        return QuadrantDistance(abs(x) - self._half())
 
     def _distance(self, x: Values) -> Values:
         return self._corner(x).value - self.fillet
 
     def _normal(self, x: Values) -> Values:
-        return _signs(x) * self._corner(x).slope
+        return _signs(x) * self._corner(x).gradient
 
     def _curvature(self, x: Values) -> Values:
         signs = _signs(x)
-        return signs[:, :, None] * self._corner(x).curvature * signs[:, None, :]
+        return signs[:, :, None] * self._corner(x).hessian * signs[:, None, :]
 
     def _radius(self) -> float:
         return self.fillet
@@ -250,11 +254,11 @@ class Box(Body):
     def _depth(self) -> float:
         return min(self.size) / 2
 
-    def _resized(self, by: float) -> Box:
+    def _resized(self, by: float) -> RoundedBox:
         size = tuple(side + 2 * by for side in self.size)
         return replace(self, size=size, rounding=resized_fillet(self.fillet, by))
 
-    def _outline(self) -> Outline:
+    def _outline(self) -> Tessellation:
         half = self._half()
         if self.dim == 3:
             return rounded_block(half, self.fillet)
@@ -270,13 +274,14 @@ def _signs(x: Values) -> Values:
 
 
 @dataclass(frozen=True)
-class Cylinder(Body):
+class RoundedCylinder(ConvexBody):
     """A cylinder of `radius` and full `length` along `axis`, edges rounded with `rounding` (m, default FILLET radius).
 
     In the half plane through the axis it is a corner, q = (rho - (R - r), |height| - (L / 2 - r)). From inside the
     distance is C1 within the rounding of the wall, as for a box.
     """
 
+    kind: ClassVar[str] = "cylinder"
     radius: float
     length: float
     rounding: float | None = None
@@ -284,7 +289,7 @@ class Cylinder(Body):
 
     def __post_init__(self) -> None:
         """InputError where it is no cylinder."""
-        unit(self.axis)
+        unit_vector(self.axis)
         if len(self.axis) != 3:
             raise InputError("a cylinder needs an axis of 3 numbers: in 2D take a sphere (a disk) or a box")
         require_lengths(self, radius=self.radius, length=self.length)
@@ -306,25 +311,25 @@ class Cylinder(Body):
         """Radius and half length of the sharp core that the fillet grows, m."""
         return self.radius - self.fillet, self.length / 2 - self.fillet
 
-    def _polar(self, x: Values) -> tuple[Corner, Values, Values, Values]:
+    def _polar(self, x: Values) -> tuple[QuadrantDistance, Values, Values, Values]:
         """The corner, distances from the axis (n,), and unit vectors (n, d) away from the axis and up or down it."""
-        axis, (radius, half) = unit(self.axis), self._core()
+        axis, (radius, half) = unit_vector(self.axis), self._core()
         height = x @ axis
         across = x - height[:, None] * axis
         rho = np.linalg.norm(across, axis=1)
         on_axis = rho < np.finfo(float).tiny
         away = across / np.where(on_axis, 1.0, rho)[:, None]
         if on_axis.any():
-            away[on_axis] = frame(axis)[:, 0]
+            away[on_axis] = frame_about(axis)[:, 0]
         q = np.stack([rho - radius, abs(height) - half], axis=1)
-        return Corner(q), rho, away, np.where(height < 0, -1.0, 1.0)[:, None] * axis
+        return QuadrantDistance(q), rho, away, np.where(height < 0, -1.0, 1.0)[:, None] * axis
 
     def _distance(self, x: Values) -> Values:
         return self._polar(x)[0].value - self.fillet
 
     def _normal(self, x: Values) -> Values:
         corner, _, away, up = self._polar(x)
-        return corner.slope[:, :1] * away + corner.slope[:, 1:] * up
+        return corner.gradient[:, :1] * away + corner.gradient[:, 1:] * up
 
     def _curvature(self, x: Values) -> Values:
         """The corner's Hessian in the half plane, and f_rho / rho around the axis (0 on it: an end is nearest)."""
@@ -332,8 +337,8 @@ class Cylinder(Body):
         plane = np.stack([away, up], axis=1)
         around = np.cross(away, up)
         on_axis = rho < np.finfo(float).tiny
-        ring = np.where(on_axis, 0.0, corner.slope[:, 0] / np.where(on_axis, 1.0, rho))
-        bent = plane.transpose(0, 2, 1) @ corner.curvature @ plane
+        ring = np.where(on_axis, 0.0, corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
+        bent = plane.transpose(0, 2, 1) @ corner.hessian @ plane
         return np.asarray(bent + ring[:, None, None] * around[:, :, None] * around[:, None, :])
 
     def _radius(self) -> float:
@@ -342,21 +347,21 @@ class Cylinder(Body):
     def _depth(self) -> float:
         return min(self.radius, self.length / 2)
 
-    def _resized(self, by: float) -> Cylinder:
+    def _resized(self, by: float) -> RoundedCylinder:
         rounding = resized_fillet(self.fillet, by)
         return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
 
-    def _outline(self) -> Outline:
+    def _outline(self) -> Tessellation:
         radius, half = self._core()
         side = profile(radius, half, self.fillet)
         points, triangles = surface_of_revolution(side)
-        return points @ frame(unit(self.axis)).T, triangles
+        return points @ frame_about(unit_vector(self.axis)).T, triangles
 
     def _moments(self) -> tuple[float, Values]:
         radius, half = self._core()
-        return revolved(unit(self.axis), radius, half, self.fillet)
+        return revolved(unit_vector(self.axis), radius, half, self.fillet)
 
 
 SHAPES: dict[str, type[Shape]] = {
-    "plane": Plane, "sphere": Sphere, "capsule": Capsule, "box": Box, "cylinder": Cylinder,
+    "plane": HalfSpace, "sphere": Sphere, "capsule": Capsule, "box": RoundedBox, "cylinder": RoundedCylinder,
 }  # fmt: skip

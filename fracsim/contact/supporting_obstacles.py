@@ -20,15 +20,15 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from .initial_overlap import pairs
-from .laws import Law
-from .obstacle import Obstacle
-from .obstacle_pairs import Stop
-from .obstacle_term import Obstacles
-from .offset_shape import Shifted
-from .shape_base import Body, Shape
-from .shapes import Plane
-from .triangle_mesh_shape import Solid, refined
+from .initial_overlap import free_pairs
+from .laws import ObstacleLaw
+from .obstacle import RigidObstacle
+from .obstacle_pairs import ObstaclePair
+from .obstacle_term import ObstacleTerm
+from .offset_shape import TranslatedShape
+from .shape_base import ConvexBody, Shape
+from .shapes import HalfSpace
+from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
 
@@ -37,11 +37,11 @@ CLEAR = 1 + 1e-6  # times the width that a gap at rest is: round-off does not pr
 LOOKS = 4  # facets are known once their obstacles have been moved back
 
 
-def set_down[Term: Obstacles](
+def build_inactive_at_rest[Term: ObstacleTerm](
     domain: Domain,
-    obstacles: Sequence[Obstacle],
-    law: Law,
-    made: Callable[[Sequence[Obstacle], Law], Term],
+    obstacles: Sequence[RigidObstacle],
+    law: ObstacleLaw,
+    made: Callable[[Sequence[RigidObstacle], ObstacleLaw], Term],
     *,
     mutual: bool,
 ) -> Term:
@@ -56,8 +56,8 @@ def set_down[Term: Obstacles](
     for look in range(LOOKS):
         width = min(law.barrier.width, float((gaps + most).min()) / CLEAR)
         by = np.clip(CLEAR * width - gaps, 0.0, most)
-        term = made([moved_back(*each) for each in zip(obstacles, by, strict=True)], _narrowed(law, width))
-        found = term.gaps_at_rest()
+        term = made([offset_obstacle(*each) for each in zip(obstacles, by, strict=True)], _narrowed(law, width))
+        found = term.rest_gaps()
         if look == LOOKS - 1 or (found >= width).all():
             break
         term.destroy()
@@ -65,67 +65,67 @@ def set_down[Term: Obstacles](
     return term
 
 
-def before_solids(
-    others: dict[int, Obstacle], free: Sequence[Obstacle], width: float, edge: float
-) -> dict[int, Obstacle]:
+def offset_from_meshes(
+    others: dict[int, RigidObstacle], free: Sequence[RigidObstacle], width: float, edge: float
+) -> dict[int, RigidObstacle]:
     """The obstacles that free ones from files feel with their points, moved back so that barriers of this width, m, do
     not act at rest; by their numbers. `edge`: m, to which triangles of files are cut."""
     x, moved = [], {}
     for each in free:
-        assert isinstance(each.shape, Solid)
-        points, _ = refined(each.shape.points, each.shape.triangles, edge)
-        x.append(each.placed(0.0).pose.points_to_space(points))
+        assert isinstance(each.shape, TriangleMeshShape)
+        points, _ = refine_triangles(each.shape.points, each.shape.triangles, edge)
+        x.append(each.posed_at(0.0).pose.points_to_space(points))
     for number, each in others.items():
-        gap = min(float(each.placed(0.0).distance(points).min()) for points in x)
+        gap = min(float(each.posed_at(0.0).distance(points).min()) for points in x)
         by = min(max(CLEAR * width - gap, 0.0), _most(each.shape))
-        moved[number] = moved_back(each, by if gap >= 0 else 0.0)
+        moved[number] = offset_obstacle(each, by if gap >= 0 else 0.0)
     return moved
 
 
-def moved_back(obstacle: Obstacle, by: float) -> Obstacle:
+def offset_obstacle(obstacle: RigidObstacle, by: float) -> RigidObstacle:
     """The obstacle with its surface `by` m further from what is outside it; its mass and inertia stay."""
     shape = obstacle.shape
     if not by:
         return obstacle
-    if isinstance(shape, Plane):
-        return replace(obstacle, at=obstacle.at - by * shape.normal(obstacle.at[None])[0])
-    if isinstance(shape, Shifted):
-        return replace(obstacle, shape=Shifted(_inset(shape.shape, by), shape.offset))
+    if isinstance(shape, HalfSpace):
+        return replace(obstacle, start_point=obstacle.start_point - by * shape.normal(obstacle.start_point[None])[0])
+    if isinstance(shape, TranslatedShape):
+        return replace(obstacle, shape=TranslatedShape(_inset(shape.shape, by), shape.offset))
     return replace(obstacle, shape=_inset(shape, by))
 
 
 def _inset(shape: Shape, by: float) -> Shape:
-    assert isinstance(shape, Body)
+    assert isinstance(shape, ConvexBody)
     return shape.inset(by)
 
 
 def _most(shape: Shape) -> float:
     """By how much a shape can be moved back, m."""
-    inner = shape.shape if isinstance(shape, Shifted) else shape
-    return inner.most_inset if isinstance(inner, Body) else float("inf")
+    inner = shape.shape if isinstance(shape, TranslatedShape) else shape
+    return inner.max_inset if isinstance(inner, ConvexBody) else float("inf")
 
 
-def _narrowed(law: Law, width: float) -> Law:
+def _narrowed(law: ObstacleLaw, width: float) -> ObstacleLaw:
     """The law with this width, m."""
     if width == law.barrier.width:
         return law
     return replace(law, barrier=replace(cast("Any", law.barrier), width=width))
 
 
-def _gaps_to_nodes(domain: Domain, obstacles: Sequence[Obstacle]) -> Values:
+def _gaps_to_nodes(domain: Domain, obstacles: Sequence[RigidObstacle]) -> Values:
     """(obstacles,) least distances to nodes at t = 0, m, infinite where one overlaps the body (collective)."""
-    every = [each.placed(0.0) for each in obstacles]
+    every = [each.posed_at(0.0) for each in obstacles]
     gaps = np.array([float(each.distance(domain.nodes).min(initial=np.inf)) for each in every])
     domain.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
     return np.where(gaps < -ROUND_OFF * domain.size, np.inf, gaps)
 
 
-def _lower_to_others(gaps: Values, obstacles: Sequence[Obstacle]) -> None:
+def _lower_to_others(gaps: Values, obstacles: Sequence[RigidObstacle]) -> None:
     """Gaps (obstacles,) of free ones are no more than those to what they feel among the others, m."""
-    for a, b in pairs(obstacles):
+    for a, b in free_pairs(obstacles):
         body, other = obstacles[a], obstacles[b]
-        sides = Stop.of(body, other).gaps(body.placed(0.0).pose, other.placed(0.0).pose)
+        sides = ObstaclePair.between(body, other).gaps(body.posed_at(0.0).pose, other.posed_at(0.0).pose)
         gap = min(float(each.min(initial=np.inf)) for each in sides)
-        size = float(np.ptp(body.shape.outline()[0], axis=0).max())
+        size = float(np.ptp(body.shape.tessellate()[0], axis=0).max())
         if gap >= -ROUND_OFF * size:
             gaps[a] = min(gaps[a], gap)

@@ -14,7 +14,7 @@ from scipy.special import beta
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
-Outline = tuple[Values, Ints]
+Tessellation = tuple[Values, Ints]
 ARC = 12  # steps of a quarter circle
 
 
@@ -28,7 +28,7 @@ def profile(core_radius: float, half: float, rounding: float) -> Values:
     return np.concatenate([lower[:-1] if half == 0 else lower, upper])
 
 
-def polygon(side: Values) -> Outline:
+def polygon(side: Values) -> Tessellation:
     """Counterclockwise segments around a half profile (k, 2) and its mirror image."""
     other = side[::-1] * [-1, 1]
     points = np.concatenate([side, other[other[:, 0] < 0]])
@@ -36,7 +36,7 @@ def polygon(side: Values) -> Outline:
     return points, np.column_stack([index, np.roll(index, -1)])
 
 
-def surface_of_revolution(side: Values) -> Outline:
+def surface_of_revolution(side: Values) -> Tessellation:
     """Triangles of a half profile (k, 2) turned about the last axis, with a pole at either end."""
     heights, side, steps = side[[0, -1], 1], side[side[:, 0] > 0], 4 * ARC
     turn = np.arange(steps) * (2 * np.pi / steps)
@@ -49,7 +49,7 @@ def surface_of_revolution(side: Values) -> Outline:
     return np.concatenate([rings, poles]), _triangles(np.column_stack([grid, grid[:, 0]]))
 
 
-def rounded_block(half: Values, rounding: float) -> Outline:
+def rounded_block(half: Values, rounding: float) -> Tessellation:
     """Triangles of a box of half sizes (3,) grown by the rounding: each octant of a sphere, moved to its corner."""
     arc = np.tan(np.linspace(0, np.pi / 4, ARC // 2 + 1))
     sides, steps = np.concatenate([-arc[::-1], arc]), np.arange(2 * len(arc))

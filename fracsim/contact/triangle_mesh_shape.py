@@ -8,6 +8,7 @@ How deep closed surfaces of triangles lie in one another.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..meshes.surfaces.enclosed import AT_ONCE, enclosed_volumes, parts, windings
 from ..meshes.topology import distinct_rows
-from .tessellation import Outline
+from .tessellation import Tessellation
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -26,21 +27,22 @@ MAX_PRODUCTS = 30 * AT_ONCE  # pairs of a point and a triangle that are looked a
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class TriangleMeshShape:
     """What points (n, 3), m, and triangles (k, 3), their normals outwards, enclose; its reference point is the origin.
 
     It stands where a Shape does as far as it is placed and drawn; it is felt by its triangles (mesh_obstacles), not by
     a distance.
     """
 
+    kind: ClassVar[str] = "mesh"
     points: Values
     triangles: Ints
     dim: int = 3
     convex: bool = False
-    round: bool = False
-    least_radius: float = 0.0
+    rotation_invariant: bool = False
+    min_radius: float = 0.0
 
-    def outline(self) -> Outline:
+    def tessellate(self) -> Tessellation:
         """Its triangles."""
         return self.points, self.triangles.astype(np.int32)
 
@@ -76,7 +78,7 @@ class Solid:
         S = (np.einsum("k,kci,kcj->ij", each, corners, corners) + np.einsum("k,ki,kj->ij", each, whole, whole)) / 20
         return np.asarray(density * (np.trace(S) * np.eye(3) - S))
 
-    def shifted(self, offset: Values) -> Solid:
+    def translated(self, offset: Values) -> TriangleMeshShape:
         """The same with its reference point elsewhere: all points by `offset` (3,), m."""
         return replace(self, points=self.points + offset)
 
@@ -86,7 +88,7 @@ class Solid:
         return np.linalg.det(corners) / 6, corners.sum(axis=1) / 4
 
 
-def refined(points: Values, triangles: Ints, edge: float) -> tuple[Values, Ints]:
+def refine_triangles(points: Values, triangles: Ints, edge: float) -> tuple[Values, Ints]:
     """The surface of points (n, 3), m, and triangles (k, 3) with sides no longer than `edge`, m, or so long that
     there are about MOST triangles: sides are halved, in both triangles at once, so that it stays closed."""
     sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
@@ -116,10 +118,10 @@ def _cut(triangles: Ints, middle: Ints) -> Ints:
     return np.concatenate(parts)
 
 
-type Closed = tuple[Values, Ints]  # points (n, 3), m, and triangles (k, 3)
+type ClosedSurface = tuple[Values, Ints]  # points (n, 3), m, and triangles (k, 3)
 
 
-def depth(one: Closed, other: Closed, *, cut: bool) -> float | None:
+def penetration_depth(one: ClosedSurface, other: ClosedSurface, *, cut: bool) -> float | None:
     """How deep a corner of either lies in the other, m; None where neither has any there.
 
     `cut`: whether they are known to cut each other; where they do not, a part of one is in the other as a whole.
@@ -129,7 +131,7 @@ def depth(one: Closed, other: Closed, *, cut: bool) -> float | None:
     return max(found) if found else None
 
 
-def crosses(one: Closed, other: Closed) -> bool:
+def surfaces_intersect(one: ClosedSurface, other: ClosedSurface) -> bool:
     """Whether a triangle of one surface cuts or touches one of the other. Without ipctk: not known, False."""
     try:
         import ipctk
@@ -143,15 +145,15 @@ def crosses(one: Closed, other: Closed) -> bool:
     return bool(ipctk.has_intersections(mesh, mesh.vertices(points), ipctk.LBVH()))
 
 
-def _depth_in(surface: Closed, other: Closed, *, cut: bool) -> float | None:
+def _depth_in(surface: ClosedSurface, other: ClosedSurface, *, cut: bool) -> float | None:
     x, corners = surface[0][_asked(surface, cut=cut)], other[0][other[1]]
     x = x[((x > corners.min(axis=(0, 1))) & (x < corners.max(axis=(0, 1)))).all(axis=1)]
     x = x[:: 1 + len(x) * len(corners) // MAX_PRODUCTS]
     x = x[is_inside(x, corners)] if len(x) else x
-    return float(distances(x, corners).max()) if len(x) else None
+    return float(surface_distances(x, corners).max()) if len(x) else None
 
 
-def _asked(surface: Closed, *, cut: bool) -> Ints:
+def _asked(surface: ClosedSurface, *, cut: bool) -> Ints:
     """Corners: all, or one of each part that hangs together."""
     points, triangles = surface
     used = np.unique(triangles)
@@ -167,7 +169,7 @@ def is_inside(x: Values, corners: Values) -> Flags:
     return windings(x, corners) > 0.5
 
 
-def distances(x: Values, corners: Values) -> Values:
+def surface_distances(x: Values, corners: Values) -> Values:
     """(n,) of points x (n, 3) to the nearest of triangles (k, 3, 3), m: to its plane over it, to its sides else."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

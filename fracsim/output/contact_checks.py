@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 from mpi4py import MPI
 
-from ..contact.drawing import least_extent
-from ..contact.obstacle import Obstacle
+from ..contact.drawing import min_extent
+from ..contact.obstacle import RigidObstacle
 from ..timestepping.state import State
 
 
@@ -20,19 +20,19 @@ class Met(Protocol):
         obstacles: with their names.    edge: of the body's mesh in the mean, m.    width: of the barrier, m.
     """
 
-    obstacles: tuple[Obstacle, ...]
+    obstacles: tuple[RigidObstacle, ...]
     comm: MPI.Intracomm
 
     @property
-    def edge(self) -> float: ...
+    def mean_edge_length(self) -> float: ...
 
     @property
-    def width(self) -> float: ...
+    def barrier_width(self) -> float: ...
 
-    def closings(self) -> list[float]:
+    def closing_distances(self) -> list[float]:
         """How far each and what it touches would have come closer in the last step, m, on this rank (collective)."""
 
-    def felt_by_points_alone(self) -> list[tuple[Obstacle, bool]]:
+    def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
         """Each, and whether only points of the body feel it."""
 
 
@@ -47,14 +47,14 @@ class Meetings:
 
     def __init__(self, contacts: Sequence[Met]) -> None:
         """`contacts`: terms of obstacles (collective)."""
-        self._contacts, self._edge = contacts, contacts[0].edge
-        self._width = {each.name: contact.width for contact in contacts for each in contact.obstacles}
+        self._contacts, self._edge = contacts, contacts[0].mean_edge_length
+        self._width = {each.name: contact.barrier_width for contact in contacts for each in contact.obstacles}
         self.gap = dict.fromkeys(self._width, (math.inf, 0.0))
         self.closed = dict.fromkeys(self.gap, (0.0, 0.0, 0.0))
 
     def look(self, state: State, dt: float, figures: dict[str, float]) -> None:
         """Note a step of dt s that was taken; `figures`: the columns gap_NAME of history.csv (collective)."""
-        closings = [closing for contact in self._contacts for closing in contact.closings()]
+        closings = [closing for contact in self._contacts for closing in contact.closing_distances()]
         for (name, gap), closing in zip(self.gap.items(), closings, strict=True):
             if figures[f"gap_{name}"] < gap[0]:
                 self.gap[name] = figures[f"gap_{name}"], state.t
@@ -86,8 +86,8 @@ class Meetings:
     def _sizes(self) -> list[float]:
         """The least extent of each obstacle that points alone feel, m; infinite of a plane and of one that the body is
         in."""
-        alone = [each for contact in self._contacts for each in contact.felt_by_points_alone()]
-        return [least_extent(each.shape) if only else math.inf for each, only in alone]
+        alone = [each for contact in self._contacts for each in contact.points_only_flags()]
+        return [min_extent(each.shape) if only else math.inf for each, only in alone]
 
     def _over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`closed` of the rank where it is largest (collective)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..contact.initial_overlap import overlaps, pairs
-from ..contact.obstacle_term import Obstacles
+from ..contact.initial_overlap import find_overlaps, free_pairs
+from ..contact.obstacle_term import ObstacleTerm
 
 
 class Overlapping:
@@ -15,16 +15,16 @@ class Overlapping:
         seen: time (s), depth (m) and the two names; empty: never.
     """
 
-    def __init__(self, contact: Obstacles) -> None:
+    def __init__(self, contact: ObstacleTerm) -> None:
         """`contact`: the term of the obstacles."""
-        self._contact, self._pairs = contact, pairs(contact.obstacles)
+        self._contact, self._pairs = contact, free_pairs(contact.obstacles)
         self.seen: dict[str, Any] = {}
 
     def look(self, t: float) -> None:
         """Note where obstacles are at the time t of the state, s (not collective)."""
         if not self._pairs:
             return
-        for a, b, deep in overlaps(self._contact.where(t), self._pairs):
+        for a, b, deep in find_overlaps(self._contact.posed_obstacles(t), self._pairs):
             if deep > self.seen.get("depth", 0.0):
                 names = [self._contact.obstacles[each].name for each in (a, b)]
                 self.seen = {"time": t, "depth": deep, "both": names}

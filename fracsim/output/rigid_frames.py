@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..contact.drawing import Drawings
-from ..contact.obstacle import Obstacle
-from ..contact.pose import Placed
+from ..contact.drawing import ObstacleTessellations
+from ..contact.obstacle import RigidObstacle
+from ..contact.pose import PosedShape
 from ..meshes.data import MeshData
 from ..rigid.bodies import Bodies
 from ..rigid.instance_placement import Poses
@@ -37,7 +37,7 @@ class RigidFrames:
         mesh: MeshData,
         poses: Poses,
         density: float,
-        obstacles: Sequence[Obstacle],
+        obstacles: Sequence[RigidObstacle],
         resume_at: float | None = None,
     ) -> None:
         """Of copies of a mesh; `resume_at`: keep the frames up to this time, s. Raises OSError."""
@@ -45,7 +45,7 @@ class RigidFrames:
         self.surface = SurfaceOfCopies(mesh, poses, density)
         self.broken_at: Values = np.full(self.surface.edge_count, NEVER)
         points = self.surface.split.points
-        self._drawings = Drawings(obstacles, points.min(axis=0), points.max(axis=0))
+        self._drawings = ObstacleTessellations(obstacles, points.min(axis=0), points.max(axis=0))
 
     def resume(self, broken_at: Values) -> None:
         """Edges broke at these times (E,), s: pieces have the names that they had."""
@@ -64,7 +64,7 @@ class RigidFrames:
         pattern: npt.NDArray[np.uint8],
         cut: Values,
         dented: Mapping[int, Values],
-        obstacles: Sequence[Placed],
+        obstacles: Sequence[PosedShape],
     ) -> None:
         """A frame at time t (s), where there is none yet, of bodies that are pieces first; `cut`: (E,) where edges are
         cut; `dented`: where nodes (N, 3) of copies are at rest, m; `obstacles`: where they are. Raises OSError."""

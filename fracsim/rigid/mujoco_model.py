@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..contact.shape_base import frame
+from ..contact.shape_base import frame_about
 from .bodies import Bodies, orientation
 from .obstacle_shapes import Primitive
 
@@ -90,7 +90,7 @@ class Planes:
     @cached_property
     def across(self) -> list[Values]:
         """(3, 3) axes of each, the last one its normal."""
-        return [frame(normal) for normal in self.normal]
+        return [frame_about(normal) for normal in self.normal]
 
     def looked(self) -> Looked:
         """As a step begins: nothing has been missed in it."""

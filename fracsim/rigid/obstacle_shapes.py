@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.shape_base import frame, unit
-from ..contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from ..contact.shape_base import frame_about, unit_vector
+from ..contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
@@ -44,9 +44,9 @@ class Primitive:
 
 def primitives(shape: Shape, name: str) -> list[Primitive]:
     """The parts of an obstacle of that name. InputError for one that the engine does not have."""
-    from ..contact.triangle_mesh_shape import Solid
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
-    if not isinstance(shape, Solid):
+    if not isinstance(shape, TriangleMeshShape):
         return [primitive(shape, name)]
     from .convex_decomposition import Solid as Enclosed
     from .convex_decomposition import convex_parts
@@ -64,17 +64,19 @@ def primitive(shape: Shape, name: str) -> Primitive:
         raise InputError(f'{name} is hollow, which time.scheme = "rigid" does not have: build it of boxes or planes')
     upright = np.eye(3)
     match shape:
-        case Plane():
-            return Primitive("plane", (0.0, 0.0, 1.0), frame(unit(shape.direction)), np.inf)
+        case HalfSpace():
+            return Primitive("plane", (0.0, 0.0, 1.0), frame_about(unit_vector(shape.direction)), np.inf)
         case Sphere():
             return Primitive("sphere", (shape.radius, 0.0, 0.0), upright, shape.radius)
         case Capsule():
             long = (shape.radius, shape.length / 2, 0.0)
-            return Primitive("capsule", long, frame(unit(shape.axis)), shape.radius)
-        case Cylinder():
+            return Primitive("capsule", long, frame_about(unit_vector(shape.axis)), shape.radius)
+        case RoundedCylinder():
             long = (shape.radius, shape.length / 2, 0.0)
-            return Primitive("cylinder", long, frame(unit(shape.axis)), min(shape.radius, shape.length / 2))
-        case Box():
+            return Primitive(
+                "cylinder", long, frame_about(unit_vector(shape.axis)), min(shape.radius, shape.length / 2)
+            )
+        case RoundedBox():
             x, y, z = (side / 2 for side in shape.size)
             return Primitive("box", (x, y, z), upright, min(x, y, z))
-    raise InputError(f'{name}: time.scheme = "rigid" has no {type(shape).__name__.lower()}')
+    raise InputError(f'{name}: time.scheme = "rigid" has no {shape.kind}')

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..contact.obstacle import Obstacle
-from ..contact.pose import Placed, Pose
+from ..contact.obstacle import RigidObstacle
+from ..contact.pose import Pose, PosedShape
 from .bodies import Bodies
 from .convex_decomposition import outermost
 from .mujoco_model import Part, Stand
@@ -37,7 +37,7 @@ class Others:
         extent: (things,) half sizes, m; infinite of planes.
     """
 
-    def __init__(self, every: Sequence[Obstacle]) -> None:
+    def __init__(self, every: Sequence[RigidObstacle]) -> None:
         self.every = every
         self.free = [number for number, each in enumerate(every) if each.free]
         shapes = [primitives(each.shape, f"obstacle {each.name}") for each in every]
@@ -49,13 +49,13 @@ class Others:
         self.owner: Ints = np.array([*self.free, *(number for number, _ in self._standing)], np.int64)
         standing = [part.extent for _, part in self._standing]
         self.extent = np.array([*(shapes[number][0].extent for number in self.free), *standing])
-        self.driven = any(each.moved is not None for each in every)
+        self.driven = any(each.prescribed_displacement is not None for each in every)
 
     def bodies(self) -> Bodies:
         """Those that are free, at the start."""
         free = [cast("FreeObstacle", self.every[number]) for number in self.free]
-        at = np.array([each.at for each in free]).reshape(-1, 3)
-        rate = np.array([each.rate for each in free]).reshape(-1, 6)
+        at = np.array([each.start_point for each in free]).reshape(-1, 3)
+        rate = np.array([each.start_rate for each in free]).reshape(-1, 6)
         inertia = np.array([each.inertia for each in free]).reshape(-1, 3, 3)
         mass, turn = np.array([each.mass for each in free]), np.tile(np.eye(3), (len(free), 1, 1))
         return Bodies(mass, at, inertia, at, turn, rate[:, :3], rate[:, 3:])
@@ -63,7 +63,8 @@ class Others:
     def stands(self, t: float) -> list[Stand]:
         """What stands at a time, s."""
         every = self.every
-        return [Stand(part, self.way(number, t), every[number].friction, every[number].moved is not None)
+        return [Stand(part, self.way(number, t), every[number].friction,
+                      every[number].prescribed_displacement is not None)
                 for number, part in self._standing]  # fmt: skip
 
     def ways(self, t: float) -> Values | None:
@@ -72,18 +73,18 @@ class Others:
 
     def way(self, number: int, t: float) -> Values:
         """(3,) where the reference point of what stands is at a time, s."""
-        return np.asarray(self.every[number].at + self.every[number].displacement(t), float)
+        return np.asarray(self.every[number].start_point + self.every[number].displacement(t), float)
 
     def moved(self, t: float, dt: float) -> Values:
         """(obstacles, 3) how far each goes that is driven, in the step from a time on, m."""
         return np.array([self.way(k, t + dt) - self.way(k, t) for k in range(len(self.every))]).reshape(-1, 3)
 
-    def placed(self, t: float, bodies: Bodies) -> list[Placed]:
+    def placed(self, t: float, bodies: Bodies) -> list[PosedShape]:
         """Where they are at a time, s, with the free ones after all pieces among the `bodies`."""
         first = len(bodies) - len(self.free)
-        result = [each.placed(t) for each in self.every]
+        result = [each.posed_at(t) for each in self.every]
         for place, number in enumerate(self.free, first):
-            result[number] = Placed(self.every[number].shape, Pose(bodies.place[place], bodies.turn[place]))
+            result[number] = PosedShape(self.every[number].shape, Pose(bodies.place[place], bodies.turn[place]))
         return result
 
     def readings(self, bodies: Bodies) -> Values:
@@ -96,9 +97,9 @@ class Others:
         """Names of the readings."""
         if not self.free:
             return []
-        from ..contact.rigid_obstacle_state import columns
+        from ..contact.rigid_obstacle_state import column_names
 
-        return [name for number in self.free for name in columns(cast("FreeObstacle", self.every[number]))]
+        return [name for number in self.free for name in column_names(cast("FreeObstacle", self.every[number]))]
 
 
 def _outer(parts: Sequence[Primitive]) -> Values:

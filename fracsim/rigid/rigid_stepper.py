@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.obstacle import Obstacle
+from ..contact.obstacle import RigidObstacle
 from ..errors import NotConverged
 from ..timestepping.stepper import StepAborted
 from .bodies import Bodies
@@ -102,7 +102,7 @@ class RigidStepper:
         copies: Copies,
         geometry: Geometry,
         density: float,
-        obstacles: Sequence[Obstacle],
+        obstacles: Sequence[RigidObstacle],
         rules: Rules,
         hertz: Hertz,
         contact_time: float | None = None,

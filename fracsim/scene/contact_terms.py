@@ -14,11 +14,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..contact.barrier import Barrier
-from ..contact.laws import Law
-from ..contact.obstacle import Obstacle
-from ..contact.obstacle_term import Obstacles
+from ..contact.laws import ObstacleLaw
+from ..contact.obstacle import RigidObstacle
+from ..contact.obstacle_term import ObstacleTerm
 from ..contact.shapes import Shape
-from ..contact.supporting_obstacles import set_down
+from ..contact.supporting_obstacles import build_inactive_at_rest
 from ..errors import InputError
 from ..forms.schemes import Scheme
 from ..mechanics.material_fields import MaterialFields
@@ -33,8 +33,8 @@ from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.penalty_law import Penalty
-    from ..contact.penalty_obstacles import ExplicitObstacles
-    from ..contact.triangle_mesh_shape import Solid
+    from ..contact.penalty_obstacles import PenaltyObstacleTerm
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
 
@@ -53,33 +53,35 @@ CREEP = 1e-3  # of the body's size, a second
 OF_SPEED = 0.05
 
 
-def obstacles_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Obstacles:
+def obstacles_of(
+    study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme
+) -> ObstacleTerm:
     """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
     entries, law = obstacle_entries(study, domain.dim), _law(_contact(study), domain, material)
     if not any(each.free for each in entries):
-        return set_down(domain, entries, law, partial(Obstacles, domain, u), mutual=False)
-    from ..contact.rigid_obstacle_term import FreeObstacles
+        return build_inactive_at_rest(domain, entries, law, partial(ObstacleTerm, domain, u), mutual=False)
+    from ..contact.rigid_obstacle_term import FreeObstacleTerm
 
-    made = partial(FreeObstacles, domain, u, scheme=scheme)
-    return set_down(domain, entries, law, made, mutual=True)
+    made = partial(FreeObstacleTerm, domain, u, scheme=scheme)
+    return build_inactive_at_rest(domain, entries, law, made, mutual=True)
 
 
 def explicit_obstacles_of(
     study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values
-) -> ExplicitObstacles:
+) -> PenaltyObstacleTerm:
     """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
     from ..contact.penalty_law import Penalty
-    from ..contact.penalty_obstacles import ExplicitObstacles
+    from ..contact.penalty_obstacles import PenaltyObstacleTerm
 
     entries = obstacle_entries(study, domain.dim)
     contact = _contact(study)
     law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
-    kind = ExplicitObstacles
+    kind = PenaltyObstacleTerm
     if any(each.free for each in entries):
-        from ..contact.penalty_rigid_obstacles import ExplicitFreeObstacles
+        from ..contact.penalty_rigid_obstacles import PenaltyFreeObstacleTerm
 
-        kind = ExplicitFreeObstacles
-    return set_down(domain, entries, law, partial(kind, domain, u, mass=mass, most=most), mutual=False)
+        kind = PenaltyFreeObstacleTerm
+    return build_inactive_at_rest(domain, entries, law, partial(kind, domain, u, mass=mass, most=most), mutual=False)
 
 
 def _most_added(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
@@ -96,7 +98,7 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     start, or without ipctk."""
     try:
         from ..contact import ipc_surface
-        from ..contact.mesh_obstacle_term import Solids
+        from ..contact.mesh_obstacle_term import MeshObstacleTerm
     except ImportError:
         raise InputError(
             'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
@@ -106,47 +108,52 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
     contact = _contact(study)
     law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     of_speed = 0.0 if contact.creep else OF_SPEED
-    how = ipc_surface.Law(law.barrier.width, stiffness, 0.0, law.creep, of_speed, straight=_straight(study))
+    how = ipc_surface.SelfContactLaw(
+        law.barrier.width, stiffness, 0.0, law.sticking_speed, of_speed, corners_only=_straight(study)
+    )
     if not any(each.free for each in entries.values()):
-        return _with_room(partial(Solids, domain, u, entries), how, contact, "an obstacle from a file and the body")
-    from ..contact.mesh_rigid_term import FreeSolids
-    from ..contact.supporting_obstacles import before_solids
+        return _with_room(
+            partial(MeshObstacleTerm, domain, u, entries), how, contact, "an obstacle from a file and the body"
+        )
+    from ..contact.mesh_rigid_term import FreeMeshTerm
+    from ..contact.supporting_obstacles import offset_from_meshes
 
     every = enumerate(obstacle_placements(study, domain.dim))
     rest = {number: each for number, each in every if each.shape != "mesh" and each.free_motion is None}
     free = [each for each in entries.values() if each.free]
     shapes = {number: _obstacle(each, number) for number, each in rest.items()}
-    others = before_solids(shapes, free, law.barrier.width, domain.mean_edge_length)
+    others = offset_from_meshes(shapes, free, law.barrier.width, domain.mean_edge_length)
     made = partial(
-        FreeSolids, domain, u, entries, scheme=scheme, others=others, barrier=cast("Barrier", law.barrier)
+        FreeMeshTerm, domain, u, entries, scheme=scheme, others=others, barrier=cast("Barrier", law.barrier)
     )  # fmt: skip
     return _with_room(made, how, contact, "an obstacle from a file and the body")
 
 
-def _solid(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> Obstacle:
+def _solid(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> RigidObstacle:
     """Read on rank 0 (collective)."""
-    from ..contact.triangle_mesh_shape import Solid
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
     given = entry.geometry
     surface = from_root(
         comm, lambda: read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
     )
-    solid = Solid(surface.points, surface.triangles)
+    solid = TriangleMeshShape(surface.points, surface.triangles)
     if entry.free_motion is not None:
         return _free_solid(entry, entry.free_motion, solid)
-    return Obstacle(entry.name, solid, entry.reference_point, entry.displacement, entry.friction, entry.spin)
+    return RigidObstacle(entry.name, solid, entry.reference_point, entry.displacement, entry.friction, entry.spin)
 
 
-def _free_solid(entry: ObstaclePlacement, loose: FreeObstacleMotion, solid: Solid) -> Obstacle:
+def _free_solid(entry: ObstaclePlacement, loose: FreeObstacleMotion, solid: TriangleMeshShape) -> RigidObstacle:
     """One with a mass: it moves about its centre of mass, or turns about its hinge."""
     from ..contact.obstacle import FreeObstacle
 
     density, own = loose.density or (loose.mass or 0.0) / solid.volume, solid.centre
     at = entry.reference_point + own if loose.hinge is None else loose.hinge
-    solid = solid.shifted(entry.reference_point - at)
+    solid = solid.translated(entry.reference_point - at)
     return FreeObstacle(
         entry.name, solid, at, friction=entry.friction, mass=density * solid.volume, inertia=solid.inertia(density),
-        ways=loose.pose_basis, centre=entry.reference_point + own - at, gravity=loose.gravity, rate=loose.initial_rate,
+        motion_basis=loose.pose_basis, mass_centre=entry.reference_point + own - at,
+        gravity=loose.gravity, start_rate=loose.initial_rate,
     )  # fmt: skip
 
 
@@ -159,7 +166,7 @@ def self_contact_of(study: Study, domain: Domain, u: fem.Function, material: Mat
 def explicit_self_contact_of(study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values) -> Term:
     """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
     most, itself = _most_added(_contact(study), domain, stress), _by_ipctk("penalty_self_contact")
-    made = partial(itself.ExplicitSelfContact, domain, u, mass=mass, most=most)
+    made = partial(itself.PenaltySelfContact, domain, u, mass=mass, most=most)
     return _self_contact(study, domain, stress.material, DISTANCE, made)
 
 
@@ -184,7 +191,7 @@ def _self_contact(
     stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
     creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
     pieces, straight = contact.itself == "pieces", _straight(study)
-    law = ipc_surface.Law(distance, stiffness, contact.friction, creep, of_speed, pieces, straight)
+    law = ipc_surface.SelfContactLaw(distance, stiffness, contact.friction, creep, of_speed, pieces, straight)
     return _with_room(made, law, contact, "parts of the body")
 
 
@@ -194,7 +201,7 @@ def _with_room(made: Callable[[Any], Any], law: Any, contact: ContactSettings, w
     InputError where the study gives a distance that is more than the gap.
     """
     term = made(law)
-    if (gap := term.least_gap()) >= (1 - 1e-6) * law.distance:
+    if (gap := term.min_gap()) >= (1 - 1e-6) * law.distance:
         return term
     term.destroy()  # they would push each other apart from the start
     if contact.distance:
@@ -205,39 +212,39 @@ def _with_room(made: Callable[[Any], Any], law: Any, contact: ContactSettings, w
     return made(replace(law, distance=0.5 * gap))
 
 
-def obstacle_entries(study: Study, dim: int) -> list[Obstacle]:
+def obstacle_entries(study: Study, dim: int) -> list[RigidObstacle]:
     """Obstacles that are felt by their distance: all but those from files. InputError where one does not fit the
     dimension, or is no shape."""
     every = enumerate(obstacle_placements(study, dim))
     return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
 
 
-def every_obstacle(study: Study) -> list[Obstacle]:
+def every_obstacle(study: Study) -> list[RigidObstacle]:
     """Of a body in space on one rank, in the order of the study, those from files too."""
     every = enumerate(obstacle_placements(study, 3))
     return [_solid(MPI.COMM_SELF, each, k) if each.shape == "mesh" else _obstacle(each, k) for k, each in every]
 
 
-def _obstacle(entry: ObstaclePlacement, number: int) -> Obstacle:
+def _obstacle(entry: ObstaclePlacement, number: int) -> RigidObstacle:
     shape = build_shape(entry, number)
     if entry.free_motion is not None:
         return _free_obstacle(entry, entry.free_motion, shape)
-    return Obstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
+    return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
 
 
-def _free_obstacle(entry: ObstaclePlacement, loose: FreeObstacleMotion, shape: Shape) -> Obstacle:
+def _free_obstacle(entry: ObstaclePlacement, loose: FreeObstacleMotion, shape: Shape) -> RigidObstacle:
     """One with a mass; on a hinge it is placed, and turns, about that."""
     from ..contact.obstacle import FreeObstacle
-    from ..contact.offset_shape import Shifted
+    from ..contact.offset_shape import TranslatedShape
 
     density = loose.density or (loose.mass or 0.0) / shape.volume
     at, centre = entry.reference_point, 0 * entry.reference_point
     if loose.hinge is not None:
         at, centre = loose.hinge, entry.reference_point - loose.hinge
-        shape = Shifted(shape, centre)
+        shape = TranslatedShape(shape, centre)
     return FreeObstacle(
         entry.name, shape, at, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
-        ways=loose.pose_basis, centre=centre, gravity=loose.gravity, rate=loose.initial_rate,
+        motion_basis=loose.pose_basis, mass_centre=centre, gravity=loose.gravity, start_rate=loose.initial_rate,
     )  # fmt: skip
 
 
@@ -252,9 +259,9 @@ def _straight(study: Study) -> bool:
 
 def _law(
     contact: ContactSettings, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
-) -> Law:
+) -> ObstacleLaw:
     distance = contact.distance or DISTANCE * domain.mean_edge_length
-    return Law(
+    return ObstacleLaw(
         barrier(contact.stiffness or STIFFNESS * _young(domain, material), distance),
         contact.creep or CREEP * domain.size,
     )

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..contact.obstacle import Obstacle
+from ..contact.obstacle import RigidObstacle
 from ..errors import InputError
 from ..mechanics.matrix_assembly import VectorAssembler
 from ..mechanics.stress import DegradationModel, Stress
@@ -65,7 +65,7 @@ class RigidScene:
     study: Study
     mesh: MeshData
     stepper: RigidStepper
-    obstacles: list[Obstacle]
+    obstacles: list[RigidObstacle]
     first: RigidState
     made_of: tuple[MeshData, Poses]
 
@@ -186,7 +186,7 @@ def _check_masses(state: RigidState) -> None:
                          "inside out or flat; mend the mesh")  # fmt: skip
 
 
-def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[Obstacle], edge: float) -> None:
+def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[RigidObstacle], edge: float) -> None:
     """InputError where bodies lie in one another, or in an obstacle, at the start."""
     found = [each for each in stepper.depths(state) if each[2] > DEEP * edge]
     if not found:

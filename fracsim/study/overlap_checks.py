@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.initial_overlap import overlaps, pairs
-from ..contact.pose import Placed, Pose
+from ..contact.initial_overlap import find_overlaps, free_pairs
+from ..contact.pose import Pose, PosedShape
 from ..contact.shapes import SHAPES, Shape
 from ..errors import InputError
 from ..meshes.data import MeshData
@@ -70,7 +70,7 @@ def find_near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]
         _check_free(entries, placed)
         bodies = corners[None]
     every = zip(entries, placed, strict=True)
-    return [each.name for each, at in every if at is None or any(at.beyond(body) <= 0 for body in bodies)]
+    return [each.name for each, at in every if at is None or any(at.distance_bound(body) <= 0 for body in bodies)]
 
 
 def check_initial_overlap(study: Study, mesh: MeshData) -> None:
@@ -88,9 +88,9 @@ def check_initial_overlap(study: Study, mesh: MeshData) -> None:
             _check_shape(entry, number, mesh)
 
 
-def _placed(entry: ObstaclePlacement, number: int) -> Placed:
+def _placed(entry: ObstaclePlacement, number: int) -> PosedShape:
     """An obstacle where it is at the start."""
-    return Placed(build_shape(entry, number), Pose.at(_reference(entry)))
+    return PosedShape(build_shape(entry, number), Pose.at_point(_reference(entry)))
 
 
 def _reference(entry: ObstaclePlacement) -> Values:
@@ -109,22 +109,22 @@ def _corners(lower: Values, upper: Values) -> Values:
     return np.asarray(np.take_along_axis(ends, choice, axis=0), float)
 
 
-def _check_free(entries: list[ObstaclePlacement], placed: list[Placed | None]) -> None:
+def _check_free(entries: list[ObstaclePlacement], placed: list[PosedShape | None]) -> None:
     """InputError where an obstacle that moves freely overlaps another one; those from files are left to the run."""
     shapes = [(number, each, at) for number, (each, at) in enumerate(zip(entries, placed, strict=True)) if at]
-    every = pairs([_Named(each.name, each.free_motion is not None) for _, each, _ in shapes])  # type: ignore[misc]
+    every = free_pairs([_Named(each.name, each.free_motion is not None) for _, each, _ in shapes])  # type: ignore[misc]
     boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in every}
-    among = [(a, b) for a, b in every if not shapes[b][2].beyond(boxes[a]) > 0]
-    for a, b, deep in overlaps([at for _, _, at in shapes], among):
+    among = [(a, b) for a, b in every if not shapes[b][2].distance_bound(boxes[a]) > 0]
+    for a, b, deep in find_overlaps([at for _, _, at in shapes], among):
         raise InputError(
             f"obstacle.{shapes[a][0]}: {shapes[a][1].name} moves freely and overlaps {shapes[b][1].name} at the start, "
             f"by {max(0.0, deep):.4g} m; move it away or make it smaller"
         )
 
 
-def _box(placed: Placed) -> tuple[Values, Values]:
+def _box(placed: PosedShape) -> tuple[Values, Values]:
     """Corners (d,) of a box around an obstacle, m."""
-    points = placed.pose.points_to_space(placed.shape.outline()[0])
+    points = placed.pose.points_to_space(placed.shape.tessellate()[0])
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -137,7 +137,7 @@ class _Named:
 
 def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     placed = _placed(entry, number)
-    if placed.beyond(mesh.points) > 0:
+    if placed.distance_bound(mesh.points) > 0:
         return
     least = float(placed.distance(mesh.points).min())
     if least < -ROUND_OFF * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
@@ -147,7 +147,7 @@ def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
         )
     if not placed.shape.convex or not np.isfinite(placed.shape.volume):
         return  # all corners of the body are in a convex room, so the body is
-    points = placed.pose.points_to_space(placed.shape.outline()[0])
+    points = placed.pose.points_to_space(placed.shape.tessellate()[0])
     inside = containment_depth(np.concatenate([points, placed.pose.centre[None]]), mesh) > WITHIN
     if inside.any():
         where = format_point(np.concatenate([points, placed.pose.centre[None]])[np.flatnonzero(inside)[0]])
@@ -184,7 +184,7 @@ def containment_depth(x: Values, mesh: MeshData) -> Values:
 
 def _check_solid(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     """The same of an obstacle that is read from a file."""
-    from ..contact.triangle_mesh_shape import crosses, depth
+    from ..contact.triangle_mesh_shape import penetration_depth, surfaces_intersect
 
     given: dict[str, Any] = entry.geometry
     solid = read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
@@ -192,8 +192,8 @@ def _check_solid(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     if np.any(points.min(axis=0) > mesh.points.max(axis=0)) or np.any(points.max(axis=0) < mesh.points.min(axis=0)):
         return
     body, other = (mesh.points, boundary_facets(mesh.cells)), (points, np.asarray(solid.triangles, np.int64))
-    cut = crosses(body, other)
-    deep = depth(body, other, cut=cut)
+    cut = surfaces_intersect(body, other)
+    deep = penetration_depth(body, other, cut=cut)
     if cut or deep is not None:
         how = "cuts" if deep is None else "overlaps"
         by = "" if deep is None else f", by {deep:.4g} m"

@@ -78,7 +78,7 @@ def measured(kind: str, n: int) -> dict[str, Any]:
         run = Run(build_scene(MPI.COMM_WORLD, validate(study, kind)), Path(folder, "run"))
         contact: Any = next(term for term in run.scene.balance.terms if term.name == "contact")
         steps = _in_touch(run, contact)
-        figures = of_pairs(contact._surface, contact._places())
+        figures = of_pairs(contact._surface, contact._end_positions())
     seconds, newton = zip(*steps, strict=True)
     own = {"triangles": 12 * (n**2 + (n + 1) ** 2), "newton": float(np.mean(newton)), "step": float(np.mean(seconds))}
     return own | figures
@@ -102,13 +102,13 @@ def of_pairs(surface: Any, x: Any) -> dict[str, Any]:
     short, long = (x - upper * np.array([0.0, 0.0, way]) for way in (1e-5, 0.5))
     away = x + 1e-12 * np.arange(x.size).reshape(x.shape)  # kept pairs are those of one place
     asked: dict[str, Callable[[int], Any]] = {
-        "detection, short way": lambda k: pairs.longest_step(x, short),
-        "detection, long way": lambda k: pairs.longest_step(x, long),
+        "detection, short way": lambda k: pairs.free_fraction(x, short),
+        "detection, long way": lambda k: pairs.free_fraction(x, long),
         "energy": lambda k: pairs.energy(away if k % 2 else x),
         "gradient": lambda k: pairs.gradient(away if k % 2 else x),
         "hessian": lambda k: pairs.hessian(away if k % 2 else x),
     }
-    touching = sum(len(found) for _, found in pairs._near.touching(pairs._mesh.vertices(x)))
+    touching = sum(len(found) for _, found in pairs._near.active_pairs(pairs._mesh.vertices(x)))
     return {"touching": touching} | {name: median(map(_timed(work), range(REPEATS))) for name, work in asked.items()}
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.contact.obstacle import Obstacle
-from fracsim.contact.shapes import Plane
+from fracsim.contact.obstacle import RigidObstacle
+from fracsim.contact.shapes import HalfSpace
 from fracsim.fracture.brittle.grains import SurfaceRules
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
@@ -37,7 +37,7 @@ def cubes(places: list[list[float]], velocity: list[float] | None = None) -> Bod
 
 def floor(friction: float = 0.5, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Stand:
     """The plane z = 0."""
-    return Stand(primitive(Plane(normal), "floor"), np.zeros(3), friction)
+    return Stand(primitive(HalfSpace(normal), "floor"), np.zeros(3), friction)
 
 
 def stepper_of(
@@ -47,13 +47,17 @@ def stepper_of(
     *,
     surfaces: int = 6,
     gravity: Values = DOWN,
-    obstacles: list[Obstacle] | None = None,
+    obstacles: list[RigidObstacle] | None = None,
     restitution: float = 0.0,
     contact_time: float | None = None,
     moved: TimeFunction | None = None,
 ) -> RigidStepper:
     """Bodies of a mesh, by default over a floor at z = 0."""
     body = breakable(mesh, strength, SurfaceRules(surfaces))
-    stand = [Obstacle("floor", Plane((0.0, 0.0, 1.0)), np.zeros(3), moved, 0.5)] if obstacles is None else obstacles
+    stand = (
+        [RigidObstacle("floor", HalfSpace((0.0, 0.0, 1.0)), np.zeros(3), moved, 0.5)]
+        if obstacles is None
+        else obstacles
+    )
     rules = Rules(step, gravity, 0.5, restitution)
     return RigidStepper(Copies.of(body), Geometry(mesh), DENSITY, stand, rules, Hertz(1e9, 0.2), contact_time)

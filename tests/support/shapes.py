@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.contact.shapes import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 
 Values = npt.NDArray[np.float64]
 
@@ -16,19 +16,19 @@ BODIES: dict[str, Shape] = {
     "sphere": Sphere(0.7),
     "stadium": Capsule(0.3, 1.1, axis=(1.0, 2.0)),
     "capsule": Capsule(0.3, 1.1, axis=(1.0, 2.0, -0.5)),
-    "rectangle": Box((1.2, 0.8), rounding=0.15),
-    "box": Box((1.2, 0.8, 1.0), rounding=0.15),
-    "sharper box": Box((1.2, 0.8, 1.0)),
-    "cylinder": Cylinder(0.5, 1.4, rounding=0.15, axis=(0.3, -1.0, 0.4)),
-    "sharper cylinder": Cylinder(0.5, 1.4),
+    "rectangle": RoundedBox((1.2, 0.8), rounding=0.15),
+    "box": RoundedBox((1.2, 0.8, 1.0), rounding=0.15),
+    "sharper box": RoundedBox((1.2, 0.8, 1.0)),
+    "cylinder": RoundedCylinder(0.5, 1.4, rounding=0.15, axis=(0.3, -1.0, 0.4)),
+    "sharper cylinder": RoundedCylinder(0.5, 1.4),
 }
 HOLLOW: dict[str, Shape] = {
     "bowl": Sphere(0.7, hollow=True),
     "ring": Sphere(0.7, dim=2, hollow=True),
-    "container": Box((1.2, 0.8, 1.0), rounding=0.15, hollow=True),
-    "drum": Cylinder(0.5, 1.4, rounding=0.15, axis=(0.3, -1.0, 0.4), hollow=True),
+    "container": RoundedBox((1.2, 0.8, 1.0), rounding=0.15, hollow=True),
+    "drum": RoundedCylinder(0.5, 1.4, rounding=0.15, axis=(0.3, -1.0, 0.4), hollow=True),
 }
-PLANES: dict[str, Shape] = {"plane": Plane((1.0, -2.0, 3.0)), "line": Plane((1.0, -2.0))}
+PLANES: dict[str, Shape] = {"plane": HalfSpace((1.0, -2.0, 3.0)), "line": HalfSpace((1.0, -2.0))}
 ALL = BODIES | HOLLOW | PLANES
 
 
