@@ -161,13 +161,14 @@ def render(
         return
     import_outside("pyvista")
     from .report.pictures.picture import render
-    from .report.pictures.picture_options import Look, limits_of, size_of
+    from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size
 
     begin_work()
     _tell_of_runs(outs)
-    how = Look(
-        colour, explode, view, zoom, skin=look, size=size_of(size), limits=limits_of(limits) if limits else None,
-        magnify=magnify, floor=floor, title=title, bare=bare, dust=dust,
+    how = PictureOptions(
+        colour, explode, view, zoom, material=look, size=parse_size(size),
+        limits=parse_limits(limits) if limits else None, magnify=magnify, floor=floor, title=title, bare=bare,
+        dust=dust,
     )  # fmt: skip
     print(f"saved {render(outs, png, how, frame=frame, sheet=sheet, fps=fps)}")
 
@@ -185,10 +186,10 @@ def export(
     if not is_first_rank():
         return
     import_outside("pyvista")
-    from .report.export import export
+    from .report.export import export_surfaces
 
     _tell_of_runs([out])
-    made = export(out, kind, target, frame=frame, dust=dust, look=look)
+    made = export_surfaces(out, kind, target, frame=frame, dust=dust, look=look)
     print(f"saved {made[0]}" + (f" and {len(made) - 1} more" if len(made) > 1 else ""))
 
 
@@ -258,10 +259,10 @@ def list_(
 
 def _tell_of_runs(folders: list[Path]) -> None:
     """A note on folders in which a run goes on: nobody is to take a part of it for the whole."""
-    from .output.lock import holder
+    from .output.lock import describe_lock_holder
 
     for folder in folders:
-        if words := holder(folder):
+        if words := describe_lock_holder(folder):
             print(
                 f"fracsim: note: a run goes on in {folder} ({one_line(words)}); shown is what it has written",
                 file=sys.stderr,

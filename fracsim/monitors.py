@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from .output.energy_check import EnergyGain, worth_telling
-from .output.inverted_cells import InvertedCells
-from .output.run_folder import versions
-from .output.summary import Meter, trouble_in_words
+from .output.result_checks import EnergyGainMonitor, InvertedCellMonitor, negligible_energy
+from .output.run_folder import software_versions
+from .output.summary import ResourceMeter, describe_trouble
 
 if TYPE_CHECKING:
-    from .output.contact_checks import Meetings, Met
+    from .output.contact_checks import ObstacleContact, ObstacleContactMonitor, ObstacleOverlapMonitor
     from .output.history import History
-    from .output.interpenetration_check import Passing
-    from .output.load_drop import LoadDrop
-    from .output.obstacle_overlap_check import Overlapping
+    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor
     from .scene import Scene
     from .study import Study
     from .timestepping.state import State
@@ -28,10 +25,10 @@ if TYPE_CHECKING:
 class Monitor(Protocol):
     """Something that is watched in some runs only."""
 
-    def monitors(self) -> dict[str, Any]:
+    def to_checkpoint(self) -> dict[str, Any]:
         """What a restart goes on from, for `restore` (collective)."""
 
-    def restore(self, monitors: dict[str, Any]) -> None:
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
         """Go on from `monitors`."""
 
     def summary(self) -> dict[str, Any]:
@@ -55,13 +52,13 @@ class Watched:
         passing: of pieces through each other.    drop: of the load; each of these four None where there is none.
     """
 
-    def __init__(self, scene: Scene, history: History, meter: Meter) -> None:
+    def __init__(self, scene: Scene, history: History, meter: ResourceMeter) -> None:
         """(collective)"""
         study, stress = scene.study, scene.balance.stress
         self._study, self.history, self.meter = study, history, meter
-        self.inverted = InvertedCells(stress, scene.fracture)
-        floor = worth_telling(stress)
-        self.gained = EnergyGain(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
+        self.inverted = InvertedCellMonitor(stress, scene.fracture)
+        floor = negligible_energy(stress)
+        self.gained = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
         self.meetings, self.overlapping = _of_obstacles(scene)
         self.passing, self.drop = _passing(study), _load_drop(study)
         those = (self.meetings, self.overlapping, self.passing, self.drop)
@@ -70,54 +67,54 @@ class Watched:
     @property
     def dropped(self) -> bool:
         """Whether the load has fallen as far as ends the run."""
-        return self.drop is not None and self.drop.reached
+        return self.drop is not None and self.drop.has_dropped
 
     def look(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
         """Note a step; `figures`: what was probed in it; `broken`: edges so far (collective)."""
         if self.meetings is not None:
-            self.meetings.look(state, report.dt, figures)
+            self.meetings.record_step(state, report.dt, figures)
         if self.drop is not None:
-            self.drop.look(state.t, figures, broken)
-        self.gained.look(report, state)
+            self.drop.record_step(state.t, figures, broken)
+        self.gained.record_step(report, state)
 
     def look_at_frame(self, t: float) -> None:
         """Note what is looked at in frames alone (collective)."""
-        self.inverted.look(t)
+        self.inverted.record_frame(t)
         if self.overlapping is not None:
-            self.overlapping.look(t)
+            self.overlapping.record_frame(t)
 
     def saved(self) -> dict[str, Any]:
         """For a checkpoint (collective)."""
-        watched: dict[str, Any] = self.inverted.monitors() | self.gained.monitors()
-        watched |= {"peak_reactions": self.history.peaks, "worked": self.history.worked}
+        watched: dict[str, Any] = self.inverted.to_checkpoint() | self.gained.to_checkpoint()
+        watched |= {"peak_reactions": self.history.reaction_peaks, "worked": self.history.obstacle_work}
         for monitor in self._others:
-            watched |= monitor.monitors()
-        return watched | self.meter.read()
+            watched |= monitor.to_checkpoint()
+        return watched | self.meter.read_totals()
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Go on from those of a checkpoint."""
         watched: list[Any] = [self.inverted, self.gained, self.meter, *self._others]
         for each in watched:
-            each.restore(saved)
-        self.history.peaks |= saved["peak_reactions"]
-        self.history.worked |= saved.get("worked", {})
+            each.from_checkpoint(saved)
+        self.history.reaction_peaks |= saved["peak_reactions"]
+        self.history.obstacle_work |= saved.get("worked", {})
 
     def summary(self) -> dict[str, Any]:
         """Their part of summary.json (collective)."""
-        used = self.meter.read()
+        used = self.meter.read_totals()
         return {
-            **used["trouble"], "smallest_J": self.inverted.least,
-            "inverted_cells": self.inverted.count, "peak_reactions": self.history.peaks,
+            **used["trouble"], "smallest_J": self.inverted.min_jacobian,
+            "inverted_cells": self.inverted.inverted_count, "peak_reactions": self.history.reaction_peaks,
             "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
             "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
             **{name: found for each in self._others for name, found in each.summary().items()},
-            "ranks": self.history.comm.size, "versions": versions(self.history.comm),
+            "ranks": self.history.comm.size, "versions": software_versions(self.history.comm),
         }  # fmt: skip
 
     def notes(self, *, done: bool) -> list[str]:
         """Sentences on what makes the result doubtful; `done`: the run came to its end (collective)."""
         energy, time = self._study.material.energy, self._study.time
-        trouble = trouble_in_words(self.meter.read()["trouble"])
+        trouble = describe_trouble(self.meter.read_totals()["trouble"])
         notes = [note for note in (trouble, self.inverted.note(energy), self.gained.note(time.scheme)) if note]
         if self.meetings is not None:
             notes += self.meetings.notes(done=done)
@@ -135,37 +132,35 @@ def wants_surface(study: Study) -> bool:
     return study.output.surface
 
 
-def _of_obstacles(scene: Scene) -> tuple[Meetings | None, Overlapping | None]:
+def _of_obstacles(scene: Scene) -> tuple[ObstacleContactMonitor | None, ObstacleOverlapMonitor | None]:
     """Where there are any; that they lie in one another, where one of several moves freely."""
     obstacles = scene.study.obstacle
     if not obstacles:
         return None, None
     from .contact.obstacle_term import ObstacleTerm
-    from .output.contact_checks import Meetings
+    from .output.contact_checks import ObstacleContactMonitor, ObstacleOverlapMonitor
 
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
-    meetings = Meetings(cast("list[Met]", terms))
+    meetings = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
     watched = [term for term in terms if isinstance(term, ObstacleTerm)]
     if not watched or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
         return meetings, None
-    from .output.obstacle_overlap_check import Overlapping
-
-    return meetings, Overlapping(watched[0])
+    return meetings, ObstacleOverlapMonitor(watched[0])
 
 
-def _passing(study: Study) -> Passing | None:
+def _passing(study: Study) -> InterpenetrationMonitor | None:
     """Where nothing keeps pieces apart, and their surface is made anyway."""
     if not wants_surface(study) or (study.contact is not None and study.contact.itself):
         return None
-    from .output.interpenetration_check import Passing
+    from .output.result_checks import InterpenetrationMonitor
 
-    return Passing()
+    return InterpenetrationMonitor()
 
 
-def _load_drop(study: Study) -> LoadDrop | None:
+def _load_drop(study: Study) -> LoadDropMonitor | None:
     """What ends the run early."""
     if (until := study.time.until) is None:
         return None
-    from .output.load_drop import LoadDrop
+    from .output.result_checks import LoadDropMonitor
 
-    return LoadDrop(study.monitored_load, until.drop, until.above, breaks=study.fracture is not None)
+    return LoadDropMonitor(study.monitored_load, until.drop, until.above, breaks=study.fracture is not None)

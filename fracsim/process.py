@@ -173,10 +173,10 @@ def begin_run() -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
     faulthandler.enable()
     from .mesh.parallel import launcher
-    from .output.interrupt import end_with
+    from .output.interrupt import end_with_launcher
 
     if _is_rank() and (process := launcher(_PARENT)) is not None:
-        end_with(process, parent=_PARENT)
+        end_with_launcher(process, parent=_PARENT)
     _run_begun = True
 
 

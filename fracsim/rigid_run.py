@@ -12,25 +12,31 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped
-from .output.atomic_write import written
+from .output.atomic_write import write_on_root
 from .output.checkpoint_file import (
-    LARGEST,
-    Notes,
-    Stored,
+    CHECKPOINT_LIMITS,
+    CheckpointNotes,
+    StoredCheckpoint,
     check_mesh,
+    check_names,
     checkpoint_path,
-    last_checkpoint,
-    read_stored,
-    refusal,
-    require,
-    write_arrays,
+    describe_last_checkpoint,
+    read_checkpoint_file,
+    restart_error,
+    write_checkpoint_file,
 )
-from .output.history import History, history_columns, read_earlier
-from .output.interrupt import Interrupt
-from .output.progress import Done, Progress
+from .output.history import History, history_columns, read_earlier_rows
+from .output.interrupt import InterruptHandler
+from .output.progress import ProgressReporter, ProgressState
 from .output.rigid_frames import RigidFrames
-from .output.run_folder import OutputClock, check_text, make_folder, missing_frames, versions
-from .output.summary import say, write_summary
+from .output.run_folder import (
+    FrameSchedule,
+    check_text_files,
+    make_output_folder,
+    missing_frame_notes,
+    software_versions,
+)
+from .output.summary import print_notes, write_summary
 from .rigid.rigid_stepper import RigidReport
 from .scene.rigid_scene import RigidScene
 from .timestepping.stepper import StepAborted
@@ -58,13 +64,13 @@ class RigidRun:
         scene: RigidScene,
         folder: Path,
         text: str,
-        interrupt: Interrupt,
+        interrupt: InterruptHandler,
         *,
         restart: bool = False,
-        progress: Progress | None = None,
+        progress: ProgressReporter | None = None,
     ) -> None:
         """`text`: study.toml, without its head; `progress`: one that tells already."""
-        self._progress = progress or Progress(first=True, end=scene.study.time.end)
+        self._progress = progress or ProgressReporter(first=True, end=scene.study.time.end)
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
         self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
@@ -75,10 +81,10 @@ class RigidRun:
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
         names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.others.columns()
         if step is not None:
-            read_earlier(folder / "history.csv", history_columns(names), step)
-            check_text(folder)
-        interrupt.writing = True
-        make_folder(folder, text, restart=restart)
+            read_earlier_rows(folder / "history.csv", history_columns(names), step)
+            check_text_files(folder)
+        interrupt.has_output = True
+        make_output_folder(folder, text, restart=restart)
         self.history = History(ALONE, folder / "history.csv", names, step)
         density = float(scene.study.material.density)
         where = folder / "surface.pvd"
@@ -86,27 +92,31 @@ class RigidRun:
         if arrays is not None:
             self.frames.resume(arrays["broken_at"])
             self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))
-            self.history.worked |= dict(zip(self.history.worked, map(float, arrays["worked"]), strict=True))
-            say(ALONE, [*self.history.notes, *missing_frames(folder, self._had, self.frames.files.counts)])
-        self._clock = OutputClock(scene.study.output.every, scene.study.frame_interval)
-        self._clock.wrote(self.state.t)
-        written(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
+            self.history.obstacle_work |= dict(
+                zip(self.history.obstacle_work, map(float, arrays["worked"]), strict=True)
+            )
+            print_notes(
+                ALONE, [*self.history.notes, *missing_frame_notes(folder, self._had, self.frames.files.frame_counts)]
+            )
+        self._clock = FrameSchedule(scene.study.output.every, scene.study.frame_interval)
+        self._clock.record_frame(self.state.t)
+        write_on_root(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
     def _writing[T](self, path: Path, work: Callable[[], T]) -> T:
-        result = written(ALONE, path, work)
+        result = write_on_root(ALONE, path, work)
         assert result is not None
         return result
 
     def _resume(self) -> dict[str, npt.NDArray[Any]]:
         """Be where the checkpoint is."""
-        stored, stepper = read_stored(self.folder), self.scene.stepper
+        stored, stepper = read_checkpoint_file(self.folder), self.scene.stepper
         check_mesh(stored, self.scene.mesh)
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
         _check_stored(stored, stepper.saved(self.state), len(self.scene.obstacles), stepper.copies)
         self._start = float(clock["start"])
         self.state = stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
         if len(self.state.bodies) != len(stepper.names) or len(arrays["broken_at"]) != len(stepper.copies.damage()[1]):
-            raise refusal(stored.path, "its bodies are not those that its broken edges leave")
+            raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
         self.blows, self.loads, self._had = earlier["blows"], earlier["loads"], earlier["frames"]
         return arrays
 
@@ -118,7 +128,7 @@ class RigidRun:
         self._interrupt.begin_step()
         self.state, report = stepper.advance(self.state)
         if report.broken:
-            self.frames.note(stepper.copies.damage()[0], self.state.t)
+            self.frames.record_breaks(stepper.copies.damage()[0], self.state.t)
         self.broken, self.blows, self.loads = (
             self.broken + report.broken, self.blows + report.blows, self.loads + report.loads
         )  # fmt: skip
@@ -137,18 +147,18 @@ class RigidRun:
         state, copies = self.state, self.scene.stepper.copies
         damage, dented = copies.damage(), {number: each.points for number, each in copies.shapes.items()}
         path, placed = self.folder / "surface.pvd", self.scene.stepper.others.placed(state.t, state.bodies)
-        written(ALONE, path, lambda: self.frames.write(state.t, state.bodies, *damage, dented, placed))
-        self._clock.wrote(state.t)
+        write_on_root(ALONE, path, lambda: self.frames.write_frame(state.t, state.bodies, *damage, dented, placed))
+        self._clock.record_frame(state.t)
 
     def checkpoint(self) -> Path:
         """Write one of now: all states that a step ends with are finite; returns its path. Raises CannotWrite."""
         state, path = self.state, checkpoint_path(self.folder)
         arrays = self.scene.stepper.saved(state) | {"broken_at": self.frames.broken_at}
-        arrays["worked"] = np.array([*self.history.worked.values()])
+        arrays["worked"] = np.array([*self.history.obstacle_work.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
-        counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.counts}
-        notes = Notes(self.text, counts)
-        written(ALONE, path, lambda: write_arrays(path, arrays, clock, self.scene.mesh, notes))
+        counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
+        notes = CheckpointNotes(self.text, counts)
+        write_on_root(ALONE, path, lambda: write_checkpoint_file(path, arrays, clock, self.scene.mesh, notes))
         self._saved_at = state.t
         return path
 
@@ -167,7 +177,7 @@ class RigidRun:
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
         try:
-            self._progress.stage("the first step")
+            self._progress.set_stage("the first step")
             if self.state.step == 0:
                 self.write_frame()
             try:
@@ -185,7 +195,7 @@ class RigidRun:
         """Write a checkpoint on the way out, and say where; none where a step `failed`: a blow in it would be lost."""
         if not failed:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
-        last = last_checkpoint(self.folder, self._saved_at)
+        last = describe_last_checkpoint(self.folder, self._saved_at)
         return f"No checkpoint was written: a blow in the step that failed would be lost. {last}"
 
     def _rescued(self) -> str:
@@ -193,11 +203,11 @@ class RigidRun:
         with contextlib.suppress(CannotWrite):
             self._finish("could not write")
         try:
-            if self.history.step == self.state.step:  # a step without its row would leave a gap
+            if self.history.last_step == self.state.step:  # a step without its row would leave a gap
                 return self._saved(failed=False)
         except CannotWrite:
             pass
-        return last_checkpoint(self.folder, self._saved_at)
+        return describe_last_checkpoint(self.folder, self._saved_at)
 
     def _loop(self) -> None:
         last, every = time.monotonic(), self.scene.study.output.checkpoint
@@ -207,23 +217,23 @@ class RigidRun:
             except StepAborted:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
-            if done or self._clock.due(self.state.t, self.state.step):
+            if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
             self._tell(report)
             if every is not None and time.monotonic() - last > every:
                 self.checkpoint()
                 last = time.monotonic()
-            if not done and self._interrupt.reason():
+            if not done and self._interrupt.stop_reason():
                 raise self._stopped()
 
     def _tell(self, report: RigidReport) -> None:
         state, pieces, dt = self.state, self.scene.stepper.count, self.scene.study.time.max_step
         more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
-        self._progress.update(Done(state.t, dt, state.step, self.broken, pieces, more))
+        self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
         """What ends the run now."""
-        reason, state = self._interrupt.reason(), self.state
+        reason, state = self._interrupt.stop_reason(), self.state
         return Stopped(f"stopped by {reason} at t = {state.t:g} s after {state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
@@ -237,7 +247,7 @@ class RigidRun:
             "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.copies.passes,
             "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
-            "ranks": MPI.COMM_WORLD.size, "versions": versions(MPI.COMM_WORLD),
+            "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
         write_summary(ALONE, self.folder, summary)
         return summary
@@ -251,40 +261,40 @@ class RigidRun:
 
 def notes_of(scene: RigidScene) -> None:
     """Tell what was mended of the mesh while it was read."""
-    say(ALONE, list(scene.mesh.notes))
+    print_notes(ALONE, list(scene.mesh.notes))
 
 
-def _check_stored(stored: Stored, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Copies) -> None:
+def _check_stored(stored: StoredCheckpoint, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Copies) -> None:
     """InputError where a checkpoint lacks something that a run goes on from, or has it in another shape, or not finite.
 
     `fresh`: what the run would write at its start; `obstacles`: how many there are.
     """
     arrays, path = stored.arrays, stored.path
     wanted = fresh | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
-    require(arrays, set(wanted), {*wanted, *_SOMETIMES}, path)
-    require(stored.clock, set(CLOCK), set(CLOCK), path)
-    require(stored.notes.monitors, _MONITORS, _MONITORS, path)
+    check_names(arrays, set(wanted), {*wanted, *_SOMETIMES}, path)
+    check_names(stored.clock, set(CLOCK), set(CLOCK), path)
+    check_names(stored.notes.monitors, _MONITORS, _MONITORS, path)
     bodies = len(arrays["body.mass"])
     for name, values in arrays.items():
         first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})
         if values.ndim == 0:
-            raise refusal(path, f"{name} is one number")
+            raise restart_error(path, f"{name} is one number")
         right = (*first.get(name, values.shape[:1]), *wanted.get(name, values).shape[1:])
         if values.shape != right:
-            raise refusal(path, f"{name} has the shape {values.shape}, of this study it is {right}")
+            raise restart_error(path, f"{name} has the shape {values.shape}, of this study it is {right}")
         if name in ("overlap.depth", "broken_at"):  # without end; never
             values = np.where(values == np.inf, 0.0, values)
         elif name == "cut":  # in the middle
             values = np.nan_to_num(values)
-        if not float(np.max(np.abs(values), initial=0.0)) < LARGEST:
-            raise refusal(path, f"{name} is not finite")
+        if not float(np.max(np.abs(values), initial=0.0)) < CHECKPOINT_LIMITS.magnitude:
+            raise restart_error(path, f"{name} is not finite")
     for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
         if len({len(arrays.get(name, ())) for name in group}) > 1:
-            raise refusal(path, f"{' and '.join(group)} do not belong together")
+            raise restart_error(path, f"{' and '.join(group)} do not belong together")
     most = {"broken": len(copies) * copies.nodes, "starts_of": len(copies), "shape_of": len(copies)}
     for name, count in most.items():
         numbers = arrays.get(name, np.empty(0, np.int64))
         if numbers.dtype.kind != "i" or np.any((numbers < 0) | (numbers >= count)):
-            raise refusal(path, f"{name} is not all from 0 to {count - 1}")
+            raise restart_error(path, f"{name} is not all from 0 to {count - 1}")
     if len(arrays.get("broken", ())) != np.count_nonzero(np.isfinite(arrays["broken_at"])):
-        raise refusal(path, "broken and broken_at do not belong together")
+        raise restart_error(path, "broken and broken_at do not belong together")

@@ -16,17 +16,30 @@ from mpi4py import MPI
 from .errors import CannotWrite, NotConverged, Stopped, one_line
 from .mesh.parallel import end_unless_all_failed, from_root, on_root, sum_over_ranks
 from .monitors import WATCHED, Watched, wants_surface
-from .output.atomic_write import written
+from .output.atomic_write import write_on_root
 from .output.checkpoint import read_checkpoint, write_checkpoint
-from .output.checkpoint_file import Notes, checkpoint_path, last_checkpoint, read_notes, refusal
-from .output.fracture_log import Breaks
+from .output.checkpoint_file import (
+    CheckpointNotes,
+    checkpoint_path,
+    describe_last_checkpoint,
+    read_notes,
+    restart_error,
+)
+from .output.fracture_log import FractureLog
 from .output.frame_files import FrameFiles
 from .output.history import History, history_columns
-from .output.interrupt import Interrupt
-from .output.lock import FolderLock, claim
-from .output.progress import Done, Progress
-from .output.run_folder import OutputClock, check_folder, check_readable, make_folder, missing_frames, versions
-from .output.summary import Meter, say, write_summary
+from .output.interrupt import InterruptHandler
+from .output.lock import FolderLock, lock_checked_folder
+from .output.progress import ProgressReporter, ProgressState
+from .output.run_folder import (
+    FrameSchedule,
+    check_continuable,
+    check_output_folder,
+    make_output_folder,
+    missing_frame_notes,
+    software_versions,
+)
+from .output.summary import ResourceMeter, print_notes, write_summary
 from .process import import_outside
 from .scene import Scene, build_scene
 from .study import Study
@@ -37,7 +50,7 @@ from .timestepping.stepper import StepAborted, StepReport
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .output.crack_length import CrackFront
+    from .output.crack_length import CrackExtent
 
 
 class Run:
@@ -58,8 +71,8 @@ class Run:
         restart: bool = False,
         overwrite: bool = False,
         wall_limit: float | None = None,
-        interrupt: Interrupt | None = None,
-        progress: Progress | None = None,
+        interrupt: InterruptHandler | None = None,
+        progress: ProgressReporter | None = None,
         began: float | None = None,
     ) -> None:
         """Start or resume; makes the output folder, once nothing stands in the way any more (collective).
@@ -69,58 +82,58 @@ class Run:
         (perf_counter). Raises InputError, and Stopped where a signal came before anything was written.
         """
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
-        self.interrupt = interrupt or Interrupt(self.comm, wall_limit)
-        self._progress = progress or Progress(first=self.comm.rank == 0, end=scene.study.time.end)
-        self._text = study_text(scene.study, [f"{key}: {value}" for key, value in versions(self.comm).items()])
-        self._meter = Meter(self.comm, scene.stepper, began)
+        self.interrupt = interrupt or InterruptHandler(self.comm, wall_limit)
+        self._progress = progress or ProgressReporter(first=self.comm.rank == 0, end=scene.study.time.end)
+        self._text = study_text(scene.study, [f"{key}: {value}" for key, value in software_versions(self.comm).items()])
+        self._meter = ResourceMeter(self.comm, scene.stepper, began)
         self._forgets = False  # a checkpoint was written: the next step depends on what is in it alone
         stress, by_forces = scene.balance.stress, scene.study.output.cut == "forces"
         self._lock = FolderLock(folder)
         check = partial(_check, folder, scene.study, self._text, restart=restart, overwrite=overwrite)
         try:
             with self.interrupt:
-                on_root(self.comm, lambda: claim(self._lock, check))
+                on_root(self.comm, lambda: lock_checked_folder(self._lock, check))
                 self.state = scene.start()
-                self.breaks = Breaks(stress, scene.fracture, cut_by_forces=by_forces)
+                self.breaks = FractureLog(stress, scene.fracture, cut_by_forces=by_forces)
                 notes = self._resume() if restart else None
-                self.interrupt.check_setup()
+                self.interrupt.check_setup_signals()
                 self._prepare(notes, check)
         except BaseException:
             self._lock.release()
             raise
 
-    def _resume(self) -> Notes:
+    def _resume(self) -> CheckpointNotes:
         """Take up the state of the checkpoint, and what it says beside it."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
         if missing := sorted(WATCHED - notes.monitors.keys()):
-            raise refusal(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
+            raise restart_error(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
-        breaks.restored()
+        breaks.apply_checkpoint()
         self.state = scene.stepper.from_checkpoint(state)
         asked = scene.study.model_dump(mode="json")["time"]["step"]
-        if notes.values()["time"]["step"] != asked:  # else the size of the last step goes on
+        if notes.study_tables()["time"]["step"] != asked:  # else the size of the last step goes on
             self.state = replace(self.state, dt=scene.study.time.max_step)
         return notes
 
-    def _prepare(self, notes: Notes | None, check: Callable[[], None]) -> None:
+    def _prepare(self, notes: CheckpointNotes | None, check: Callable[[], None]) -> None:
         """Open the output, of a run that goes on where there are notes of it; `check`: that it may be opened."""
         study, restart, folder = self.scene.study, notes is not None, self.folder
         step, t = (self.state.step, self.state.t) if restart else (None, None)
         self.front = self._crack_front()
-        names = [*self.scene.probes.names, *(self.front.names if self.front is not None else [])]
+        names = [*self.scene.probes.columns, *(self.front.columns if self.front is not None else [])]
         columns = history_columns(names)
         if step is not None:
-            on_root(self.comm, lambda: check_readable(folder, columns, step))
-        on_root(self.comm, lambda: claim(self._lock, check, make=True))
-        self.interrupt.writing = True
-        on_root(self.comm, lambda: make_folder(folder, self._text, restart=restart))
+            on_root(self.comm, lambda: check_continuable(folder, columns, step))
+        on_root(self.comm, lambda: lock_checked_folder(self._lock, check, make=True))
+        self.interrupt.has_output = True
+        on_root(self.comm, lambda: make_output_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
         self.history = History(self.comm, folder / "history.csv", names, step, study.thickness)
         self.watched = Watched(self.scene, self.history, self._meter)
         if notes is not None:
             self.watched.restore(notes.monitors)
             if self.front is not None:
-                self.front.restore(notes.monitors)
+                self.front.from_checkpoint(notes.monitors)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
@@ -128,22 +141,22 @@ class Run:
         )  # fmt: skip
         if notes is not None:
             had = notes.monitors["frames"]
-            say(self.comm, [*self.history.notes, *missing_frames(folder, had, self.frames.counts)])
-        self._clock = OutputClock(study.output.every, study.frame_interval)
-        self._clock.wrote(self.state.t)
+            print_notes(self.comm, [*self.history.notes, *missing_frame_notes(folder, had, self.frames.frame_counts)])
+        self._clock = FrameSchedule(study.output.every, study.frame_interval)
+        self._clock.record_frame(self.state.t)
         self._frame_of: int | None = None  # the step of the last frame of this part of the run
         # it tells how the run ended, which is open again
-        written(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
+        write_on_root(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
-    def _crack_front(self) -> CrackFront | None:
+    def _crack_front(self) -> CrackExtent | None:
         """Where cracks say where they cut: how long they are, and their tip."""
         study = self.scene.study
         if study.fracture is None or not (study.crack or study.fracture.energy):
             return None
-        from .output.crack_length import CrackFront
+        from .output.crack_length import CrackExtent
 
         assert self.breaks.record is not None
-        return CrackFront(self.breaks.record, initial_cracks(study, self.scene.domain.dim))
+        return CrackExtent(self.breaks.record, initial_cracks(study, self.scene.domain.dim))
 
     @property
     def ended(self) -> bool:
@@ -163,39 +176,39 @@ class Run:
         if report.broken:
             self.note_breaks()
         probes = self.scene.probes()
-        front = self.front() if self.front is not None else ()
-        self.history.append(self.state, report, self.breaks.figures, np.array([*probes, *front]))
-        figures = {name: float(value) for name, value in zip(self.scene.probes.names, probes, strict=True)}
-        self.watched.look(self.state, report, figures, self.breaks.figures[0])
+        front = self.front.values if self.front is not None else ()
+        self.history.append(self.state, report, self.breaks.counts, np.array([*probes, *front]))
+        figures = {name: float(value) for name, value in zip(self.scene.probes.columns, probes, strict=True)}
+        self.watched.look(self.state, report, figures, self.breaks.counts[0])
         return report
 
     def note_breaks(self) -> None:
         """Edges have broken since the last step, in it or by hand: when, where, and into how many pieces
         (collective)."""
-        self.breaks.note(self.state.t)
+        self.breaks.record_breaks(self.state.t)
         if self.front is not None:
-            self.front.look()
+            self.front.update()
 
     def write_frame(self) -> None:
         """Write the body as it is now, and look at its cells. Raises CannotWrite (collective)."""
         began = time.perf_counter()
         self.watched.look_at_frame(self.state.t)
-        self.frames.write(self.state)
-        self._clock.wrote(self.state.t)
+        self.frames.write_frame(self.state)
+        self._clock.record_frame(self.state.t)
         self._frame_of = self.state.step
-        self._meter.output += time.perf_counter() - began
+        self._meter.output_seconds += time.perf_counter() - began
 
     def checkpoint(self) -> Path:
         """Write a checkpoint of now, which the run goes on from as one that resumes does; returns its path. Raises
         CannotWrite, and NotConverged where the state is not finite (collective)."""
         began = time.perf_counter()
         domain, balance, breaks = self.scene.domain, self.scene.balance, self.breaks
-        front = self.front.monitors() if self.front is not None else {}
-        notes = Notes(self._text, self.watched.saved() | front | {"frames": self.frames.counts})
-        breaks.remember()
+        front = self.front.to_checkpoint() if self.front is not None else {}
+        notes = CheckpointNotes(self._text, self.watched.saved() | front | {"frames": self.frames.frame_counts})
+        breaks.prepare_checkpoint()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
         self._saved_at, self._forgets = self.state.t, True
-        self._meter.output += time.perf_counter() - began
+        self._meter.output_seconds += time.perf_counter() - began
         return path
 
     # --- to the end ---
@@ -207,7 +220,7 @@ class Run:
             return self._run_and_draw()
 
     def _run_and_draw(self) -> dict[str, Any]:
-        self._meter.begin_steps()
+        self._meter.start_stepping()
         try:
             with self.interrupt:
                 summary = self._run()
@@ -216,13 +229,13 @@ class Run:
         finally:
             self.history.close()
         if self.comm.rank == 0 and self.scene.study.output.picture:
-            self._progress.stage("drawing the last frame")
+            self._progress.set_stage("drawing the last frame")
             _draw(self.folder)
         return summary
 
     def _run(self) -> dict[str, Any]:
         """The loop, and a checkpoint where it does not end well."""
-        self.scene.stepper.set_stop_request(self.interrupt.abandons)
+        self.scene.stepper.set_stop_request(self.interrupt.must_abandon_step)
         try:
             try:
                 self._loop()
@@ -236,10 +249,10 @@ class Run:
         return self._finish("done")
 
     def _loop(self) -> None:
-        self._progress.stage("the first step")
+        self._progress.set_stage("the first step")
         if self.state.step == 0:
             self.write_frame()
-        if reason := self.interrupt.signalled():
+        if reason := self.interrupt.received_signal():
             raise Stopped(f"stopped by {reason} before the first step, at t = {self.state.t:g} s")
         last, every = time.monotonic(), self.scene.study.output.checkpoint
         while not self.ended:
@@ -248,39 +261,41 @@ class Run:
             except StepAborted:
                 raise self._stopped("; the step that was under way begins anew") from None
             done = self.ended
-            if done or self._clock.due(self.state.t, self.state.step):
+            if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
             self._tell(report)
             if every is not None and self.comm.bcast(time.monotonic() - last > every):
                 self.checkpoint()
                 last = time.monotonic()
-            if not done and self.interrupt.reason():
+            if not done and self.interrupt.stop_reason():
                 raise self._stopped()
 
     def _tell(self, report: StepReport) -> None:
-        broken, _, pieces = self.breaks.figures
+        broken, _, pieces = self.breaks.counts
         more = f"Newton {report.solve.newton_iterations}  {report.seconds:.2g} s/step"
-        self._progress.update(Done(self.state.t, report.dt, self.state.step, broken, pieces, more))
+        self._progress.update(ProgressState(self.state.t, report.dt, self.state.step, broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
         """What ends the run now, with a frame of now (collective)."""
         if self._frame_of != self.state.step:
             self.write_frame()
-        reason, t = self.interrupt.reason(), self.state.t
+        reason, t = self.interrupt.stop_reason(), self.state.t
         return Stopped(f"stopped by {reason} at t = {t:g} s after {self.state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
-        say(self.comm, self.watched.notes(done=outcome == "done"))
+        print_notes(self.comm, self.watched.notes(done=outcome == "done"))
         return summary
 
     def _summary(self, outcome: str) -> dict[str, Any]:
         state, domain, thick = self.state, self.scene.domain, self.scene.study.thickness
-        broken, split, pieces = self.breaks.figures
+        broken, split, pieces = self.breaks.counts
         sizes = sum_over_ranks(self.comm, np.array([domain.node_count, domain.cell_count]))
-        dust, dust_mass = self.breaks.dust(self.scene.balance.stress.material.density * domain.volumes * thick)
+        dust, dust_mass = self.breaks.count_single_nodes(
+            self.scene.balance.stress.material.density * domain.volumes * thick
+        )
         return {
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": int(sizes[0]), "cells": int(sizes[1]),
@@ -295,18 +310,18 @@ class Run:
         try:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
         except NotConverged as error:
-            return f"No checkpoint was written: {error}. {last_checkpoint(self.folder, self._saved_at)}"
+            return f"No checkpoint was written: {error}. {describe_last_checkpoint(self.folder, self._saved_at)}"
 
     def _rescued(self) -> str:
         """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
         with contextlib.suppress(CannotWrite):
             write_summary(self.comm, self.folder, self._summary("could not write"))
         try:
-            if self.history.step == self.state.step:  # a step without its row would leave a gap
+            if self.history.last_step == self.state.step:  # a step without its row would leave a gap
                 return self._saved()
         except CannotWrite:
             pass
-        return last_checkpoint(self.folder, self._saved_at)
+        return describe_last_checkpoint(self.folder, self._saved_at)
 
 
 def wanted_fields(study: Study) -> list[str]:
@@ -339,23 +354,23 @@ def run_study(
     file, which must not be written over.
     """
     began = time.perf_counter()
-    say(comm, study.frame_notes)
+    print_notes(comm, study.frame_notes)
     if study.time.scheme == "rigid":
         how = {"restart": restart, "overwrite": overwrite}
         return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
-    progress = Progress(first=comm.rank == 0, end=study.time.end)
+    progress = ProgressReporter(first=comm.rank == 0, end=study.time.end)
 
     def stage(name: str) -> None:
-        progress.stage(name)
-        interrupt.check_setup()
+        progress.set_stage(name)
+        interrupt.check_setup_signals()
 
-    with Interrupt(comm, wall_limit) as interrupt, FolderLock(folder) as lock, progress:
+    with InterruptHandler(comm, wall_limit) as interrupt, FolderLock(folder) as lock, progress:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
-        on_root(comm, lambda: claim(lock, check))  # at once, not after a mesh of minutes
+        on_root(comm, lambda: lock_checked_folder(lock, check))  # at once, not after a mesh of minutes
         scene = build_scene(comm, study, stage)
         if scene.domain.source is not None and scene.domain.source.notes:
             progress.end_line()
-            say(comm, list(scene.domain.source.notes))
+            print_notes(comm, list(scene.domain.source.notes))
         try:
             ways: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
             return Run(scene, folder, restart=restart, overwrite=overwrite, **ways)()
@@ -379,19 +394,19 @@ def _run_rigid(
 
     def work() -> dict[str, Any]:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
-        claim(lock, check)
+        lock_checked_folder(lock, check)
         from .rigid_run import RigidRun, notes_of
 
-        progress.stage("building the bodies")
+        progress.set_stage("building the bodies")
         scene = build_rigid_scene(study, comm, heed)
-        interrupt.check_setup()
-        claim(lock, check, make=True)
+        interrupt.check_setup_signals()
+        lock_checked_folder(lock, check, make=True)
         progress.end_line()
         notes_of(scene)
-        text = study_text(study, [f"{key}: {value}" for key, value in versions(comm).items()])
+        text = study_text(study, [f"{key}: {value}" for key, value in software_versions(comm).items()])
         summary = RigidRun(scene, folder, text, interrupt, restart=restart, progress=progress)()
         if study.output.picture:
-            progress.stage("drawing the last frame")
+            progress.set_stage("drawing the last frame")
             _draw(folder)
         return summary
 
@@ -403,11 +418,11 @@ def _run_rigid(
                 tell(comm, None)
 
     def heed() -> None:
-        if interrupt.abandons():
+        if interrupt.must_abandon_step():
             raise StepAborted
 
-    alone, progress = comm.size == 1, Progress(first=comm.rank == 0, end=study.time.end)
-    with Interrupt(MPI.COMM_SELF, wall_limit, alone=alone) as interrupt, FolderLock(folder) as lock, progress:
+    alone, progress = comm.size == 1, ProgressReporter(first=comm.rank == 0, end=study.time.end)
+    with InterruptHandler(MPI.COMM_SELF, wall_limit, alone=alone) as interrupt, FolderLock(folder) as lock, progress:
         if comm.rank:
             help_rigid(comm, heed)
         return from_root(comm, first)
@@ -424,7 +439,9 @@ def _check(
         study.mesh.shell,
         *(each.file for each in study.obstacle),
     )
-    check_folder(folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults)
+    check_output_folder(
+        folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults
+    )
 
 
 def _draw(folder: Path) -> None:

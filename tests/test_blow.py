@@ -85,7 +85,7 @@ def test_what_holds_a_side_reads_the_force_that_presses_it(scheme: str) -> None:
         time={"scheme": scheme, "step": 0.01, "end": 0.05},
     )  # fmt: skip
     march(scene, state)
-    row = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    row = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert row["contact_platen_y"] > 0.1 and not state.u.any()
     assert row["reaction_held_y"] == pytest.approx(row["contact_platen_y"], rel=1e-9)
 

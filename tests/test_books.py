@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.output.fields import Frames
-from fracsim.report.runs import flattened
+from fracsim.output.frame_files import FieldEvaluator
+from fracsim.report.runs import flatten_tables
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
@@ -36,7 +36,7 @@ def test_a_body_at_rest_holds_no_energy(energy: str, dim: int, scheme: str) -> N
         material={"energy": energy, "young": 1e3, "poisson": 0.25, "density": 1.0},
         obstacle=[ball], time={"scheme": scheme, "step": 1e-3, "end": 0.01},
     )  # fmt: skip
-    _, *fields = Frames(scene.balance.stress, ["energy_density", "stress"])(walk.state, None)
+    _, *fields = FieldEvaluator(scene.balance.stress, ["energy_density", "stress"])(walk.state, None)
     assert all(np.abs(field.values).max() < 1e-9 for field in fields)  # moduli are 1e3
     assert abs(scene.balance.stress.stored_energy()) < 1e-9 and np.abs(walk.a).max() < 1e-9
     for _ in range(2):
@@ -111,7 +111,7 @@ def written(thickness: float | None, out: Path) -> dict[str, dict[str, Any]]:
         with (out / f"{name}.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         found[name] = {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
-    flat = flattened(json.loads((out / "summary.json").read_text()))
+    flat = flatten_tables(json.loads((out / "summary.json").read_text()))
     found["summary"] = {key: np.array(value) for key, value in flat.items() if not isinstance(value, str | list)}
     return found
 

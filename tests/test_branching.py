@@ -295,7 +295,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     """How fast tips are is remembered, and how far they have to go: the crack branches in the same cell."""
     tables = RUNS["forked"] | {"output": {"picture": False, "interval": 100.0}, "solver": DIRECT}
     going, broken, again = going_stopped_resumed(tables, tmp_path, 13, 5)
-    assert 1 < broken < going.breaks.figures[0]
+    assert 1 < broken < going.breaks.counts[0]
     assert np.any(going.scene.fracture.graph.pattern == 7)
     assert_alike(again, going, 1e-9)
     carried = [each.scene.fracture.criterion.carried for each in (going, again)]

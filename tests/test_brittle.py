@@ -419,7 +419,7 @@ def test_a_restart_remembers_its_surfaces(tmp_path: Path) -> None:
     whole()
     stopped = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path / "parts")
     surfaces = stopped.scene.fracture.criterion
-    stopped.interrupt.reason = lambda: "the test" if len(surfaces.starts) else ""  # type: ignore[method-assign]
+    stopped.interrupt.stop_reason = lambda: "the test" if len(surfaces.starts) else ""  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
     assert len(surfaces.starts) == 1 and len(whole.scene.fracture.criterion.starts) == 4

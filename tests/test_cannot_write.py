@@ -50,12 +50,12 @@ main()
 """
 # what is full -> (what the message names, what of the module is wrapped, bytes that a file may have)
 CASES: dict[str, tuple[str, tuple[str, str, str], int]] = {
-    "fields": ("fields.xdmf", ("fracsim.output.fields_file", "FieldsFile", "write"), 35_000),
-    "xml": ("fields.xdmf", ("fracsim.output.fields_file", "", "append"), 4_500),
-    "surface": ("surface.pvd", ("fracsim.output.surface.vtk_files", "SurfaceFiles", "write"), 1_000),
-    "pieces": ("surface.pvd", ("fracsim.output.surface.vtk_files", "", "append"), 600),
+    "fields": ("fields.xdmf", ("fracsim.output.fields_file", "FieldsFile", "append_frame"), 35_000),
+    "xml": ("fields.xdmf", ("fracsim.output.fields_file", "", "append_bytes"), 4_500),
+    "surface": ("surface.pvd", ("fracsim.output.surface.vtk_files", "SurfaceFiles", "write_frame"), 1_000),
+    "pieces": ("surface.pvd", ("fracsim.output.surface.vtk_files", "", "append_bytes"), 600),
     "history": ("history.csv", ("fracsim.output.history", "", "write_all"), 700),
-    "checkpoint": ("checkpoint/state.h5", ("fracsim.output.checkpoint", "", "write_arrays"), 9_000),
+    "checkpoint": ("checkpoint/state.h5", ("fracsim.output.checkpoint", "", "write_checkpoint_file"), 9_000),
 }
 EVERY_STEP = {"output": {"checkpoint": 1e-9}}
 
@@ -169,7 +169,7 @@ def test_a_full_disk_in_a_rigid_run(
     from test_rigid_study import study as falling
 
     table, out = falling(output={"every": 10, "picture": False, "checkpoint": every}), tmp_path / "out"
-    write, calls, full_now = rigid_frames.SurfaceFiles.write, iter(range(100)), []
+    write, calls, full_now = rigid_frames.SurfaceFiles.write_frame, iter(range(100)), []
 
     def full(self: Any, *arguments: Any) -> None:
         if next(calls) == 2:
@@ -183,10 +183,10 @@ def test_a_full_disk_in_a_rigid_run(
                 raise OSError(28, "No space left on device")
             return work()
 
-        return atomic_write.written(comm, path, tried)
+        return atomic_write.write_on_root(comm, path, tried)
 
-    monkeypatch.setattr(rigid_frames.SurfaceFiles, "write", full)
-    monkeypatch.setattr("fracsim.rigid_run.written", on_disk)
+    monkeypatch.setattr(rigid_frames.SurfaceFiles, "write_frame", full)
+    monkeypatch.setattr("fracsim.rigid_run.write_on_root", on_disk)
     with pytest.raises(CannotWrite) as error:
         run_study(MPI.COMM_SELF, table, out)
     path = out / "checkpoint" / "state.h5"

@@ -156,7 +156,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     going, _, again = going_stopped_resumed(tables, tmp_path, 8, 5)
     assert_alike(again, going, 1e-9)
     np.testing.assert_allclose(again.scene.fracture.criterion.cut, going.scene.fracture.criterion.cut, atol=1e-9)
-    assert np.count_nonzero(~np.isnan(going.scene.fracture.criterion.cut)) > going.breaks.figures[0]
+    assert np.count_nonzero(~np.isnan(going.scene.fracture.criterion.cut)) > going.breaks.counts[0]
 
 
 def test_a_panel_of_concrete_is_as_stiff_as_by_another_program() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.output.interrupt import Interrupt
+from fracsim.output.interrupt import InterruptHandler
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
@@ -90,7 +90,7 @@ def test_rigid_bodies_go_on_the_same(tmp_path: Path, name: str) -> None:
     text = study_text(data, [f"{key}: 1" for key in ("fracsim", "dolfinx", "petsc", "python", "ranks")])
 
     def begun(where: str, *, restart: bool = False) -> RigidRun:
-        scene, interrupt = build_rigid_scene(data), Interrupt(MPI.COMM_SELF, None)
+        scene, interrupt = build_rigid_scene(data), InterruptHandler(MPI.COMM_SELF, None)
         return RigidRun(scene, tmp_path / where, text, interrupt, restart=restart)
 
     def numbers(run: RigidRun) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from fracsim.fracture.edge_history import EdgeRecord
-from fracsim.output.crack_length import CrackFront
+from fracsim.output.crack_length import CrackExtent
 from fracsim.study.conditions import initial_cracks as given
 from support.scenes import make_scene
 
@@ -22,14 +22,14 @@ def test_what_changes_is_enough(dim: int) -> None:
     edge that broke last, of a cell that holds together where there is one, found cell by cell."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.25}, fracture={"strength": 1.0})
     graph, record = scene.fracture.graph, EdgeRecord(scene.fracture.graph)
-    front, sizes, led = CrackFront(record), [], 0
+    front, sizes, led = CrackExtent(record), [], 0
     order = np.random.default_rng(2).permutation(len(graph.broken))
     for t, edges in enumerate(np.array_split(order, 40)):
         graph.break_edges(np.isin(np.arange(len(order)), edges))
         record.note(float(t))
-        front.look()
-        sizes.append(front()[0])
-        np.testing.assert_allclose(front()[0], CrackFront(record)()[0], rtol=1e-12)
+        front.update()
+        sizes.append(front.values[0])
+        np.testing.assert_allclose(front.values[0], CrackExtent(record).values[0], rtol=1e-12)
         last = set(np.flatnonzero(record.at == np.nanmax(record.at)).tolist())
         whole = [
             set(cell) & last for cell, split in zip(graph.cell_edges.tolist(), graph.split, strict=True) if not split
@@ -37,7 +37,7 @@ def test_what_changes_is_enough(dim: int) -> None:
         into = set().union(*whole)
         led += bool(into)
         middles = graph.domain.nodes[graph.edge_nodes[sorted(into or last)]].mean(axis=1)
-        assert np.abs(middles - front()[1:]).sum(axis=1).min() < 1e-12
+        assert np.abs(middles - front.values[1:]).sum(axis=1).min() < 1e-12
     assert 10 < led < 40 and max(sizes) > 0
 
 
@@ -53,23 +53,23 @@ def test_a_tip_that_has_left_stays_where_it_was(ahead: int) -> None:
     )  # fmt: skip
     graph, record = scene.fracture.graph, EdgeRecord(scene.fracture.graph)
     record.note(0.0, scene.fracture.opened)
-    front = CrackFront(record, given(scene.study, 2))
+    front = CrackExtent(record, given(scene.study, 2))
     ends = graph.domain.nodes[graph.edge_nodes]
     crossed = np.flatnonzero((ends[:, :, 1].min(axis=1) < 0.507) & (ends[:, :, 1].max(axis=1) > 0.507) & ~graph.broken)
     crossed = crossed[np.argsort(at_height(ends[crossed], 0.507))]
-    seen, lengths = [], [front()[0]]
+    seen, lengths = [], [front.values[0]]
     for t, k in enumerate(range(0, len(crossed), ahead)):
         graph.break_edges(np.isin(np.arange(len(graph.broken)), crossed[k : k + ahead]))
         record.note(t + 1.0)
-        front.look()
-        seen.append(front()[1:].copy())
-        lengths.append(front()[0])
+        front.update()
+        seen.append(front.values[1:].copy())
+        lengths.append(front.values[0])
     assert len(seen) > 3 and np.all(np.diff([x for x, _ in seen]) > -0.03) and np.all(np.diff(lengths) > -1e-12)
     assert seen[-1] == pytest.approx([1.0, 0.507], abs=0.03)
-    again = CrackFront(record, given(scene.study, 2))  # as after a restart
-    again.restore(front.monitors())
-    again.look()
-    np.testing.assert_array_equal(again(), front())
+    again = CrackExtent(record, given(scene.study, 2))  # as after a restart
+    again.from_checkpoint(front.to_checkpoint())
+    again.update()
+    np.testing.assert_array_equal(again.values, front.values)
 
 
 def at_height(ends: np.ndarray, y: float) -> np.ndarray:
@@ -97,7 +97,7 @@ def test_cracks_are_as_long_as_asked_for(mesh: str, order: int, tmp_path: Path) 
         )  # fmt: skip
         record = EdgeRecord(scene.fracture.graph)
         record.note(0.0, scene.fracture.opened)
-        length, *tip = CrackFront(record, given(scene.study, 2))()
+        length, *tip = CrackExtent(record, given(scene.study, 2)).values
         inside = [np.clip(line, 0.0, 1.0) if line is LINES[4] else cut_off(np.array(line)) for line in lines]
         assert length == pytest.approx(sum(np.linalg.norm(b - a) for a, b in inside), abs=0.08 * h * len(lines))
         ends = [end for line in lines for end in line if 0 < end[0] < 1 and 0 < end[1] < 1]
@@ -150,5 +150,5 @@ def test_polygons_are_as_large_as_asked_for() -> None:
             scene, _ = make_scene(mesh=box, crack=[crack], fracture={"strength": 1.0})
             record = EdgeRecord(scene.fracture.graph)
             record.note(0.0, scene.fracture.opened)
-            errors.append(CrackFront(record, given(scene.study, 3))()[0] / exact - 1)
+            errors.append(CrackExtent(record, given(scene.study, 3)).values[0] / exact - 1)
         assert np.abs(errors).max() < each and abs(np.mean(errors)) < mean

@@ -31,7 +31,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("torn")
     write_study(folder / "torn.toml", TORN)
     run = Run(build_scene(MPI.COMM_SELF, validate(TORN, "torn.toml")), folder / "out")
-    while not run.breaks.figures[0]:
+    while not run.breaks.counts[0]:
         run.step()
     assert not run.ended
     run.write_frame()

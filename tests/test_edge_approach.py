@@ -163,7 +163,7 @@ def test_a_restart_takes_up_the_integrity(tmp_path: Path) -> None:
     whole()
     first = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path / "parts")
     steps = iter(range(6))
-    first.interrupt.reason = lambda: "" if next(steps, None) is not None else "the test"  # type: ignore[method-assign]
+    first.interrupt.stop_reason = lambda: "" if next(steps, None) is not None else "the test"  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         first()
     assert first.scene.fracture.graph.broken.any()

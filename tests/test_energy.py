@@ -494,7 +494,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     """Cuts are remembered: the tip goes on from where it is in its cell."""
     tables = RUNS["notched"] | {"output": {"picture": False, "interval": 100.0}, "solver": DIRECT}
     going, broken, again = going_stopped_resumed(tables, tmp_path, 1, 4)
-    assert 0 < broken < going.breaks.figures[0]
+    assert 0 < broken < going.breaks.counts[0]
     assert_alike(again, going, 1e-9)
     np.testing.assert_allclose(again.scene.fracture.criterion.cut, going.scene.fracture.criterion.cut, atol=1e-9)
 

@@ -152,7 +152,7 @@ def test_a_ball_that_strikes_a_block(mass: float) -> None:
     began, energies = momentum(), []
     for report in each_step(scene, state):
         energies.append(report.kinetic + report.elastic + state.dissipated - state.work)
-    figures = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    figures = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert figures["contact_ball_z"] == 0 and figures["velocity_ball_z"] > 0  # it has left
     np.testing.assert_allclose(momentum(), began, atol=1e-12 * abs(began).max())
     np.testing.assert_allclose(energies, energies[0], rtol=0.02 if mass > 10 else 0.1)
@@ -170,7 +170,7 @@ def test_a_weight_dropped_on_a_rail() -> None:
     )  # fmt: skip
     impulse, before = 0.0, 0.0
     for report in each_step(scene, state):
-        figures = dict(zip(scene.probes.names, scene.probes(), strict=True))
+        figures = dict(zip(scene.probes.columns, scene.probes(), strict=True))
         impulse += report.dt * (figures["contact_weight_y"] + before) / 2
         before = figures["contact_weight_y"]
     assert impulse > 100 and abs(figures["velocity_weight_x"]) == 0

@@ -14,9 +14,9 @@ import pyvista
 from mpi4py import MPI
 
 from fracsim.errors import InputError
-from fracsim.output.surface.body_surface import Surface
-from fracsim.output.surface.vtk_files import SurfaceFiles, quaternions
-from fracsim.report.export import export
+from fracsim.output.surface.body_surface import BodySurface
+from fracsim.output.surface.vtk_files import SurfaceFiles, rotation_quaternions
+from fracsim.report.export import export_surfaces
 from fracsim.run import run_study
 from fracsim.study import Study
 from support.solids import lattice, patterns, separated
@@ -30,13 +30,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bar of 6 x 1 x 1 m, whole at first, then in three pieces that lie far away from the origin."""
     folder = tmp_path_factory.mktemp("bar")
     mesh = lattice(6, 1, 1)
-    surface, files = Surface(mesh, 1.0), SurfaceFiles(folder, 3)
+    surface, files = BodySurface(mesh, 1.0), SurfaceFiles(folder, 3)
     x, none = mesh.points, np.zeros_like(mesh.points)
-    files.write(surface.at(0.0, none, none))
+    files.write_frame(surface.make_frame(0.0, none, none))
     part = np.searchsorted([2.5, 3.5], x[:, 0])
     surface.update(patterns(surface.skeleton, separated(surface.skeleton, part)))
     apart = np.array([[0.0, 0, 0], [0.5, 0.25, 0], [40.0, 0, 8.0]])[part]
-    files.write(surface.at(1.0, apart, none))
+    files.write_frame(surface.make_frame(1.0, apart, none))
     (folder / "study.toml").write_text('[output]\nlook = "bread"\n')
     return folder
 
@@ -87,7 +87,7 @@ READERS: dict[str, Callable[[Path], list[Any]]] = {"ply": of_ply, "obj": of_ply,
 def test_what_is_read_again_is_closed_with_its_volume(kind: str, run: Path, tmp_path: Path) -> None:
     """Three pieces, each as large as it was, to 1e-6; before it broke one of 6 m^3."""
     pytest.importorskip("pxr" if kind == "usd" else "trimesh")
-    made = export(run, kind, tmp_path)
+    made = export_surfaces(run, kind, tmp_path)
     assert len(made) == (1 if kind == "usd" else 2) and all(path.parent == tmp_path for path in made)
     found = sorted(volume(each) for each in READERS[kind](made[-1]))
     expected = sorted(_cut_volumes(run))
@@ -139,7 +139,7 @@ def rigid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_rigid_pieces_are_closed_with_their_volumes(kind: str, rigid: Path, tmp_path: Path) -> None:
     """As many as pieces.csv has, each as large, to 1e-6; all together 0.024 m^3. The floor is none of them."""
     pytest.importorskip("pxr" if kind == "usd" else "trimesh")
-    made, volume_of = export(rigid, kind, tmp_path)[-1], volume_in_single if kind == "glb" else volume
+    made, volume_of = export_surfaces(rigid, kind, tmp_path)[-1], volume_in_single if kind == "glb" else volume
     found = sorted(volume_of(each) for each in (by_trimesh if kind == "glb" else READERS[kind])(made))
     with (rigid / "pieces.csv").open() as file:
         rows = [*csv.DictReader(file)]
@@ -152,7 +152,7 @@ def test_usd_has_every_frame_and_metres(run: Path, tmp_path: Path) -> None:
     pxr = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom
 
-    stage = pxr.Stage.Open(str(export(run, "usd", tmp_path)[0]))
+    stage = pxr.Stage.Open(str(export_surfaces(run, "usd", tmp_path)[0]))
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
     assert mesh.GetPointsAttr().GetTimeSamples() == [0.0, 1.0] and stage.GetEndTimeCode() == 1.0
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
@@ -163,7 +163,7 @@ def test_usd_has_every_frame_and_metres(run: Path, tmp_path: Path) -> None:
 def test_colours_are_those_of_the_look(run: Path, tmp_path: Path) -> None:
     """Of faces, in PLY, as trimesh reads them: two, and as many of the inside as cracks have triangles."""
     trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.load(export(run, "ply", tmp_path, frame=-1)[0], process=False)
+    mesh = trimesh.load(export_surfaces(run, "ply", tmp_path, frame=-1)[0], process=False)
     colours, count = np.unique(mesh.visual.face_colors[:, :3], axis=0, return_counts=True)
     assert colours.tolist() == [[0xB9, 0x71, 0x2C], [0xF0, 0xDE, 0xB6]]
     grid = pyvista.read(run / "surface/surface_000001.vtu")
@@ -171,20 +171,20 @@ def test_colours_are_those_of_the_look(run: Path, tmp_path: Path) -> None:
 
 
 def test_obj_names_its_pieces(run: Path, tmp_path: Path) -> None:
-    text = export(run, "obj", tmp_path, frame=1)[0].read_text()
+    text = export_surfaces(run, "obj", tmp_path, frame=1)[0].read_text()
     assert [line for line in text.splitlines() if line.startswith("o ")] == [f"o piece_{n:06d}" for n in PIECES]
 
 
 def test_what_cannot_be_exported(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--format stl: must be one of ply, obj, glb, usd"):
-        export(run, "stl")
+        export_surfaces(run, "stl")
     with pytest.raises(InputError, match=r"--frame 7: .* has 2 frames"):
-        export(run, "obj", frame=7)
+        export_surfaces(run, "obj", frame=7)
     flat = lattice(2, 2)
     none = np.zeros_like(flat.points)
-    SurfaceFiles(tmp_path, 2).write(Surface(flat, 1.0).at(0.0, none, none))
+    SurfaceFiles(tmp_path, 2).write_frame(BodySurface(flat, 1.0).make_frame(0.0, none, none))
     with pytest.raises(InputError, match="2D has no closed surface"):
-        export(tmp_path, "obj")
+        export_surfaces(tmp_path, "obj")
 
 
 def test_quaternions_turn_as_rotation_vectors_do() -> None:
@@ -192,7 +192,7 @@ def test_quaternions_turn_as_rotation_vectors_do() -> None:
     from scipy.spatial.transform import Rotation
 
     turn = np.concatenate([np.zeros((1, 3)), np.random.default_rng(1).normal(size=(20, 3)) * 2])
-    found = quaternions(turn)
+    found = rotation_quaternions(turn)
     assert (found[:, 0] >= 0).all() and found[0].tolist() == [1.0, 0.0, 0.0, 0.0]
     wanted = Rotation.from_rotvec(turn).as_matrix()
     np.testing.assert_allclose(Rotation.from_quat(np.roll(found, -1, axis=1)).as_matrix(), wanted, atol=1e-12)

@@ -15,12 +15,12 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed, fracsim, study, write_study
-from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
-from fracsim.report.export import export
-from fracsim.report.pictures.frames import times_shown
+from fracsim.report.export import export_surfaces
+from fracsim.report.pictures.frames import film_repetitions
 from fracsim.report.pictures.picture import render
-from fracsim.report.pictures.picture_options import Look
+from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study import Study
@@ -149,12 +149,12 @@ def test_an_interval_that_is_no_multiple_of_the_step_is_told_of(tmp_path: Path) 
     ],
 )
 def test_pictures_of_a_film_are_evenly_spaced_in_time(times: list[float], shown: list[int]) -> None:
-    assert times_shown(times).tolist() == shown
+    assert film_repetitions(times).tolist() == shown
 
 
 def test_a_film_has_few_pictures_where_few_frames_are_close() -> None:
     times = np.concatenate([1e-6 * np.arange(50), np.linspace(0.1, 1.0, 10)])
-    counts = times_shown(times.tolist())
+    counts = film_repetitions(times.tolist())
     assert counts.sum() <= 4 * len(times) + 1 and counts[-1] > 0
     # equal times are equal parts of the film
     assert counts[50:59] == pytest.approx(counts[50:59].mean(), abs=1)
@@ -166,9 +166,9 @@ def uneven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("uneven") / "block"
     folder.mkdir()
     mesh = lattice(2, 1, 1)
-    surface, files = Surface(mesh, 1.0), SurfaceFiles(folder, 3)
+    surface, files = BodySurface(mesh, 1.0), SurfaceFiles(folder, 3)
     for t in (0.0, 0.01, 0.02, 0.04):
-        files.write(surface.at(t, np.full_like(mesh.points, t), np.ones_like(mesh.points)))
+        files.write_frame(surface.make_frame(t, np.full_like(mesh.points, t), np.ones_like(mesh.points)))
     return folder
 
 
@@ -176,13 +176,13 @@ def test_a_film_lasts_as_long_as_the_motion(uneven: Path, tmp_path: Path) -> Non
     """Five pictures of 10 ms at 10 a second, the third of them held; a folder has the four frames."""
     from PIL import Image
 
-    film = Image.open(render(uneven, tmp_path / "film.gif", Look(size=(160, 120), bare=True), fps=10))
+    film = Image.open(render(uneven, tmp_path / "film.gif", PictureOptions(size=(160, 120), bare=True), fps=10))
     lengths = []
     for frame in range(film.n_frames):
         film.seek(frame)
         lengths.append(film.info["duration"])
     assert sum(lengths) == 500 and Counter(lengths) in (Counter({100: 3, 200: 1}), Counter({100: 5}))
-    render(uneven, tmp_path / "pictures", Look(size=(160, 120), bare=True))
+    render(uneven, tmp_path / "pictures", PictureOptions(size=(160, 120), bare=True))
     assert len(list((tmp_path / "pictures").iterdir())) == 4
 
 
@@ -191,7 +191,7 @@ def test_usd_has_simulated_time(uneven: Path, tmp_path: Path) -> None:
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
-    (path,) = export(uneven, "usd", tmp_path)
+    (path,) = export_surfaces(uneven, "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
     points = UsdGeom.Mesh(stage.GetDefaultPrim()).GetPointsAttr()
     codes = points.GetTimeSamples()
@@ -204,11 +204,11 @@ def test_usd_has_simulated_time(uneven: Path, tmp_path: Path) -> None:
 
 def test_files_of_a_frame_have_its_time(uneven: Path, tmp_path: Path) -> None:
     pytest.importorskip("trimesh")
-    (glb,) = export(uneven, "glb", tmp_path, frame=2)
+    (glb,) = export_surfaces(uneven, "glb", tmp_path, frame=2)
     length = struct.unpack("<I", glb.read_bytes()[12:16])[0]
     scene = json.loads(glb.read_bytes()[20 : 20 + length])["scenes"][0]
     assert scene["extras"]["time"] == 0.02
-    (obj,) = export(uneven, "obj", tmp_path, frame=2)
+    (obj,) = export_surfaces(uneven, "obj", tmp_path, frame=2)
     assert obj.read_text().splitlines()[1] == "# t = 0.02 s"
-    (ply,) = export(uneven, "ply", tmp_path, frame=2)
+    (ply,) = export_surfaces(uneven, "ply", tmp_path, frame=2)
     assert b"\ncomment t = 0.02 s\n" in ply.read_bytes()[:300]

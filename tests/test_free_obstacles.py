@@ -39,7 +39,7 @@ def contact_of(scene: Scene) -> FreeObstacleTerm:
 
 def told(scene: Scene) -> dict[str, float]:
     """The columns of history.csv."""
-    return dict(zip(scene.probes.names, scene.probes(), strict=True))
+    return dict(zip(scene.probes.columns, scene.probes(), strict=True))
 
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fracsim.output.energy_check import EnergyGain, worth_telling
-from fracsim.output.summary import trouble_in_words
+from fracsim.output.result_checks import EnergyGainMonitor, negligible_energy
+from fracsim.output.summary import describe_trouble
 from support.scenes import deform, make_scene
 
 
-def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> EnergyGain:
+def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> EnergyGainMonitor:
     """A watch that has seen rows of (kinetic, elastic, dissipated, work), J."""
-    watch = EnergyGain(at_rest=at_rest)
+    watch = EnergyGainMonitor(at_rest=at_rest)
     for step, (kinetic, elastic, dissipated, work) in enumerate(rows, 1):
         report: Any = SimpleNamespace(kinetic=kinetic, elastic=elastic)
         state: Any = SimpleNamespace(t=0.1 * step, dissipated=dissipated, work=work)
-        watch.look(report, state)
+        watch.record_step(report, state)
     return watch
 
 
@@ -43,10 +43,10 @@ def test_the_step_that_gained_most_is_named() -> None:
     told = "gained 4 J of energy from nowhere (100% of it in the step to t = 0.5 s), 89% of all"
     assert told in watched([*held, (4.5, 0.0, 0.0, 0.5)]).note("generalized-alpha")
     assert "gained 4 J of energy from nowhere, " in watched([(n, 0.0, 0.0, 0.0) for n in range(1, 5)]).note("newmark")
-    first, again = watched(held), EnergyGain(at_rest=True)
-    again.restore(first.monitors())
+    first, again = watched(held), EnergyGainMonitor(at_rest=True)
+    again.from_checkpoint(first.to_checkpoint())
     last: Any = SimpleNamespace(kinetic=4.5, elastic=0.0), SimpleNamespace(t=0.5, dissipated=0.0, work=0.5)
-    again.look(*last)
+    again.record_step(*last)
     assert told in again.note("generalized-alpha")
 
 
@@ -62,16 +62,16 @@ def test_a_note_does_not_advise_what_is_so_already() -> None:
 def test_round_off_is_not_told() -> None:
     """A steel block that lies there: 4e-14 J are of strains of 1e-12, and no gain."""
     scene, _ = make_scene(material={"energy": "linear", "young": 2e11, "poisson": 0.3, "density": 7800.0})
-    watch = EnergyGain(at_rest=True, floor=worth_telling(scene.balance.stress))
+    watch = EnergyGainMonitor(at_rest=True, floor=negligible_energy(scene.balance.stress))
     assert watch.floor == pytest.approx(2e11 * 1.0 * 9e-16)
-    watch.look(SimpleNamespace(kinetic=4e-14, elastic=0.0), SimpleNamespace(t=0.1, dissipated=0.0, work=0.0))  # type: ignore[arg-type]
+    watch.record_step(SimpleNamespace(kinetic=4e-14, elastic=0.0), SimpleNamespace(t=0.1, dissipated=0.0, work=0.0))  # type: ignore[arg-type]
     assert watch.rise == 4e-14 and watch.note("newmark") == ""
 
 
 def test_what_a_run_went_on_in_spite_of_is_one_sentence() -> None:
     """Counts of what happened, none of what did not; a halved step that was taken in the end is no trouble."""
-    assert trouble_in_words({"steps_failed": 7, "linear_failures": 0}) == ""
-    words = trouble_in_words({"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5})
+    assert describe_trouble({"steps_failed": 7, "linear_failures": 0}) == ""
+    words = describe_trouble({"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5})
     assert words.startswith("the run went on in spite of 2 steps that ended out of balance")
     assert "; 5 cells crushed flat" in words and "linear" not in words
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import fracsim
 from fracsim.forms.schemes import SCHEMES
-from fracsim.output.history import COLUMNS
+from fracsim.output.history import HISTORY_COLUMNS
 from fracsim.study.time_and_output import FIELDS
 from fracsim.timestepping.stepper import FailureCounts
 
@@ -46,7 +46,7 @@ def test_rows_have_a_meaning() -> None:
 def test_columns_fields_and_figures_are_defined() -> None:
     """All names that files of the output folder have."""
     trouble = {field.name for field in dataclasses.fields(FailureCounts)}
-    names = {*COLUMNS, *FIELDS, *SCHEMES, *trouble, *keys_of_summaries()}
+    names = {*HISTORY_COLUMNS, *FIELDS, *SCHEMES, *trouble, *keys_of_summaries()}
     assert not names - CODE
 
 

@@ -86,14 +86,14 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     """A corner of the square cut off: one node, whose lumped mass is a third of its cells'."""
     tables = {"mesh": MESH, "fracture": {"strength": 1e9}, "output": {"picture": False, "surface": True}}
     run = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path)
-    assert run.breaks.dust(run.scene.domain.volumes) == (0, 0.0)
+    assert run.breaks.count_single_nodes(run.scene.domain.volumes) == (0, 0.0)
     domain = run.scene.domain
     corner = int(np.argmin(domain.nodes.sum(axis=1)))
     graph = run.scene.fracture.graph  # type: ignore[union-attr]
     graph.break_edges((graph.edge_nodes == corner).any(axis=1))
     run.note_breaks()
     wanted = domain.volumes[(graph.cell_nodes == corner).any(axis=1)].sum() / 3
-    count, mass = run.breaks.dust(domain.volumes)
+    count, mass = run.breaks.count_single_nodes(domain.volumes)
     assert count == 1 and mass == pytest.approx(wanted, rel=1e-12)
     assert "1 of them dust (single nodes; [fracture] crumbs = false leaves none)" in _dust({"dust": count})
     assert not _dust({"dust": 0}) and not _dust({})

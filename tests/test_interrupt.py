@@ -20,7 +20,7 @@ from mpi4py import MPI
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, mpirun, study, write_study
 from fracsim.errors import Exit, Stopped
 from fracsim.output import interrupt
-from fracsim.output.interrupt import Interrupt
+from fracsim.output.interrupt import InterruptHandler
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study import Study
@@ -87,16 +87,16 @@ class Asked:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.count, self.number = 0, 0
-        abandons = Interrupt.abandons
+        abandons = InterruptHandler.must_abandon_step
 
-        def counted(of: Interrupt) -> bool:
+        def counted(of: InterruptHandler) -> bool:
             self.count += 1
             if self.count == self.number:
                 os.kill(os.getpid(), signal.SIGTERM)
             return abandons(of)
 
-        monkeypatch.setattr(Interrupt, "abandons", counted)
-        monkeypatch.setattr(interrupt, "SHORT", -1.0)  # every step is long
+        monkeypatch.setattr(InterruptHandler, "abandons", counted)
+        monkeypatch.setattr(interrupt, "MAX_UNINTERRUPTED_SECONDS", -1.0)  # every step is long
 
     def begin(self, number: int = 0) -> None:
         self.count, self.number = 0, number
@@ -184,10 +184,10 @@ def test_the_wall_limit_abandons_a_long_step(tmp_path: Path, monkeypatch: pytest
     """A step that is short is completed; one that is not is given up."""
     data = study(STRIPS["passes"])
     with pytest.raises(Stopped, match=r"the wall-time limit at t = 0\.005 s after 1 steps\. Checkpoint"):
-        monkeypatch.setattr(interrupt, "SHORT", 1e9)
+        monkeypatch.setattr(interrupt, "MAX_UNINTERRUPTED_SECONDS", 1e9)
         Run(build_scene(MPI.COMM_SELF, data), tmp_path / "short", wall_limit=0.0)()
     with pytest.raises(Stopped, match=r"the wall-time limit at t = 0 s after 0 steps; the step that was under way"):
-        monkeypatch.setattr(interrupt, "SHORT", -1.0)
+        monkeypatch.setattr(interrupt, "MAX_UNINTERRUPTED_SECONDS", -1.0)
         Run(build_scene(MPI.COMM_SELF, data), tmp_path / "long", wall_limit=0.0)()
 
 

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, command, fracsim_here, study, swept_here, write_study
 from fracsim.errors import InputError
-from fracsim.output.file_ownership import FILES, NEW
+from fracsim.output.file_ownership import NEW, OUTPUT_FILES
 from fracsim.run import Run
 from fracsim.scene import build_scene
 
@@ -46,7 +46,7 @@ def precious(tmp_path: Path) -> Path:
         "log.txt",
         "report.html",
         "sweep.csv",
-        *FILES,
+        *OUTPUT_FILES,
         *(f"surface/surface_{n:06d}.vtu" for n in range(12)),
     ):
         (folder / name).write_text(WORDS)
@@ -55,7 +55,7 @@ def precious(tmp_path: Path) -> Path:
 
 def assert_untouched(folder: Path) -> None:
     files = [path for path in folder.rglob("*") if not path.is_dir()]
-    assert len(files) == 12 + len(FILES) + 4
+    assert len(files) == 12 + len(OUTPUT_FILES) + 4
     assert all(path.is_file() and not path.is_symlink() and path.read_text() == WORDS for path in files)
 
 
@@ -75,9 +75,9 @@ def test_no_file_that_is_not_whole_is_written_through_a_link(tmp_path: Path, pre
     """At the names by which a run writes before it replaces: in a new folder, in an old one, and going on."""
     out = tmp_path / "out"
     for how in ({}, {}, {"restart": True}):
-        link(out, precious, ["study.toml", *FILES], NEW)
+        link(out, precious, ["study.toml", *OUTPUT_FILES], NEW)
         if not how and not (out / "study.toml").exists():  # a new folder may hold no more than this
-            for name in FILES:
+            for name in OUTPUT_FILES:
                 (out / (name + NEW)).unlink()
             (out / "checkpoint").rmdir()
         run(out, **how)
@@ -89,13 +89,13 @@ def test_no_file_is_written_through_a_link(tmp_path: Path, precious: Path) -> No
     """At the names of the files themselves; frames that do not exist yet as well."""
     out, frames = tmp_path / "out", [f"surface/surface_{number:06d}.vtu" for number in range(12)]
     run(out)
-    link(out, precious, [*FILES, *frames])
+    link(out, precious, [*OUTPUT_FILES, *frames])
     (out / "pieces.csv").unlink()
     (out / "pieces.csv").symlink_to(tmp_path / "gone.csv")  # a link to nothing is not followed either
     run(out, overwrite=True)
     assert_untouched(precious)
     assert not (tmp_path / "gone.csv").exists()
-    assert all((out / name).is_file() and not (out / name).is_symlink() for name in FILES if name != "last.png")
+    assert all((out / name).is_file() and not (out / name).is_symlink() for name in OUTPUT_FILES if name != "last.png")
 
 
 @pytest.mark.parametrize("name", ["surface", "checkpoint"])
@@ -139,7 +139,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path, kind: str
     out, make, said = tmp_path / "cases" / "end-0.01", *OTHERS[kind]
     strip = write_study(tmp_path / "strip.toml", TEARING)
     run(out)
-    for name in ("study.toml", *FILES):
+    for name in ("study.toml", *OUTPUT_FILES):
         place = out / name
         if place.exists():
             place.rename(tmp_path / "kept")
@@ -169,7 +169,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path, kind: str
 def test_leftovers_that_are_pipes_are_replaced(tmp_path: Path) -> None:
     """By the names of files that are not whole yet, which are fracsim's own."""
     run(tmp_path / "out")
-    for name in ("study.toml", *FILES):
+    for name in ("study.toml", *OUTPUT_FILES):
         pipe(tmp_path / "out" / (name + NEW))
     done = limited("run", write_study(tmp_path / "strip.toml", TEARING), "-o", tmp_path / "out", "--overwrite")
     assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ import pytest
 
 from cases import BAR, command, fracsim, fracsim_here, write_study
 from fracsim.errors import Exit, InputError
-from fracsim.output.lock import LOCK, FolderLock, holder
+from fracsim.output.lock import LOCK_FILE, FolderLock, describe_lock_holder
 
 # Holds a lock on a folder by flock(1)'s own means, and says so.
 HOLD = """
@@ -69,7 +69,7 @@ def test_a_second_run_is_refused_and_the_first_loses_nothing(tmp_path: Path) -> 
     first.send_signal(signal.SIGUSR1)
     assert first.wait(timeout=30) == Exit.STOPPED
     assert steps(out) == list(range(1, len(steps(out)) + 1))
-    assert not (out / LOCK).exists()
+    assert not (out / LOCK_FILE).exists()
 
 
 def test_a_killed_run_leaves_no_lock(tmp_path: Path) -> None:
@@ -78,16 +78,16 @@ def test_a_killed_run_leaves_no_lock(tmp_path: Path) -> None:
             FolderLock(tmp_path).acquire()
         process.kill()
         process.wait()
-        assert (tmp_path / LOCK).exists() and holder(tmp_path) is None
+        assert (tmp_path / LOCK_FILE).exists() and describe_lock_holder(tmp_path) is None
         with FolderLock(tmp_path) as lock:
             assert lock.acquire()
-    assert not (tmp_path / LOCK).exists()
+    assert not (tmp_path / LOCK_FILE).exists()
 
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "folder", "pipe"])
 def test_a_lock_file_is_a_plain_file(tmp_path: Path, kind: str) -> None:
     """What lies under its name is left as it is."""
-    path, precious, out = tmp_path / "out" / LOCK, tmp_path / "precious", tmp_path / "out"
+    path, precious, out = tmp_path / "out" / LOCK_FILE, tmp_path / "precious", tmp_path / "out"
     precious.write_text("mine")
     out.mkdir()
     {
@@ -97,8 +97,8 @@ def test_a_lock_file_is_a_plain_file(tmp_path: Path, kind: str) -> None:
         "pipe": lambda: os.mkfifo(path),
     }[kind]()
     done = fracsim("run", write_study(tmp_path / "bar.toml", BAR), "-o", out)
-    assert done.returncode == Exit.BAD_INPUT and f"{LOCK} is not a plain file" in done.stderr
-    assert precious.read_text() == "mine" and sorted(each.name for each in out.iterdir()) == [LOCK]
+    assert done.returncode == Exit.BAD_INPUT and f"{LOCK_FILE} is not a plain file" in done.stderr
+    assert precious.read_text() == "mine" and sorted(each.name for each in out.iterdir()) == [LOCK_FILE]
 
 
 def test_a_file_system_without_locks(

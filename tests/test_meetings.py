@@ -96,7 +96,7 @@ def test_it_is_told_after_a_restart_too(tmp_path: Path, capsys: pytest.CaptureFi
     tables = struck(velocity=[0.0, -20.0], at=[0.5, 0.25])
     tables["obstacle"] += [{"name": "floor", "shape": "plane", "at": [0.0, -3.0], "normal": [0.0, 1.0]}]
     stopped = begun(tables, tmp_path)
-    stopped.interrupt.reason = lambda: "the test" if stopped.state.t > 0.008 else ""  # type: ignore[method-assign]
+    stopped.interrupt.stop_reason = lambda: "the test" if stopped.state.t > 0.008 else ""  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
     assert "never met" not in capsys.readouterr().err
@@ -179,7 +179,7 @@ def test_pieces_are_told_of_after_a_restart(tmp_path: Path, capsys: pytest.Captu
     """Stopped once it was seen: not looked for again, and told at the end all the same."""
     tables = two_bodies(tmp_path)
     stopped = begun(tables, tmp_path / "out")
-    stopped.interrupt.reason = lambda: "the test" if stopped.state.t > 0.7 else ""  # type: ignore[method-assign]
+    stopped.interrupt.stop_reason = lambda: "the test" if stopped.state.t > 0.7 else ""  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
     assert "first seen at t = 0.75 s" in capsys.readouterr().err
@@ -191,7 +191,7 @@ def test_one_piece_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def never(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("fracsim.mesh.interpenetration.overlap", never)
+    monkeypatch.setattr("fracsim.mesh.interpenetration.find_interpenetration", never)
     one = begun(STRIP, tmp_path)
     assert one.watched.passing is not None
     one()

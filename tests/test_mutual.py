@@ -129,7 +129,7 @@ def test_a_pile_on_a_body_weighs_what_it_weighs() -> None:
         time={"scheme": "backward-euler", "step": 0.05, "end": 0.8},
     )  # fmt: skip
     march(scene, state)
-    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert told["contact_box_y"] == pytest.approx(13.0 * G, rel=1e-3) and told["contact_it_y"] == 0.0
     assert term._free_system is not None
     assert [force[1] for force in term._free_system.wrenches().values()] == pytest.approx([-5.0 * G, 5.0 * G], rel=1e-3)

@@ -257,7 +257,7 @@ def test_friction_acts_between_corners(dim: int) -> None:
         time={"scheme": "backward-euler", "step": 0.05, "end": 0.35},
     )  # fmt: skip
     march(scene, state)
-    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     *across, pressed = (told[f"contact_it_{axis}"] for axis in "xyz"[:dim])
     assert pressed > 50 and across[0] < 0 and np.linalg.norm(across) == pytest.approx(0.3 * pressed, rel=0.08)
 
@@ -272,7 +272,7 @@ def test_a_ball_that_spins_is_driven_off_by_what_it_presses() -> None:
         time={"scheme": "backward-euler", "step": 4e-3, "end": 0.044},
     )  # fmt: skip
     march(scene, state)
-    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     given = 0.5 * (told["velocity_it_y"] + 1.0)
     assert given > 0.5 and 0.5 * told["velocity_it_x"] == pytest.approx(-0.2 * given, rel=0.02)
     both = (mass(scene) * state.v.reshape(-1, 2)).sum(axis=0)
@@ -350,5 +350,5 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
         "output": {"picture": False},
     }
     going, broken, again = going_stopped_resumed(tables, tmp_path, 2, 1)
-    assert 0 < broken < going.breaks.figures[0]
+    assert 0 < broken < going.breaks.counts[0]
     assert_alike(again, going, 1e-6)

@@ -14,10 +14,10 @@ from mpi4py import MPI
 from fracsim.contact.drawing import ObstacleTessellation
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, Sphere
-from fracsim.output.surface.collection import read_entries
+from fracsim.output.surface.vtk_files import read_pvd
 from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import render
-from fracsim.report.pictures.picture_options import Look
+from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
@@ -71,7 +71,7 @@ def test_what_does_not_move_is_written_once(shown: Path) -> None:
     names = sorted(path.name for path in (shown / "surface").iterdir() if path.name.startswith("obstacle"))
     assert names == ["obstacle_disk_000000.vtu", "obstacle_disk_000001.vtu", "obstacle_disk_000002.vtu",
                      "obstacle_floor_000000.vtu"]  # fmt: skip
-    parts = {(each.part, each.name) for each in read_entries(shown / "surface.pvd")}
+    parts = {(each.part, each.name) for each in read_pvd(shown / "surface.pvd")}
     assert parts == {(0, "body"), (1, "floor"), (2, "disk")}
 
 
@@ -95,7 +95,7 @@ def test_a_picture_has_them(shown: Path, tmp_path: Path) -> None:
     """Above the floor, which is wide, all of their colour is a disk: pi / 4 of its bounding box."""
     from imageio.v3 import imread
 
-    pixels = np.asarray(imread(render(shown, tmp_path / "picture.png", Look(zoom=0.6))))[..., :3].astype(int)
+    pixels = np.asarray(imread(render(shown, tmp_path / "picture.png", PictureOptions(zoom=0.6))))[..., :3].astype(int)
     solid = np.abs(pixels - [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]).max(axis=2) <= 2
     floor = solid.mean(axis=1) > 0.5
     assert floor.any()

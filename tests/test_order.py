@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 import xdmf_reader
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface
-from fracsim.output.fracture_log import Breaks
+from fracsim.output.fracture_log import FractureLog
 from fracsim.run import run_study
 from fracsim.studies.evidence.precision.manufactured import errors, solved
 from fracsim.study.check import check_study
@@ -202,7 +202,7 @@ def pressed(order: int, **more: Any) -> tuple[float, Any]:
     )
     march(scene, state)
     top = np.abs(scene.domain.nodes[:, 1] - 1) < 1e-9
-    force = dict(zip(scene.probes.names, scene.probes(), strict=True))["contact_plate_y"]
+    force = dict(zip(scene.probes.columns, scene.probes(), strict=True))["contact_plate_y"]
     return force, state.u.reshape(-1, 2)[top, 1]
 
 
@@ -307,7 +307,7 @@ def test_dust_is_what_has_one_corner() -> None:
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 1.0, "order": 2}, fracture={"strength": 1.0})
     graph = scene.fracture.graph
     graph.break_edges(np.ones(len(graph.broken), bool))
-    breaks = Breaks(scene.balance.stress, scene.fracture)
+    breaks = FractureLog(scene.balance.stress, scene.fracture)
     corners = len(scene.domain.source.points)
-    assert breaks.figures[2] == corners
-    assert breaks.dust(scene.domain.volumes) == (corners, pytest.approx(1.0))
+    assert breaks.counts[2] == corners
+    assert breaks.count_single_nodes(scene.domain.volumes) == (corners, pytest.approx(1.0))

@@ -21,9 +21,9 @@ from mpi4py import MPI
 
 import xdmf_reader
 from cases import BAR, STRIP, command, study, write_study
-from fracsim.output.surface.vtu import write_vtu
-from fracsim.report.pictures.colour_maps import select
-from fracsim.report.pictures.frames import Shot, find_frames, load
+from fracsim.output.surface.vtk_files import write_vtu
+from fracsim.report.pictures.colour_maps import select_array
+from fracsim.report.pictures.frames import FrameSource, find_frames, load_grid
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
@@ -271,11 +271,11 @@ def test_a_restart_does_not_mix_orders_of_tensors(tmp_path: Path) -> None:
     run.checkpoint()
     run.history.close()
     make_earlier(parts)
-    of_surface, of_mesh = load(find_frames(parts)[2]), load(Shot(0.0, parts / "fields.h5", 2))
+    of_surface, of_mesh = load_grid(find_frames(parts)[2]), load_grid(FrameSource(0.0, parts / "fields.h5", 2))
     cells, elements = stresses(whole)
     scale = np.abs(cells[-1]).max()
     for grid, wanted in ((of_mesh, cells[2]), (of_surface, elements[2])):
-        shown = grid.cell_data[select(grid, "stress:yy")]
+        shown = grid.cell_data[select_array(grid, "stress:yy")]
         np.testing.assert_allclose(shown, wanted[:, 1], atol=1e-6 * scale)
     Run(build_scene(MPI.COMM_SELF, data), parts, restart=True)()
     for found, reference in zip(stresses(parts), (cells, elements), strict=True):
@@ -335,7 +335,7 @@ def test_the_picture_shows_something(output: Output, tmp_path: Path) -> None:
 
 def test_the_colour_of_a_piece_depends_on_its_number_alone() -> None:
     """Not on which other pieces there are, so that it stays from frame to frame; the palette of 20 starts again."""
-    from fracsim.report.pictures.colour_maps import colours
+    from fracsim.report.pictures.colour_maps import map_colours
 
-    ten, zero, twenty = colours(np.array([10.0, 0.0, 20.0]), None, "#000000").tolist()
-    assert zero == twenty != ten == colours(np.array([10.0]), None, "#000000")[0].tolist()
+    ten, zero, twenty = map_colours(np.array([10.0, 0.0, 20.0]), None, "#000000").tolist()
+    assert zero == twenty != ten == map_colours(np.array([10.0]), None, "#000000")[0].tolist()

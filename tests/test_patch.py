@@ -15,7 +15,7 @@ import pytest
 
 from fracsim.forms.energies import ENERGIES
 from fracsim.meshes.topology import boundary_facets
-from fracsim.output.fields import Frames
+from fracsim.output.frame_files import FieldEvaluator
 from fracsim.scene import Scene
 from fracsim.timestepping.state import State
 from support.laws import law_of
@@ -58,7 +58,7 @@ def patch(dim: int, energy: str, scheme: str, steps: int, plane: str = "strain")
 
 def stress_of(scene: Scene, state: State) -> Values:
     """(cells, 6) Cauchy stress as it is written: xx, xy, xz, yy, yz, zz."""
-    return Frames(scene.balance.stress, ["stress"])(state, None)[1].values
+    return FieldEvaluator(scene.balance.stress, ["stress"])(state, None)[1].values
 
 
 def expected_stress(energy: str, dim: int, F: Values) -> Values:

@@ -15,21 +15,21 @@ import pytest
 from fracsim.errors import InputError
 from fracsim.mechanics.surface_data import SurfaceData
 from fracsim.output.fields_file import Field
-from fracsim.output.surface.body_surface import Surface
+from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
-from fracsim.report.pictures.annotations import in_seconds, in_words, lettered, nice
-from fracsim.report.pictures.material_looks import SKINS
+from fracsim.report.pictures.annotations import annotate, format_length, format_time, round_length
+from fracsim.report.pictures.material_looks import MATERIAL_LOOKS
 from fracsim.report.pictures.obstacle_meshes import COLOUR
-from fracsim.report.pictures.picture import GAP, render, tiled
-from fracsim.report.pictures.picture_options import SIZE, Look, limits_of, size_of
-from fracsim.report.pictures.renderer import opening
+from fracsim.report.pictures.picture import GAP, render, tile_pictures
+from fracsim.report.pictures.picture_options import SIZE, PictureOptions, parse_limits, parse_size
+from fracsim.report.pictures.renderer import crack_opening
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 
 Pixels = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 SMALL = (420, 300)
-FRONT = Look(view="front", size=SMALL, skin="#ff0000,#00ff00", bare=True)
+FRONT = PictureOptions(view="front", size=SMALL, material="#ff0000,#00ff00", bare=True)
 CUT = 3.5  # m: where the bar of 6 x 1 x 1 m is cut
 
 
@@ -44,7 +44,7 @@ def written(
 ) -> Path:
     """A bar along x, a frame for each of the gaps (m) of its crack."""
     mesh = lattice(6, 1, 1) if dim == 3 else lattice(6, 2)
-    surface, files = Surface(mesh, 1.0), SurfaceFiles(folder, dim)
+    surface, files = BodySurface(mesh, 1.0), SurfaceFiles(folder, dim)
     skeleton = surface.skeleton
     if cut:
         surface.update(patterns(skeleton, separated(skeleton, (mesh.points[:, 0] > CUT).astype(int))))
@@ -53,7 +53,7 @@ def written(
         u[mesh.points[:, 0] > CUT, 0] = gap
         middles = mesh.points[mesh.cells].mean(axis=1)
         more = fields(middles[:, 0]) if fields is not None else []
-        files.write(surface.at(float(t), u, np.zeros_like(u), fields=more))
+        files.write_frame(surface.make_frame(float(t), u, np.zeros_like(u), fields=more))
     return folder
 
 
@@ -68,7 +68,7 @@ def of_hue(pixels: Pixels, channel: int) -> npt.NDArray[np.bool_]:
 
 def test_the_inside_has_its_own_colour_and_is_seen_in_the_gap(tmp_path: Path) -> None:
     """From aslant a wall of the open crack, green, between skins, red; nothing green before it is cut."""
-    look = Look(view="1,-2,0.3", size=SMALL, skin=FRONT.skin, bare=True)
+    look = PictureOptions(view="1,-2,0.3", size=SMALL, material=FRONT.material, bare=True)
     whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), look=look))
     torn = shown(render(written(tmp_path / "torn", 1.0), look=look))
     assert of_hue(whole, 0).mean() > 0.05 and not of_hue(whole, 1).any()
@@ -97,13 +97,17 @@ def test_a_crack_that_opens_by_less_than_a_pixel_is_a_line(tmp_path: Path) -> No
 def test_the_opening_is_the_distance_of_what_was_at_one_place() -> None:
     rest = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0]])
     at = rest + np.array([[0.5, 0, 0], [0, 0, 0], [3e-3, 0, 0], [0, 4e-3, 0]])
-    np.testing.assert_allclose(opening(at, rest), [0.0, 5e-3, 5e-3, 5e-3])
+    np.testing.assert_allclose(crack_opening(at, rest), [0.0, 5e-3, 5e-3, 5e-3])
 
 
 def test_magnified_displacements(tmp_path: Path) -> None:
     """A gap of 1 mm, too narrow for a pixel, is 2 m wide at 2000 times: a third of the bar."""
     folder = written(tmp_path, 1e-3)
-    pixels = shown(render(folder, look=Look(view="front", size=SMALL, skin=FRONT.skin, bare=True, magnify=2000.0)))
+    pixels = shown(
+        render(
+            folder, look=PictureOptions(view="front", size=SMALL, material=FRONT.material, bare=True, magnify=2000.0)
+        )
+    )
     row = of_hue(pixels, 0)[SMALL[1] // 2]
     columns = np.flatnonzero(row)
     gap = np.count_nonzero(~row[columns.min() : columns.max()])
@@ -113,14 +117,14 @@ def test_magnified_displacements(tmp_path: Path) -> None:
 def test_dust_is_hidden_on_request(tmp_path: Path) -> None:
     """A corner of the bar that flew off to the left is red on the picture, or it is not; the bar is."""
     mesh = lattice(6, 1, 1)
-    surface = Surface(mesh, 1.0)
+    surface = BodySurface(mesh, 1.0)
     corner = int(np.argmin(mesh.points.sum(axis=1)))
     part = (np.arange(len(mesh.points)) == corner).astype(int)
     surface.update(patterns(surface.skeleton, separated(surface.skeleton, part)))
     u = np.zeros_like(mesh.points)
     u[corner, 0] = -1.0
-    SurfaceFiles(tmp_path, 3).write(surface.at(0.0, u, np.zeros_like(u)))
-    far = Look(view="front", size=SMALL, skin=FRONT.skin, bare=True, zoom=0.6)
+    SurfaceFiles(tmp_path, 3).write_frame(surface.make_frame(0.0, u, np.zeros_like(u)))
+    far = PictureOptions(view="front", size=SMALL, material=FRONT.material, bare=True, zoom=0.6)
     shown_all, without = (shown(render(tmp_path, look=each)) for each in (far, replace(far, dust=False)))
     with_dust, bar = (np.flatnonzero(of_hue(each, 0).any(axis=0)) for each in (shown_all, without))
     assert np.diff(with_dust).max() > 8 and np.diff(bar).max() == 1
@@ -131,7 +135,7 @@ def test_dust_is_hidden_on_request(tmp_path: Path) -> None:
 def test_a_body_fills_its_picture_from_every_side(view: str, dim: int, tmp_path: Path) -> None:
     """By what is not paper: between 90 and 98 % of a side, as far from one edge as from the other; one torn and
     moved apart is whole on every picture of a sheet."""
-    look = Look(view=view, size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
+    look = PictureOptions(view=view, size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
     sheet = shown(render(written(tmp_path, 0.0, 3.0, dim=dim), tmp_path / "sheet.png", look, sheet="0,1"))
     drawn = np.abs(sheet - sheet[0, 0]).max(axis=2) > 12
     torn = drawn[:, -SMALL[0] :]
@@ -155,12 +159,14 @@ def test_colours_in_2d_are_those_of_the_legend(
 ) -> None:
     """To a unit in 255, light or no light; zero between two signs is grey and the paper white."""
     folder = written(tmp_path, 0.0, cut=False, dim=2, fields=lambda x: [Field("heat", "Cell", np.full(len(x), value))])
-    pixels = shown(render(folder, look=Look("heat", size=SMALL, bare=True, limits=limits)))
+    pixels = shown(render(folder, look=PictureOptions("heat", size=SMALL, bare=True, limits=limits)))
     wanted = np.rint(255 * np.array(matplotlib.colormaps[colours](0.5)[:3]))
     inner = pixels[SMALL[1] // 2, SMALL[0] // 2]
     assert np.abs(inner - wanted).max() <= 1 and inner.min() < 240
     assert (pixels[0, 0] == 255).all()
-    legend = shown(render(folder, look=Look("heat", size=SIZE, limits=limits)))[-120:]  # the bar, in its middle
+    legend = shown(render(folder, look=PictureOptions("heat", size=SIZE, limits=limits)))[
+        -120:
+    ]  # the bar, in its middle
     assert np.abs(legend[:, SIZE[0] // 2] - wanted).max(axis=1).min() <= 2
 
 
@@ -171,7 +177,7 @@ def test_one_range_for_all_frames(tmp_path: Path) -> None:
         tmp_path, 0.0, 0.0, cut=False, dim=2,
         fields=lambda x: [Field("heat", "Cell", np.where(x < 3, 1.0, next(level)))],
     )  # fmt: skip
-    look = Look("heat", size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
+    look = PictureOptions("heat", size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
     sheet = shown(render(folder, tmp_path / "sheet.png", look, sheet="0,1"))
     assert sheet.shape == (SMALL[1], 2 * SMALL[0] + GAP, 3)
     quarter, step = SMALL[0] // 3, SMALL[0] + GAP
@@ -182,7 +188,7 @@ def test_one_range_for_all_frames(tmp_path: Path) -> None:
 
 def test_the_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
     """Beside a bar of 6 m, in a flat picture: 1 m of a width of some 7."""
-    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), look=Look(size=SIZE)))
+    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), look=PictureOptions(size=SIZE)))
     ink = (np.abs(pixels - [34, 38, 44]).max(axis=2) < 4)[-60:, : SIZE[0] // 3]
     length = ink.sum(axis=1).max()
     body = np.flatnonzero(np.any(pixels[SIZE[1] // 2] < 250, axis=1))
@@ -190,9 +196,9 @@ def test_the_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
 
 
 def test_numbers_in_words() -> None:
-    assert [nice(x) for x in (0.0123, 0.7, 49.0)] == pytest.approx([0.01, 0.5, 20.0])
-    assert [in_words(x) for x in (0.01, 0.005, 2e-5, 5.0, 0.5)] == ["1 cm", "5 mm", "20 µm", "5 m", "50 cm"]
-    assert [in_seconds(t) for t in (0.0, 1.2e-4, 0.45, 2.0)] == ["t = 0 s", "t = 120 µs", "t = 450 ms", "t = 2 s"]
+    assert [round_length(x) for x in (0.0123, 0.7, 49.0)] == pytest.approx([0.01, 0.5, 20.0])
+    assert [format_length(x) for x in (0.01, 0.005, 2e-5, 5.0, 0.5)] == ["1 cm", "5 mm", "20 µm", "5 m", "50 cm"]
+    assert [format_time(t) for t in (0.0, 1.2e-4, 0.45, 2.0)] == ["t = 0 s", "t = 120 µs", "t = 450 ms", "t = 2 s"]
 
 
 @pytest.mark.parametrize("ground", (40, 90, 140, 190, 250))
@@ -203,7 +209,7 @@ def test_letters_can_be_read_on_any_ground(ground: int) -> None:
     half = even.copy()
     half[:, 40:] = 250
     for paper in (even, half):
-        written_on = lettered(paper, title="A title across it all", time="t = 340 µs", pixel=1e-3)
+        written_on = annotate(paper, title="A title across it all", time="t = 340 µs", pixel=1e-3)
         changed = np.any(written_on != paper, axis=2)
         for rows in (slice(0, 26), slice(26, 60), slice(240, 300)):  # title, time, scale bar
             for columns in (slice(0, 40), slice(40, 420)):
@@ -226,10 +232,17 @@ def test_a_look_colours_skin_and_inside(tmp_path: Path) -> None:
     of its channels), where the two lie on different sides of red and green; the walls of the crack are paler."""
     folder = written(tmp_path, 1.0)
     (folder / "study.toml").write_text('title = "x"\n[output]\nlook = "bread"\n')
-    look = Look(view="1,-2,0.3", size=SMALL, bare=True)
+    look = PictureOptions(view="1,-2,0.3", size=SMALL, bare=True)
     for name in ("bread", "jade"):
-        pixels = shown(render(folder, look=look if name == "bread" else replace(look, skin=name)))
-        skin, inside, back = (rgb_of(each) for each in (SKINS[name].skin, SKINS[name].inside, SKINS[name].backdrop))
+        pixels = shown(render(folder, look=look if name == "bread" else replace(look, material=name)))
+        skin, inside, back = (
+            rgb_of(each)
+            for each in (
+                MATERIAL_LOOKS[name].boundary_colour,
+                MATERIAL_LOOKS[name].crack_colour,
+                MATERIAL_LOOKS[name].backdrop,
+            )
+        )
         body = pixels[np.abs(pixels - back).max(axis=2) > 12]
         for part, least in ((skin, 0.3), (inside, 0.01)):
             apart = np.linalg.norm(body / body.sum(axis=1, keepdims=True) - part / part.sum(), axis=1)
@@ -243,12 +256,12 @@ def rgb_of(colour: str) -> Values:
 def test_a_sheet_is_read_from_left_to_right_and_down() -> None:
     """Five pictures: three and two, and paper where there is no sixth; up to three stand in one row."""
     pictures = [np.full((4, 6, 3), 10 * k, np.uint8) for k in range(1, 6)]
-    sheet = tiled(pictures)
+    sheet = tile_pictures(pictures)
     assert sheet.shape == (2 * 4 + GAP, 3 * 6 + 2 * GAP, 3)
     down, along = 4 + GAP, 6 + GAP
     assert [sheet[0, 0, 0], sheet[0, along, 0], sheet[0, 2 * along, 0]] == [10, 20, 30]
     assert [sheet[down, 0, 0], sheet[down, along, 0], sheet[down, 2 * along, 0]] == [40, 50, 255]
-    assert tiled(pictures[:3]).shape == (4, 3 * 6 + 2 * GAP, 3)
+    assert tile_pictures(pictures[:3]).shape == (4, 3 * 6 + 2 * GAP, 3)
 
 
 # --- floor ---
@@ -257,8 +270,10 @@ def test_a_sheet_is_read_from_left_to_right_and_down() -> None:
 def test_a_floor_has_the_shadow_of_what_stands_on_it(tmp_path: Path) -> None:
     """Darker than the floor, beside the body; without one there is none."""
     folder = written(tmp_path, 0.0, cut=False)
-    look = Look(view="0.3,-1.5,1.2", size=SMALL, skin=FRONT.skin, bare=True)
-    plain, floor = (shown(render(folder, look=each)) for each in (look, Look(**{**vars(look), "floor": True})))
+    look = PictureOptions(view="0.3,-1.5,1.2", size=SMALL, material=FRONT.material, bare=True)
+    plain, floor = (
+        shown(render(folder, look=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True}))
+    )
     backdrop = floor[0, 0]
 
     def grey(pixels: Pixels) -> float:
@@ -272,7 +287,7 @@ def test_a_floor_has_the_shadow_of_what_stands_on_it(tmp_path: Path) -> None:
 def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
     """In place of its slab, not of a wall, and the shadow lies where the plane is, below the bar."""
     folder = written(tmp_path, 0.0, cut=False)
-    frame = Surface(lattice(6, 1, 1), 1.0)
+    frame = BodySurface(lattice(6, 1, 1), 1.0)
     x = np.array([[-9.0, -9, -2], [9, -9, -2], [0, 9, -2]])
     none = np.zeros_like(frame.skeleton.points)
     behind = np.array([[-1.0, 3, 0], [1, 3, 0], [0, 3, 1]])
@@ -280,12 +295,12 @@ def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
         name: SurfaceData(each, np.array([[0, 1, 2]]), np.empty((0, 2), int))
         for name, each in (("wall", behind), ("table", x))
     }
-    SurfaceFiles(folder, 3).write(frame.at(0.0, none, none), drawn)
+    SurfaceFiles(folder, 3).write_frame(frame.make_frame(0.0, none, none), drawn)
     wall = '[[obstacle]]\nname = "wall"\nshape = "plane"\nnormal = [0.0, -1.0, 0.0]\n'
     table = '[[obstacle]]\nname = "table"\nshape = "plane"\nnormal = [0.0, 0.0, 1.0]\n'
     (folder / "study.toml").write_text(wall + table)
-    look = Look(view="0.3,-1.5,1.2", size=SMALL, skin=FRONT.skin, bare=True)
-    slab, floor = (shown(render(folder, look=each)) for each in (look, Look(**{**vars(look), "floor": True})))
+    look = PictureOptions(view="0.3,-1.5,1.2", size=SMALL, material=FRONT.material, bare=True)
+    slab, floor = (shown(render(folder, look=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True})))
     solid = [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]
     assert (np.abs(slab - solid).max(axis=2) < 60).mean() > (np.abs(floor - solid).max(axis=2) < 60).mean() + 0.02
     shadow = (floor.max(axis=2) < 0.93 * floor[0, 0].max()) & ~of_hue(floor, 0)
@@ -298,7 +313,7 @@ def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
 
 def test_a_folder_of_pictures_and_runs_side_by_side(tmp_path: Path) -> None:
     first, second = written(tmp_path / "first", 0.0, 0.5), written(tmp_path / "second", 1.0)
-    look = Look(size=SMALL)
+    look = PictureOptions(size=SMALL)
     made = render(first, tmp_path / "frames", look)
     assert [path.name for path in sorted(made.iterdir())] == ["frame_000000.png", "frame_000001.png"]
     both = shown(render([first, second], tmp_path / "both.png", look))
@@ -310,7 +325,7 @@ def test_a_film_in_mp4_has_every_frame(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     import imageio.v2
 
-    made = render(written(tmp_path, 0.0, 0.5, 1.0), tmp_path / "film.mp4", Look(size=(161, 121)), fps=5)
+    made = render(written(tmp_path, 0.0, 0.5, 1.0), tmp_path / "film.mp4", PictureOptions(size=(161, 121)), fps=5)
     with imageio.v2.get_reader(made) as film:
         assert film.count_frames() == 3 and film.get_meta_data()["fps"] == pytest.approx(5)
 
@@ -322,10 +337,10 @@ def test_a_film_in_mp4_has_every_frame(tmp_path: Path) -> None:
         (lambda folder: render(folder, sheet="some"), "--sheet some: must be how many frames, or which"),
         (lambda folder: render([folder, folder], sheet="2"), "--sheet: frames of one run"),
         (lambda folder: render([folder, folder], folder / "a.gif"), "pictures of several runs, is a .png"),
-        (lambda folder: size_of("big"), "--size big: must be WIDTHxHEIGHT"),
-        (lambda folder: size_of("4x90000"), "--size 4x90000"),
-        (lambda folder: limits_of("2,1"), "--range 2,1: must be two numbers, the lower first"),
-        (lambda folder: limits_of("0,nan"), "--range 0,nan"),
+        (lambda folder: parse_size("big"), "--size big: must be WIDTHxHEIGHT"),
+        (lambda folder: parse_size("4x90000"), "--size 4x90000"),
+        (lambda folder: parse_limits("2,1"), "--range 2,1: must be two numbers, the lower first"),
+        (lambda folder: parse_limits("0,nan"), "--range 0,nan"),
     ),
 )
 def test_what_cannot_be_drawn_is_said(call: Callable[[Path], Any], message: str, tmp_path: Path) -> None:
@@ -335,8 +350,8 @@ def test_what_cannot_be_drawn_is_said(call: Callable[[Path], Any], message: str,
 
 def test_a_flat_body_has_no_floor(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--floor: a body in 2D has none"):
-        render(written(tmp_path, 0.0, dim=2), look=Look(floor=True, size=SMALL))
+        render(written(tmp_path, 0.0, dim=2), look=PictureOptions(floor=True, size=SMALL))
 
 
 def test_a_study_names_the_looks_that_there_are() -> None:
-    assert set(LOOKS) == set(SKINS)
+    assert set(LOOKS) == set(MATERIAL_LOOKS)

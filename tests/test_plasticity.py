@@ -16,7 +16,7 @@ from fracsim.mechanics.plasticity import WEAKEST, ImplicitPlasticFlow
 from fracsim.mechanics.return_mapping import CLOSE
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
-from fracsim.output.fields import Frames
+from fracsim.output.frame_files import FieldEvaluator
 from fracsim.scene import Scene
 from fracsim.timestepping.state import State
 from support.laws import law_of, rotation
@@ -306,7 +306,7 @@ def test_stress_beyond_yield_decays_with_the_flow_rate(energy: str) -> None:
         for _ in range(round(0.5 / dt)):
             scene.stepper.flow.begin_step(dt)
             scene.stepper.flow()
-        found = Frames(scene.balance.stress, ["von_mises"])(state, None)[1].values
+        found = FieldEvaluator(scene.balance.stress, ["von_mises"])(state, None)[1].values
         np.testing.assert_allclose(found, Y + (q_0 - Y) * np.exp(-rate * 0.5), rtol=20 * CLOSE)
 
 
@@ -399,7 +399,7 @@ def test_plane_strain_is_a_body_held_across_the_plane(energy: str) -> None:
             probe=[{"name": "grip", "on": "right"}],
         )
         march(scene, state)
-        sigma = Frames(scene.balance.stress, ["stress"])(state, None)[1].values
+        sigma = FieldEvaluator(scene.balance.stress, ["stress"])(state, None)[1].values
         memory = memory_of(scene)
         np.testing.assert_allclose(memory, memory[:1].repeat(len(memory), 0), atol=1e-7)
         found.append([stress(scene) / 2, *memory[0], *sigma[0]])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cases import BAR, STRIP, command, fracsim_here, write_study
-from fracsim.output.progress import VARIABLE, Done, Progress
+from fracsim.output.progress import PROGRESS_VARIABLE, ProgressReporter, ProgressState
 
 STEP = re.compile(r"\[\d+:\d\d\] +\d+\.\d% +t = \S+ s  step \d+  broken edges \d+  pieces \d+  left \d+:\d\d  \S.*")
 
@@ -25,7 +25,7 @@ def on_terminal(words: list[str], folder: Path) -> tuple[str, str]:
     import termios
 
     termios.tcsetwinsize(slave, (24, 80))
-    known = {name: value for name, value in os.environ.items() if name != VARIABLE}
+    known = {name: value for name, value in os.environ.items() if name != PROGRESS_VARIABLE}
     with (folder / "said").open("w+") as out:
         process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=out, stderr=slave, env=known)
         os.close(slave)
@@ -60,18 +60,18 @@ def test_a_log_has_a_line_each_so_many_seconds(monkeypatch: pytest.MonkeyPatch) 
     """Of the set-up and of steps, however long they take, and of nothing but what can be printed."""
     log = io.StringIO()
     monkeypatch.setattr("sys.stderr", log)
-    monkeypatch.setenv(VARIABLE, "0.05")
+    monkeypatch.setenv(PROGRESS_VARIABLE, "0.05")
 
     def wait_for(count: int) -> None:
         until = time.monotonic() + 20
         while log.getvalue().count("\n") < count and time.monotonic() < until:
             time.sleep(0.01)
 
-    with Progress(first=True, end=2.0) as progress, Progress(first=False, end=2.0) as silent:
-        silent.stage("nobody hears of this")
-        progress.stage("building the mesh")
+    with ProgressReporter(first=True, end=2.0) as progress, ProgressReporter(first=False, end=2.0) as silent:
+        silent.set_stage("nobody hears of this")
+        progress.set_stage("building the mesh")
         wait_for(1)
-        progress.update(Done(0.5, 0.5, 1, 7, 2, "Newton 3"))
+        progress.update(ProgressState(0.5, 0.5, 1, 7, 2, "Newton 3"))
         wait_for(log.getvalue().count("\n") + 2)
     lines = log.getvalue().splitlines()
     assert re.fullmatch(r"\[0:\d\d\] building the mesh", lines[0])
@@ -85,15 +85,15 @@ def test_a_run_that_takes_no_time_says_nothing_to_a_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wish: str, lines: int
 ) -> None:
     """Nor does one whose progress nobody wants; a wish that makes no sense is told of."""
-    monkeypatch.setenv(VARIABLE, wish)
+    monkeypatch.setenv(PROGRESS_VARIABLE, wish)
     done = fracsim_here("run", write_study(tmp_path / "bar.toml", BAR), "-o", tmp_path / "out")
     assert done.returncode == 0 and done.stderr.count("\n") == lines
-    assert not lines or f'{VARIABLE}=soon is none of "live", "off" or a number of seconds' in done.stderr
+    assert not lines or f'{PROGRESS_VARIABLE}=soon is none of "live", "off" or a number of seconds' in done.stderr
 
 
 def test_steps_of_a_run_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the figures of its history."""
-    monkeypatch.setenv(VARIABLE, "1e-3")
+    monkeypatch.setenv(PROGRESS_VARIABLE, "1e-3")
     out = tmp_path / "out"
     done = fracsim_here("run", write_study(tmp_path / "strip.toml", STRIP), "-o", out)
     told = [line for line in done.stderr.splitlines() if STEP.fullmatch(line)]

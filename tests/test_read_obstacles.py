@@ -52,7 +52,7 @@ def block(folder: Path, size: tuple[float, float, float] = (2.0, 2.0, 1.0), kind
 
 def last(scene: Scene) -> dict[str, float]:
     """The columns of the obstacle after a step."""
-    return dict(zip(scene.probes.names, scene.probes().tolist(), strict=True))
+    return dict(zip(scene.probes.columns, scene.probes().tolist(), strict=True))
 
 
 def mean_velocity(scene: Scene, state: Walk) -> Values:

@@ -17,8 +17,8 @@ from mpi4py import MPI
 from pydantic import BaseModel, TypeAdapter
 
 from cases import fracsim
-from fracsim.output.fields_file import read_times
-from fracsim.report.pictures.frames import Shot, load
+from fracsim.output.fields_file import read_frame_times
+from fracsim.report.pictures.frames import FrameSource, load_grid
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import gallery
@@ -70,7 +70,7 @@ def regions(folder: Path, upper: float) -> tuple[int, int]:
 
     threshold, connectivity = vtkThreshold(), vtkConnectivityFilter()
     h5 = folder / "fields.h5"
-    threshold.SetInputData(load(Shot(0.0, h5, len(read_times(h5)) - 1)))
+    threshold.SetInputData(load_grid(FrameSource(0.0, h5, len(read_frame_times(h5)) - 1)))
     threshold.SetInputArrayToProcess(0, 0, 0, 1, "damage")  # array 0 of input 0, on cells
     threshold.SetLowerThreshold(0.0)
     threshold.SetUpperThreshold(upper)
@@ -110,7 +110,7 @@ def test_the_lines_of_python_step_as_the_command_does(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     with (tmp_path / "out" / "history.csv").open(newline="") as file:
         written = list(csv.DictReader(file))
-    columns = ["time", "elastic", "kinetic", "dissipated", "broken_edges", *names["scene"].probes.names]
+    columns = ["time", "elastic", "kinetic", "dissipated", "broken_edges", *names["scene"].probes.columns]
     broken = list(itertools.accumulate(row[4] for row in names["rows"]))
     assert broken[-1] == np.count_nonzero(names["broken"]) > 0
     assert (names["chi"] < 1).any() and len(names["u"]) == len(names["scene"].balance.reactions) / 2

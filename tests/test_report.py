@@ -16,10 +16,10 @@ import pytest
 
 from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, swept_here, write_study
 from fracsim.errors import FalseClaim, InputError
-from fracsim.report.content import Claim, Picture, Plot, Section, Series, Table, from_data, to_data
+from fracsim.report.content import Claim, Picture, Plot, ReportTable, Section, Series, from_data, to_data
 from fracsim.report.html_report import make_report
 from fracsim.report.page import write_page
-from fracsim.report.runs import find_runs, flattened
+from fracsim.report.runs import find_runs, flatten_tables
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plots are left blank, where only tables are looked at."""
-    monkeypatch.setattr("fracsim.report.page.draw", lambda plot, name: "<svg/>")
+    monkeypatch.setattr("fracsim.report.page.draw_plot", lambda plot, name: "<svg/>")
 
 
 class Page(HTMLParser):
@@ -209,7 +209,9 @@ def test_text_of_a_study_cannot_become_markup(tmp_path: Path) -> None:
     """Titles, names and labels are shown as they are, formulas included."""
     nasty = "<b>$x_1$ & co</b>"
     plot = Plot(nasty, nasty, nasty, (Series(nasty, (1.0, 2.0), (1.0, None), names=(nasty, "")),))
-    section = Section(nasty, nasty, (Claim(nasty, nasty, False),), (Table("t", nasty, (nasty,), ((nasty,),)),), (plot,))
+    section = Section(
+        nasty, nasty, (Claim(nasty, nasty, False),), (ReportTable("t", nasty, (nasty,), ((nasty,),)),), (plot,)
+    )
     target = write_page(tmp_path / "page.html", [section], tmp_path, title=nasty, subtitle=nasty, about={nasty: nasty})
     parsed(target)
     text = target.read_text()
@@ -220,7 +222,7 @@ def test_sections_survive_json() -> None:
     plot = Plot(
         "c", "x", "y", (Series("l", (1.0, None), (2.0, 3.0), "points", ("a", "b"), (0.1, 0.2)),), "loglog", True, (1.0,)
     )
-    table_ = Table("t", "c", ("a", "b"), ((1, 2.5), ("x", None)), "run it", (1,))
+    table_ = ReportTable("t", "c", ("a", "b"), ((1, 2.5), ("x", None)), "run it", (1,))
     sections = [Section("s", "t", (Claim("c", "m", None),), (table_,), (plot,), (Picture("p", "a/b.png"),))]
     assert from_data(json.loads(json.dumps(to_data(sections)))) == sections
 
@@ -281,7 +283,7 @@ def test_names_in_a_plot_are_clear_of_one_another() -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from fracsim.report.labels import name_points
+    from fracsim.report.labels import label_points
 
     random = np.random.default_rng(5)
     points = [*random.normal(0.0, 0.1, (12, 2)).tolist(), [-1.0, 1.0], [1.0, -1.0]]
@@ -289,7 +291,7 @@ def test_names_in_a_plot_are_clear_of_one_another() -> None:
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.plot(*np.transpose(points), "o")
-    name_points(axes, [(x, y, f"trial-{at}-mm") for at, (x, y) in enumerate(points)], [tuple(p) for p in points])
+    label_points(axes, [(x, y, f"trial-{at}-mm") for at, (x, y) in enumerate(points)], [tuple(p) for p in points])
     boxes = [text.get_window_extent(canvas.get_renderer()) for text in axes.texts]
     assert len(boxes) >= 8
     assert not any(one.overlaps(other) for at, one in enumerate(boxes) for other in boxes[:at])
@@ -309,4 +311,4 @@ def test_a_false_claim_ends_the_command_with_1(tmp_path: Path, holds: bool | Non
 
 def test_tables_inside_tables_are_named_by_their_path() -> None:
     data = {"a": {"b": 1, "c": [{"d": 2}, {"d": 3}]}, "e": [1, 2]}
-    assert flattened(data) == {"a.b": 1, "a.c.0.d": 2, "a.c.1.d": 3, "e": [1, 2]}
+    assert flatten_tables(data) == {"a.b": 1, "a.c.0.d": 2, "a.c.1.d": 3, "e": [1, 2]}

@@ -25,8 +25,8 @@ from mpi4py import MPI
 
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
-from fracsim.output.fields import Frames
-from fracsim.output.run_folder import differences
+from fracsim.output.frame_files import FieldEvaluator
+from fracsim.output.run_folder import study_differences
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh, save_mesh
@@ -284,8 +284,8 @@ def test_a_restart_of_another_study_is_refused(tmp_path: Path, stopped: Path, ta
 def test_tables_that_an_earlier_version_did_not_know_are_empty() -> None:
     """A list of tables is absent where it is empty, and not where it has an entry."""
     then: dict[str, object] = {"mesh": {"h": 0.1}}
-    assert list(differences(then, then | {"crack": []})) == []
-    (found,) = differences(then, then | {"crack": [{"segment": [0.0, 1.0]}]})
+    assert list(study_differences(then, then | {"crack": []})) == []
+    (found,) = study_differences(then, then | {"crack": [{"segment": [0.0, 1.0]}]})
     assert found.startswith("crack.0.segment was absent")
 
 
@@ -296,7 +296,7 @@ def test_keys_that_an_earlier_version_did_not_know_have_their_defaults() -> None
     assert then["fracture"].pop("crumbs") is True and then["mesh"].pop("order") == 1
     assert add_missing_defaults(then) == now
     then["fracture"]["strength"] *= 2
-    assert [each.split()[0] for each in differences(add_missing_defaults(then), now)] == ["fracture.strength"]
+    assert [each.split()[0] for each in study_differences(add_missing_defaults(then), now)] == ["fracture.strength"]
     assert add_missing_defaults({"mesh": {"forgotten": 1}}) == {"mesh": {"forgotten": 1}}
 
 
@@ -372,8 +372,10 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 FRAMES, SURFACE = "output.frame_files", "output.surface.surface_output"
-OPENING = ("run.make_folder", "run.History", f"{FRAMES}.Frames", f"{FRAMES}.FieldsFile", f"{SURFACE}.SurfaceFiles",
-           f"{SURFACE}.Surface", "run.OutputClock", "output.atomic_write.os.replace")  # fmt: skip
+OPENING = (
+    "run.make_output_folder", "run.History", f"{FRAMES}.FieldEvaluator", f"{FRAMES}.FieldsFile",
+    f"{SURFACE}.SurfaceFiles", f"{SURFACE}.BodySurface", "run.FrameSchedule", "output.atomic_write.os.replace",
+)  # fmt: skip
 
 
 def contents(folder: Path) -> frozenset[tuple[Path, bytes]]:
@@ -442,9 +444,9 @@ def test_a_signal_while_the_output_is_opened_ends_before_the_first_step(
 
         def frames(*arguments: Any) -> Any:
             os.kill(os.getpid(), signal.SIGTERM)
-            return Frames(*arguments)
+            return FieldEvaluator(*arguments)
 
-        patch.setattr("fracsim.output.frame_files.Frames", frames)
+        patch.setattr("fracsim.output.frame_files.FieldEvaluator", frames)
         with pytest.raises(
             Stopped, match=r"signal SIGTERM before the first step, at t = .* s\. Checkpoint: .*state\.h5"
         ):

@@ -37,7 +37,7 @@ CONTACT = "initial_overlap obstacle pose shape_base shapes tessellation triangle
 WITHOUT_DOLFINX |= {f"contact.{name}" for name in CONTACT.split()}
 # a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {
-    "frames": {"output.fields_file", "output.surface.collection", "output.surface.vtu"},
+    "frames": {"output.fields_file", "output.surface.vtk_files"},
     "colour_maps": {"output.fields_file"},
     "sweep": {"study.check", "study.reader", "output.lock", "output.file_ownership"},
 }

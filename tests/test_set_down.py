@@ -83,7 +83,7 @@ def test_nothing_moves_beside_an_obstacle(name: str, gap: float, scheme: str) ->
     scene, walk = block(dim, [entry], scheme)
     for report in march(scene, walk, 3):
         assert report.kinetic + report.elastic < 1e-18
-    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert np.abs(walk.u).max() < 1e-12 and all(abs(told[key]) < 1e-9 for key in told if key.startswith("contact_"))
 
 
@@ -111,7 +111,7 @@ def test_free_obstacles_are_set_down_on_others() -> None:
     scene, walk = block(3, entries)
     for report in march(scene, walk, 3):
         assert report.kinetic + report.elastic < 1e-18
-    told = dict(zip(scene.probes.names, scene.probes(), strict=True))
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert told["position_box_z"] == pytest.approx(-0.15 + 1e-5, abs=1e-12)
     assert told["position_ball_z"] == pytest.approx(-0.05 + 2e-5, abs=1e-12)
 

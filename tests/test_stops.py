@@ -88,7 +88,7 @@ def thrown(
     for report in each_step(scene, state):
         placed = contact.posed_obstacles(state.t)
         assert overlap_depth(placed[-1], placed[0]) < 0
-        row = dict(zip(scene.probes.names, scene.probes(), strict=True))
+        row = dict(zip(scene.probes.columns, scene.probes(), strict=True))
         yield row | {"energy": report.kinetic + report.elastic + state.dissipated - state.work}
 
 

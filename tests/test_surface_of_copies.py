@@ -7,8 +7,8 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
-from fracsim.output.surface.body_surface import Surface
-from fracsim.output.surface.instance_surface import SurfaceOfCopies
+from fracsim.output.rigid_frames import InstanceSurface
+from fracsim.output.surface.body_surface import BodySurface
 from fracsim.rigid.instance_placement import Place, Poses, placed
 from support.solids import lattice, patterns, separated
 
@@ -20,8 +20,8 @@ def test_it_is_that_of_the_mesh_of_all_copies() -> None:
     """One of three breaks, then another: names, masses, volumes, triangles, and the cells and edges behind them."""
     mesh, still = lattice(3, 2, 2), np.zeros(3)
     places = [Place(np.array([5.0 * k, 0, 0]), np.array([0.1 * k, 0.2, 0]), still, still) for k in range(3)]
-    whole, copies = placed(mesh, places), SurfaceOfCopies(mesh, Poses.of(places), DENSITY)
-    expected, skeleton = Surface(whole, DENSITY), EntityNumbering(whole)
+    whole, copies = placed(mesh, places), InstanceSurface(mesh, Poses.of(places), DENSITY)
+    expected, skeleton = BodySurface(whole, DENSITY), EntityNumbering(whole)
     assert copies.edge_count == len(skeleton.edges)
     label = np.zeros(len(whole.points), int)
     pattern, broken = np.zeros(len(whole.cells), np.uint8), np.zeros(len(skeleton.edges), bool)
@@ -33,7 +33,7 @@ def test_it_is_that_of_the_mesh_of_all_copies() -> None:
         assert np.array_equal(copies.broken_edges(pattern), broken)
         assert copies.update(pattern, cut) and expected.update(pattern, cut)
         assert not copies.update(pattern, cut)
-        assert np.array_equal(copies.names, expected.names)
+        assert np.array_equal(copies.fragment_names, expected.fragment_names)
         assert copies.volume == pytest.approx(expected.volume)
         assert copies.mass == pytest.approx(expected.mass)
         assert np.array_equal(copies.split.node_fragment, expected.split.node_fragment)
@@ -41,11 +41,11 @@ def test_it_is_that_of_the_mesh_of_all_copies() -> None:
             assert np.allclose(mine_rows, rows)
 
 
-def rows_of(surface: Surface) -> list[Values]:
+def rows_of(surface: BodySurface) -> list[Values]:
     """Middles (m, 3) of the triangles, in some order of places, and (m, 4) their pieces, cells, edges and origins."""
     made = surface.split
     middle = made.points[made.elements].mean(axis=1)
-    piece = surface.names[made.point_fragment[made.elements[:, 0]]]
+    piece = surface.fragment_names[made.point_fragment[made.elements[:, 0]]]
     order = np.lexsort((piece, *np.round(middle, 9).T))
     return [middle[order], np.column_stack([piece, made.cell, made.edge, made.origin])[order]]
 
@@ -54,7 +54,7 @@ def test_pieces_of_earlier_frames_have_their_names_again() -> None:
     """After a restart: the same names as a run that saw them break."""
     mesh, still = lattice(3, 1, 1), np.zeros(3)
     places = [Place(np.array([5.0 * k, 0, 0]), still, still, still) for k in range(2)]
-    seen, again = (SurfaceOfCopies(mesh, Poses.of(places), DENSITY) for _ in range(2))
+    seen, again = (InstanceSurface(mesh, Poses.of(places), DENSITY) for _ in range(2))
     skeleton = EntityNumbering(placed(mesh, places))
     x = np.tile(mesh.points[:, 0], 2)
     first, second = ((x > 1.5) & (np.arange(len(x)) >= len(x) // 2)), x > 0.5
@@ -62,6 +62,6 @@ def test_pieces_of_earlier_frames_have_their_names_again() -> None:
     late = early | separated(skeleton, second.astype(int))
     seen.update(patterns(skeleton, early))
     seen.update(patterns(skeleton, late))
-    again.replay(np.where(early, 1.0, np.where(late, 2.0, np.inf)), [0.0, 1.0])
+    again.replay_fragment_names(np.where(early, 1.0, np.where(late, 2.0, np.inf)), [0.0, 1.0])
     again.update(patterns(skeleton, late))
-    assert np.array_equal(seen.names, again.names) and len(seen.names) == 5
+    assert np.array_equal(seen.fragment_names, again.fragment_names) and len(seen.fragment_names) == 5

@@ -15,9 +15,9 @@ from fracsim.errors import NotConverged
 from fracsim.fracture.edge_history import cut_by_forces
 from fracsim.meshes.data import MeshData
 from fracsim.output.fields_file import Field
-from fracsim.output.surface.body_surface import FARTHEST, Frame, Surface
-from fracsim.output.surface.fragment_table import PieceNames, fragments
-from fracsim.output.surface.vtk_files import SurfaceFiles, columns
+from fracsim.output.surface.body_surface import MAX_COORDINATE, BodySurface, SurfaceFrame
+from fracsim.output.surface.fragment_table import FragmentNames, tabulate_fragments
+from fracsim.output.surface.vtk_files import SurfaceFiles, fragment_columns
 from support.ranks import OnRanks
 from support.solids import Values, lattice, patterns, separated
 from support.torn import SURFACES
@@ -70,26 +70,28 @@ def bar(cells: int = 6) -> MeshData:
     return MeshData(mesh.points, mesh.cells, ends | {"tip": ends["right"][:1]})
 
 
-def torn_at(surface: Surface, *places: float) -> npt.NDArray[np.uint8]:
+def torn_at(surface: BodySurface, *places: float) -> npt.NDArray[np.uint8]:
     """Patterns of a bar cut at right angles."""
     skeleton = surface.skeleton
     return patterns(skeleton, separated(skeleton, np.searchsorted(places, skeleton.points[:, 0])))
 
 
-def frame_of(surface: Surface, t: float, **options: object) -> Frame:
+def frame_of(surface: BodySurface, t: float, **options: object) -> SurfaceFrame:
     points = surface.skeleton.points
-    return surface.at(t, 0.1 * points, np.zeros_like(points), **options)  # type: ignore[arg-type]
+    return surface.make_frame(t, 0.1 * points, np.zeros_like(points), **options)  # type: ignore[arg-type]
 
 
 def test_a_frame_reads_back(tmp_path: Path) -> None:
     """Points where they are now, closed, every field there, groups by name, and the age of the crack."""
-    surface, files = Surface(bar(), 2.0), SurfaceFiles(tmp_path, 3)
+    surface, files = BodySurface(bar(), 2.0), SurfaceFiles(tmp_path, 3)
     surface.update(torn_at(surface, 2.5))
     skeleton = surface.skeleton
     broken_at = np.where(surface.split.broken, 0.25, np.nan)
     stress = np.arange(float(len(skeleton.cells)))
     heat = Field("heat", "Node", skeleton.points[:, 0])
-    path = files.write(frame_of(surface, 1.0, broken_at=broken_at, fields=[Field("von_mises", "Cell", stress), heat]))
+    path = files.write_frame(
+        frame_of(surface, 1.0, broken_at=broken_at, fields=[Field("von_mises", "Cell", stress), heat])
+    )
     grid = pyvista.read(path)
     assert grid.extract_surface().n_open_edges == 0
     reference = grid.points - grid.point_data["displacement"]
@@ -107,28 +109,28 @@ def test_a_frame_reads_back(tmp_path: Path) -> None:
 
 def test_outlines_and_filled_faces_in_2d(tmp_path: Path) -> None:
     """Triangles, then segments, in a plane z = 0."""
-    surface, files = Surface(lattice(4, 2), 1.0), SurfaceFiles(tmp_path, 2)
+    surface, files = BodySurface(lattice(4, 2), 1.0), SurfaceFiles(tmp_path, 2)
     surface.update(torn_at(surface, 1.5))
     frame = frame_of(surface, 0.0)
-    grid = pyvista.read(files.write(frame))
+    grid = pyvista.read(files.write_frame(frame))
     assert grid.cells_dict.keys() == {5, 3}
     assert np.array_equal(grid.cells_dict[3], surface.split.elements)
     assert np.all(grid.points[:, 2] == 0)
-    origins = np.array(frame.origins)[frame.at_elements["origin"]]
+    origins = np.array(frame.origins)[frame.element_fields["origin"]]
     assert set(origins[: len(frame.triangles)]) == {"body"}
     assert set(origins[len(frame.triangles) :]) == {"boundary", "crack"}
 
 
 def test_the_collection_is_valid_after_every_frame_and_resumes(tmp_path: Path) -> None:
     """Frames after the time of the checkpoint go, files and rows too, and the next one takes their place."""
-    surface, files = Surface(bar(), 1.0), SurfaceFiles(tmp_path, 3)
+    surface, files = BodySurface(bar(), 1.0), SurfaceFiles(tmp_path, 3)
     for count, t in enumerate((0.0, 0.5, 1.0), start=1):
-        files.write(frame_of(surface, t))
+        files.write_frame(frame_of(surface, t))
         assert pyvista.get_reader(tmp_path / "surface.pvd").time_values == [0.0, 0.5, 1.0][:count]
     again = SurfaceFiles(tmp_path, 3, resume_at=0.5)
     assert again.times == [0.0, 0.5]
     assert len(list((tmp_path / "surface").iterdir())) == 2
-    again.write(frame_of(surface, 0.7))
+    again.write_frame(frame_of(surface, 0.7))
     reader = pyvista.get_reader(tmp_path / "surface.pvd")
     assert reader.time_values == [0.0, 0.5, 0.7]
     reader.set_active_time_value(0.7)
@@ -143,28 +145,28 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 def test_pieces_csv(tmp_path: Path) -> None:
     """A bar of 6 x 1 x 1 m and 2 kg/m^3 cut at 2.5 m: the heavier part keeps the name 0."""
-    surface, files = Surface(bar(), 2.0), SurfaceFiles(tmp_path, 3)
+    surface, files = BodySurface(bar(), 2.0), SurfaceFiles(tmp_path, 3)
     surface.update(torn_at(surface, 2.5))
-    files.write(frame_of(surface, 0.5))
+    files.write_frame(frame_of(surface, 0.5))
     rows = rows_of(tmp_path)
-    assert list(rows[0]) == columns(3)
+    assert list(rows[0]) == fragment_columns(3)
     assert [row["piece"] for row in rows] == ["0", "1"]
     assert [float(row["mass"]) for row in rows] == pytest.approx([7.0, 5.0])
     assert [float(row["volume"]) for row in rows] == pytest.approx([3.5, 2.5])
 
 
 @pytest.mark.parametrize("what", ["displacement", "velocity"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, 10 * FARTHEST])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 10 * MAX_COORDINATE])
 def test_lost_nodes_are_reported_not_written(tmp_path: Path, value: float, what: str) -> None:
     """With the time, the piece, the cell and what to do; nothing is written."""
-    surface, files = Surface(bar(), 1.0), SurfaceFiles(tmp_path, 3)
+    surface, files = BodySurface(bar(), 1.0), SurfaceFiles(tmp_path, 3)
     surface.update(torn_at(surface, 2.5))
     values = {name: np.zeros_like(surface.skeleton.points) for name in ("displacement", "velocity")}
     values[what][-1, 1] = value
     node = len(values[what]) - 1
     said = rf"t = 0.125 s .* node {node} of piece 0 \(cell \d+\) has the {what}.*time.step"
     with pytest.raises(NotConverged, match=said):
-        files.write(surface.at(0.125, *values.values()))
+        files.write_frame(surface.make_frame(0.125, *values.values()))
     assert not list((tmp_path / "surface").iterdir())
     assert files.times == []
 
@@ -173,13 +175,13 @@ def test_lost_nodes_are_reported_not_written(tmp_path: Path, value: float, what:
 
 
 def test_built_again_only_where_edges_broke() -> None:
-    surface = Surface(bar(), 1.0)
-    assert surface.builds == 1
+    surface = BodySurface(bar(), 1.0)
+    assert surface.build_count == 1
     pattern = torn_at(surface, 2.5)
     assert surface.update(pattern)
     assert not surface.update(pattern.copy())
     frame_of(surface, 1.0)
-    assert surface.builds == 2
+    assert surface.build_count == 2
 
 
 # --- pieces ---
@@ -187,7 +189,7 @@ def test_built_again_only_where_edges_broke() -> None:
 
 def test_names_stay_with_the_heaviest_part() -> None:
     """10 nodes of 1 kg: cut after 3 the right part stays 0; cut that after 7, its left part (4 of 7) stays 0."""
-    names, mass = PieceNames(), np.ones(10)
+    names, mass = FragmentNames(), np.ones(10)
     cuts = ((), (3,), (3, 7), (1, 3, 7, 9), (1, 3, 5, 7, 9))
     of_node = []
     for cut in cuts:
@@ -204,15 +206,15 @@ def test_names_stay_with_the_heaviest_part() -> None:
 
 def test_names_after_a_restart() -> None:
     """Breaks replayed at the times of the earlier frames give the names of the run that was not broken off."""
-    whole, again = Surface(bar(), 1.0), Surface(bar(), 1.0)
+    whole, again = BodySurface(bar(), 1.0), BodySurface(bar(), 1.0)
     when = np.full(len(whole.skeleton.edges), np.nan)
     for t, places in ((1.0, (4.5,)), (2.0, (1.5, 4.5)), (3.0, (1.5, 2.5, 4.5))):
         whole.update(torn_at(whole, *places))
         when[whole.split.broken & np.isnan(when)] = t
-    again.replay(when, [0.0, 1.0, 2.0])
+    again.replay_fragment_names(when, [0.0, 1.0, 2.0])
     again.update(torn_at(again, 1.5, 2.5, 4.5))
-    assert np.array_equal(again.names, whole.names)
-    assert len(set(whole.names)) == 4
+    assert np.array_equal(again.fragment_names, whole.fragment_names)
+    assert len(set(whole.fragment_names)) == 4
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -228,7 +230,7 @@ def test_spin_of_rigid_pieces(dim: int) -> None:
     mass = random.uniform(1, 2, 12)
     centre = np.stack([np.average(x[piece == k], axis=0, weights=mass[piece == k]) for k in range(3)])
     v = V + spun(omega, x - centre[piece])
-    found = fragments(np.arange(3), piece, mass, np.ones(3), x, v)
+    found = tabulate_fragments(np.arange(3), piece, mass, np.ones(3), x, v)
     assert np.allclose(found.centre, centre)
     assert np.allclose(found.velocity, np.tile(V, (3, 1)))
     line = np.diff(x[9:11], axis=0)[0]

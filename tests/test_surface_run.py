@@ -14,11 +14,11 @@ from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError, Stopped
-from fracsim.report.pictures.colour_maps import select, shown_range
-from fracsim.report.pictures.frame_geometry import exploded
-from fracsim.report.pictures.frames import Shot, find_frames, load
+from fracsim.report.pictures.colour_maps import colour_range, select_array
+from fracsim.report.pictures.frame_geometry import explode_fragments
+from fracsim.report.pictures.frames import FrameSource, find_frames, load_grid
 from fracsim.report.pictures.picture import render
-from fracsim.report.pictures.picture_options import Look
+from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.run import Run
 from fracsim.scene import build_scene
 
@@ -47,7 +47,7 @@ def test_a_run_writes_its_surface(torn: Run) -> None:
     assert torn.frames.fields is not None
     assert [shot.t for shot in find_frames(torn.folder)] == pytest.approx(torn.frames.fields.times, rel=1e-11)
     grid = last(torn.folder)
-    assert len(np.unique(grid.point_data["piece"])) == torn.breaks.figures[2] > 1
+    assert len(np.unique(grid.point_data["piece"])) == torn.breaks.counts[2] > 1
     assert {"von_mises", "strain", "origin", "age", "cell"} <= set(grid.cell_data)
     assert list(grid.field_data["origins"])[-1] == "crack" or "crack" in list(grid.field_data["origins"])
 
@@ -95,8 +95,8 @@ def area(grid: Any) -> float:
 def test_a_restart_goes_on_with_the_same_pieces_and_ages(torn: Run, tmp_path: Path) -> None:
     """Stopped in the middle of tearing and continued: points, piece numbers and ages as without the stop."""
     stopped = Run(build_scene(MPI.COMM_SELF, study(TEARING)), tmp_path)
-    reason, steps = stopped.interrupt.reason, iter(range(6))
-    stopped.interrupt.reason = lambda: reason() or ("" if next(steps, None) is not None else "the test")  # type: ignore[method-assign]
+    reason, steps = stopped.interrupt.stop_reason, iter(range(6))
+    stopped.interrupt.stop_reason = lambda: reason() or ("" if next(steps, None) is not None else "the test")  # type: ignore[method-assign]
     with pytest.raises(Stopped):
         stopped()
     assert stopped.breaks.record is not None and stopped.breaks.record.graph.broken.any()
@@ -133,16 +133,16 @@ def picture(path: Path) -> npt.NDArray[np.uint8]:
 @pytest.mark.parametrize(
     "look",
     (
-        Look(),
-        Look("von_mises"),
-        Look("piece", explode=0.5),
-        Look("age", zoom=2.0),
-        Look("stress:xy"),
-        Look("displacement"),
-        Look("displacement:y"),
+        PictureOptions(),
+        PictureOptions("von_mises"),
+        PictureOptions("piece", explode=0.5),
+        PictureOptions("age", zoom=2.0),
+        PictureOptions("stress:xy"),
+        PictureOptions("displacement"),
+        PictureOptions("displacement:y"),
     ),
 )
-def test_looks_differ_and_show_something(torn: Run, look: Look, tmp_path: Path) -> None:
+def test_looks_differ_and_show_something(torn: Run, look: PictureOptions, tmp_path: Path) -> None:
     pixels = picture(render(torn.folder, tmp_path / "shot.png", look))[..., :3]
     assert np.any(pixels != 255, axis=2).mean() > 0.02
 
@@ -150,9 +150,11 @@ def test_looks_differ_and_show_something(torn: Run, look: Look, tmp_path: Path) 
 def test_components_are_those_of_the_mesh(torn: Run) -> None:
     """stress:yy of the surface is the second column that fields.h5 has for the same cell, and says so to ParaView."""
     grid = last(torn.folder)
-    wanted = np.asarray(load(Shot(0.0, torn.folder / "fields.h5", -1 + len(find_frames(torn.folder))))["stress"])
+    wanted = np.asarray(
+        load_grid(FrameSource(0.0, torn.folder / "fields.h5", -1 + len(find_frames(torn.folder))))["stress"]
+    )
     cells = np.asarray(grid.cell_data["cell"])
-    assert select(grid, "stress:yy") == "stress:yy"
+    assert select_array(grid, "stress:yy") == "stress:yy"
     np.testing.assert_array_equal(grid.cell_data["stress:yy"], wanted[cells, 1])
     stress = grid.GetCellData().GetArray("stress")
     assert [stress.GetComponentName(i) for i in range(6)] == ["XX", "YY", "ZZ", "XY", "YZ", "XZ"]
@@ -160,7 +162,7 @@ def test_components_are_those_of_the_mesh(torn: Run) -> None:
 
 def test_split_cells_have_no_strain(torn: Run) -> None:
     """Their nodes belong to several pieces that fly apart: F of the cell says nothing about either."""
-    frame = load(Shot(0.0, torn.folder / "fields.h5", len(find_frames(torn.folder)) - 1))
+    frame = load_grid(FrameSource(0.0, torn.folder / "fields.h5", len(find_frames(torn.folder)) - 1))
     assert torn.scene.fracture is not None
     split = torn.scene.fracture.graph.split
     assert split.any()
@@ -171,9 +173,9 @@ def test_split_cells_have_no_strain(torn: Run) -> None:
 def test_the_range_of_the_colours() -> None:
     """Symmetric where both signs occur; a few values beyond the rest do not stretch it."""
     values = np.concatenate([np.linspace(-1.0, 2.0, 1001), [1e6]])
-    low, high = shown_range(values) or (0.0, 0.0)
+    low, high = colour_range(values) or (0.0, 0.0)
     assert -low == high == pytest.approx(2.0, rel=0.03)
-    assert shown_range(np.zeros(3)) == (0.0, 0.0) and shown_range(np.full(3, np.nan)) is None
+    assert colour_range(np.zeros(3)) == (0.0, 0.0) and colour_range(np.full(3, np.nan)) is None
 
 
 def test_an_animation_moves(tmp_path: Path) -> None:
@@ -187,20 +189,32 @@ def test_an_animation_moves(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("look", "frame", "name", "message"),
     (
-        (Look("colour"), -1, "a.png", "--field colour: this run has: "),
-        (Look("stress"), -1, "a.png", "--field stress: stress is a tensor; add a component: stress:xx, stress:yy"),
-        (Look("stress:rr"), -1, "a.png", "stress has no component rr; its components are xx, yy, zz, xy, yz, xz"),
-        (Look("damage:x"), -1, "a.png", "damage has no component x; it has no components"),
-        (Look("origin"), -1, "a.png", "--field origin: this run has: "),
-        (Look(view="below"), -1, "a.png", "--view below: must be one of iso, front"),
-        (Look(view="0,0,0"), -1, "a.png", "--view 0,0,0: a direction must be finite and not zero"),
-        (Look(), 99, "a.png", "--frame 99: "),
-        (Look(), -1, "a.jpg", "pictures are .png, films .gif or .mp4"),
-        (Look(skin="bred"), -1, "a.png", "--look bred: must be one of plain, bread"),
-        (Look(skin="#b9712c,red"), -1, "a.png", "--look: red is no colour"),
+        (PictureOptions("colour"), -1, "a.png", "--field colour: this run has: "),
+        (
+            PictureOptions("stress"),
+            -1,
+            "a.png",
+            "--field stress: stress is a tensor; add a component: stress:xx, stress:yy",
+        ),
+        (
+            PictureOptions("stress:rr"),
+            -1,
+            "a.png",
+            "stress has no component rr; its components are xx, yy, zz, xy, yz, xz",
+        ),
+        (PictureOptions("damage:x"), -1, "a.png", "damage has no component x; it has no components"),
+        (PictureOptions("origin"), -1, "a.png", "--field origin: this run has: "),
+        (PictureOptions(view="below"), -1, "a.png", "--view below: must be one of iso, front"),
+        (PictureOptions(view="0,0,0"), -1, "a.png", "--view 0,0,0: a direction must be finite and not zero"),
+        (PictureOptions(), 99, "a.png", "--frame 99: "),
+        (PictureOptions(), -1, "a.jpg", "pictures are .png, films .gif or .mp4"),
+        (PictureOptions(material="bred"), -1, "a.png", "--look bred: must be one of plain, bread"),
+        (PictureOptions(material="#b9712c,red"), -1, "a.png", "--look: red is no colour"),
     ),
 )
-def test_what_cannot_be_drawn(torn: Run, look: Look, frame: int, name: str, message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_drawn(
+    torn: Run, look: PictureOptions, frame: int, name: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=message):
         render(torn.folder, tmp_path / name, look, frame=frame)
 
@@ -208,5 +222,5 @@ def test_what_cannot_be_drawn(torn: Run, look: Look, frame: int, name: str, mess
 def test_exploding_moves_pieces_rigidly() -> None:
     """Two pieces move apart along the line of their centres by the share asked for; inside a piece nothing changes."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [4, 0, 0], [5, 0, 0]])
-    moved = exploded(points, np.array([0, 0, 1, 1]), 0.5)
+    moved = explode_fragments(points, np.array([0, 0, 1, 1]), 0.5)
     assert moved[:, 0].tolist() == [-1.0, 0.0, 5.0, 6.0]

@@ -16,8 +16,8 @@ import pytest
 from cases import BAR, command, fracsim, fracsim_here, mpirun, swept_here, write_study
 from fracsim.errors import InputError
 from fracsim.report import sweep
-from fracsim.report.exit_status import last_words
-from fracsim.report.sweep import combinations, name_of, split_list
+from fracsim.report.exit_status import read_last_message
+from fracsim.report.sweep import case_folder_name, split_values, sweep_cases
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
 
@@ -31,15 +31,15 @@ def rows(out: Path) -> list[dict[str, str]]:
 
 
 def test_commas_inside_brackets_and_quotes_part_nothing() -> None:
-    assert split_list("[1, 1, 1],[2,1,1]") == ["[1, 1, 1]", "[2,1,1]"]
-    assert split_list('"a,b",c') == ['"a,b"', "c"]
-    assert split_list("{a = [1,2], b = 3},4") == ["{a = [1,2], b = 3}", "4"]
-    assert split_list("1e-3") == ["1e-3"]
+    assert split_values("[1, 1, 1],[2,1,1]") == ["[1, 1, 1]", "[2,1,1]"]
+    assert split_values('"a,b",c') == ['"a,b"', "c"]
+    assert split_values("{a = [1,2], b = 3},4") == ["{a = [1,2], b = 3}", "4"]
+    assert split_values("1e-3") == ["1e-3"]
 
 
 def test_every_combination_has_a_readable_folder_of_its_own(tmp_path: Path) -> None:
     sets = ["mesh.h=0.02,0.01", "time.scheme=newmark,explicit", "mesh.size=[1,1,1],[2,1,1]"]
-    cases = combinations(sets, tmp_path)
+    cases = sweep_cases(sets, tmp_path)
     assert len({case.folder for case in cases}) == 2 * 2 * 2
     assert cases[0].overrides == ["mesh.h=0.02", "time.scheme=newmark", "mesh.size=[1,1,1]"]
     assert cases[1].values["mesh.size"] == "[2,1,1]", "the last key changes fastest"
@@ -47,14 +47,20 @@ def test_every_combination_has_a_readable_folder_of_its_own(tmp_path: Path) -> N
 
 
 def test_names_that_lose_characters_stay_apart() -> None:
-    assert name_of({"h": "0.02", "scheme": "newmark"}) == "h-0.02_scheme-newmark"
-    assert name_of({"size": "[1,11]"}) != name_of({"size": "[11,1]"}) != name_of({"size": "[1-11]"})
-    assert len(name_of({"a": "x" * 300})) < 120
-    assert "/" not in name_of({"file": "../part.msh"}) and not name_of({"file": "../part.msh"}).startswith(".")
+    assert case_folder_name({"h": "0.02", "scheme": "newmark"}) == "h-0.02_scheme-newmark"
+    assert (
+        case_folder_name({"size": "[1,11]"})
+        != case_folder_name({"size": "[11,1]"})
+        != case_folder_name({"size": "[1-11]"})
+    )
+    assert len(case_folder_name({"a": "x" * 300})) < 120
+    assert "/" not in case_folder_name({"file": "../part.msh"}) and not case_folder_name(
+        {"file": "../part.msh"}
+    ).startswith(".")
 
 
 def test_keys_with_the_same_end_are_written_out(tmp_path: Path) -> None:
-    (case,) = combinations(["solver.a.tol=1", "other.tol=2"], tmp_path)
+    (case,) = sweep_cases(["solver.a.tol=1", "other.tol=2"], tmp_path)
     assert case.folder.name == "solver.a.tol-1_other.tol-2"
 
 
@@ -70,7 +76,7 @@ def test_keys_with_the_same_end_are_written_out(tmp_path: Path) -> None:
 )
 def test_what_is_no_sweep(sets: list[str], words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
-        combinations(sets, tmp_path)
+        sweep_cases(sets, tmp_path)
 
 
 # --- running --------------------------------------------------------------------------------------------------------
@@ -123,7 +129,7 @@ def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
 )
 def test_the_last_words_are_the_programs_own_where_it_spoke(log: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "log.txt").write_text(log)
-    assert last_words(tmp_path / "log.txt") == words
+    assert read_last_message(tmp_path / "log.txt") == words
 
 
 def test_nothing_runs_where_one_combination_is_wrong(tmp_path: Path) -> None:

@@ -1,20 +1,21 @@
-"""What a run writes, and what it watches meanwhile.
+"""Output of a run, and monitors of its results.
 
-history                 history.csv, and the probes
-fracture_log            what is told of the edges that broke: figures, pieces, times and places
-frame_files             a frame in all files that have frames
-fields                  what a frame of fields.xdmf holds
-fields_file             fields.xdmf and fields.h5
-surface                 surface.pvd and pieces.csv: the split surface in time
-checkpoint              state.h5, on any number of ranks; checkpoint_file: with its digest, and what is refused
-summary                 summary.json
-energy_check            energy from nowhere
-inverted_cells          cells turned inside out
-interpenetration_check  pieces that pass through each other where nothing keeps them apart
-contact_checks          obstacles that never met the body, or met it too fast
-progress                a line on the terminal
-interrupt               signals and the wall-time limit
-run_folder              the output folder, and when a frame is due; what may change on a restart
-file_ownership          what a run may write over or delete
-atomic_write            whole files or none, and why not
+atomic_write      replaces files as a whole or not at all
+checkpoint        state.h5: writes and reads the state, on any number of ranks
+checkpoint_file   format of state.h5 with its digest, and its checks
+contact_checks    monitors of obstacles: gaps, closing distances, overlaps
+crack_length      length or area of the cracks and position of the tip
+fields_file       fields.xdmf and fields.h5
+file_ownership    files that a run may overwrite or delete
+fracture_log      broken edges and fragments
+frame_files       the fields of a frame, and all files that have frames
+history           history.csv, and the probes
+interrupt         signals and the wall-time limit
+lock              lock on the output folder
+progress          line of progress on the terminal
+result_checks     monitors of energy gain, inverted cells, interpenetration, load drop
+rigid_frames      frames of rigid bodies
+run_folder        output folder: checks before a run or restart, schedule of frames
+summary           summary.json: outcome, times, memory
+surface           the split surface: surface.pvd, surface/*.vtu and pieces.csv
 """

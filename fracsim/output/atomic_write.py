@@ -1,4 +1,4 @@
-"""Writing so that nothing is lost: whole files take the place of old ones, and a failure says what, why and where."""
+"""Atomic writing: a file is replaced as a whole or not at all, and an error names the file and the reason."""
 
 from __future__ import annotations
 
@@ -16,105 +16,124 @@ from ..errors import CannotWrite
 from ..mesh.parallel import on_root
 from ..meshes.plain_files import MISSING, NotAFile, replacing, wrong_with
 
-ROOM = 6 << 10  # bytes that HDF5 may need beside the values of one array, most of it for an attribute that is text
+# Bytes that HDF5 may need beside the values of one array. A text attribute takes most of them.
+HDF5_OVERHEAD_BYTES = 6 << 10
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file in one go."""
-    with replacing(path) as new:
-        new.write_text(text, encoding="utf-8", newline="")
+    """Write a text file (UTF-8) as a whole in place of the old one. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="")
 
 
-def written[T](comm: MPI.Comm, path: Path, work: Callable[[], T]) -> T | None:
-    """`work` on rank 0, which writes `path`. Raises CannotWrite on all ranks alike (collective)."""
+def write_on_root[T](comm: MPI.Comm, path: Path, work: Callable[[], T]) -> T | None:
+    """Return what `work` returns on rank 0, None on the other ranks (collective).
 
-    def guarded() -> T:
+    Args:
+        comm: the ranks that call.
+        path: the file that `work` writes, named in the error.
+        work: called on rank 0 only.
+
+    Raises:
+        CannotWrite: on all ranks, if `work` raised OSError.
+    """
+
+    def guarded_work() -> T:
         try:
             return work()
         except OSError as error:
-            raise CannotWrite(f"could not write {path}: {reason(error)}") from error
+            raise CannotWrite(f"could not write {path}: {error_reason(error)}") from error
 
-    return on_root(comm, guarded)
+    return on_root(comm, guarded_work)
 
 
-def reason(error: Exception) -> str:
-    """Why a file could not be written, in the words of the system."""
+def error_reason(error: Exception) -> str:
+    """Reason of a failed file operation, in the words of the operating system."""
     if isinstance(error, NotAFile):
         return str(error.strerror)
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)
 
 
-def append(path: Path, text: bytes, over: int = 0) -> None:
-    """Write `text` in place of the last `over` bytes; where that fails (OSError) the file is as it was."""
-    with open(path, "r+b", buffering=0, opener=_no_link) as file:
-        at = file.seek(-over, os.SEEK_END)
+def append_bytes(path: Path, data: bytes, over: int = 0) -> None:
+    """Append `data` to a file, in place of its last `over` bytes. If that fails (OSError), the file is unchanged."""
+    with open(path, "r+b", buffering=0, opener=_open_without_link) as file:
+        start = file.seek(-over, os.SEEK_END)
         tail = file.read()
-        file.seek(at)
+        file.seek(start)
         try:
-            write_all(file, text)
+            write_all(file, data)
         except OSError:
-            file.seek(at)
+            file.seek(start)
             file.write(tail)
-            file.truncate(at + over)
+            file.truncate(start + over)
             raise
 
 
 def open_to_append(path: Path) -> RawIOBase:
-    """A plain file, to be written at its end. Raises OSError."""
-    return open(path, "ab", buffering=0, opener=_no_link)
+    """Unbuffered regular file, opened for writing at its end. Raises OSError, also for a symbolic link."""
+    return open(path, "ab", buffering=0, opener=_open_without_link)
 
 
-def _no_link(path: str, flags: int) -> int:
+def _open_without_link(path: str, flags: int) -> int:
+    """File descriptor of a path that is not a symbolic link. Raises OSError."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
-def write_all(file: RawIOBase, text: bytes) -> None:
-    """A raw file takes what there is room for, and refuses the next piece."""
-    rest = memoryview(text)
-    while rest:
-        rest = rest[file.write(rest) :]
+def write_all(file: RawIOBase, data: bytes) -> None:
+    """Write all bytes to an unbuffered file. Raises OSError on a full disk."""
+    # a raw write may accept part of the data; the next call then raises
+    unwritten = memoryview(data)
+    while unwritten:
+        unwritten = unwritten[file.write(unwritten) :]
 
 
-def hdf5_there(path: Path) -> Any:
-    """An HDF5 file, to be read. h5py is imported by the rank that reads or writes one."""
+def open_hdf5(path: Path) -> Any:
+    """HDF5 file, opened for reading."""
+    # imported here, so that only the rank that reads or writes such files loads h5py
     import h5py
 
     return h5py.File(path)
 
 
 @contextlib.contextmanager
-def hdf5_file(path: Path, size: int, *, begin: bool = False) -> Iterator[Any]:
-    """An HDF5 file that is to take `size` more bytes; `begin`: a new one. OSError where it cannot, on closing too.
+def writable_hdf5(path: Path, size: int, *, new: bool = False) -> Iterator[Any]:
+    """HDF5 file, opened for adding `size` bytes.
 
-    HDF5 that meets a full disk cannot close its file, and all that was in it is lost; so room is looked for before.
+    Args:
+        path: the file; a symbolic link is refused.
+        size: bytes that will be added; the disk must have room for them.
+        new: create an empty file first.
+
+    Raises:
+        OSError: the file cannot be written, or not be closed.
     """
     import h5py
 
-    if (wrong := "is a link, not a file" if path.is_symlink() else wrong_with(path)) not in ("", MISSING):
-        raise NotAFile(path, wrong)
+    if (problem := "is a link, not a file" if path.is_symlink() else wrong_with(path)) not in ("", MISSING):
+        raise NotAFile(path, problem)
     try:
-        if begin:
+        if new:
             h5py.File(path, "w").close()
-        _find_room(path, size)
+        # HDF5 cannot close its file on a full disk, and all data in it would be lost
+        _check_disk_space(path, size)
         with h5py.File(path, "r+") as file:
             yield file
-    except RuntimeError as error:  # h5py's, where closing fails
+    except RuntimeError as error:  # raised by h5py if closing fails
         raise OSError(str(error)) from error
 
 
-def _find_room(path: Path, size: int) -> None:
-    """OSError where the file has no room for `size` more bytes; it stays as it is.
-
-    The room is given back at once: HDF5 would cut the file to size between two of its writes, and the longer it takes
-    for these the likelier is a file that cannot be read after a kill.
-    """
+def _check_disk_space(path: Path, size: int) -> None:
+    """Raise OSError if the disk has no room to extend the file by `size` bytes. The file stays unchanged."""
     with path.open("r+b") as file:
-        before = file.seek(0, os.SEEK_END)
+        length = file.seek(0, os.SEEK_END)
         try:
-            os.posix_fallocate(file.fileno(), before, size)
+            os.posix_fallocate(file.fileno(), length, size)
         except OSError as error:
-            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):  # a file system that cannot tell
+            # these errors mean that the file system does not support the request
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
                 raise
         finally:
-            os.ftruncate(file.fileno(), before)
+            # The space is released at once. HDF5 would truncate the file between two of its writes, and the longer
+            # that takes, the likelier a killed process leaves an unreadable file.
+            os.ftruncate(file.fileno(), length)

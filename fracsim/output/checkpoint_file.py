@@ -1,8 +1,8 @@
-"""The file of a checkpoint: arrays, numbers and notes by name, and at its end the SHA-256 of all bytes before.
+"""Checkpoint file: named arrays and numbers in HDF5, followed by one line with the SHA-256 digest of all bytes before.
 
-The digest is looked at before HDF5 is: a file that is cut, or of which one bit is another, is refused as a whole.
-Rank 0 writes and reads it, in the order of the input mesh: the ranks of a run do not matter to it. What a run goes on
-from is then checked by name, shape and value: files can be made by other programs, and programs have faults.
+The digest is verified before HDF5 opens the file, so a truncated or altered file is refused as a whole. Rank 0 reads
+and writes, in the order of the input mesh; the number of ranks of a run does not matter. Names, shapes and ranges are
+checked after the digest, since other programs can write such files too.
 """
 
 from __future__ import annotations
@@ -23,50 +23,79 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import replacing
-from .atomic_write import ROOM, hdf5_file, hdf5_there
-from .file_ownership import CHECKPOINT
+from .atomic_write import HDF5_OVERHEAD_BYTES, open_hdf5, writable_hdf5
+from .file_ownership import CHECKPOINT_FILE
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-MARK = b"\nfracsim checkpoint, SHA-256 "  # of the last line, before the digest
-DIGITS = 64
-SEAL = len(MARK) + DIGITS + 1  # bytes of that line
-LARGEST = 1e150  # a number whose square overflows is as good as infinite
-MOST_STEPS = 10**8  # of a run
+DIGEST_MARK = b"\nfracsim checkpoint, SHA-256 "  # the last line of the file before its digest
+DIGEST_LINE_BYTES = len(DIGEST_MARK) + 2 * hashlib.sha256().digest_size + 1
 _NOTES = ("study", "monitors")
-_UNREADABLE = (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
+# whatever h5py, NumPy, json and tomllib raise on a damaged file
+_READ_ERRORS = (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
 
 
 @dataclass(frozen=True)
-class Notes:
-    """What a checkpoint says beside the state: the `study`, as in study.toml, and the `monitors` of the run so far."""
+class CheckpointLimits:
+    """Bounds of the numbers in a checkpoint.
+
+    Attributes:
+        magnitude: largest absolute value that counts as finite. The square of a larger number overflows.
+        steps: largest number of steps of a run.
+        chi_rounding: chi, in [0, 1], may exceed its bounds by this round-off.
+    """
+
+    magnitude: float = 1e150
+    steps: int = 10**8
+    chi_rounding: float = 1e-9
+
+
+CHECKPOINT_LIMITS = CheckpointLimits()
+
+
+@dataclass(frozen=True)
+class CheckpointNotes:
+    """Texts of a checkpoint beside the state.
+
+    Attributes:
+        study: text of study.toml.
+        monitors: what the monitors of the run have recorded so far, by name.
+    """
 
     study: str
     monitors: dict[str, Any]
 
-    def values(self) -> dict[str, Any]:
-        """The study's tables."""
+    def study_tables(self) -> dict[str, Any]:
+        """Tables of the study."""
         return tomllib.loads(self.study)
 
 
 @dataclass(frozen=True)
-class Stored:
-    """What a checkpoint at `path` holds: arrays and numbers by name, the fingerprint of its mesh, and notes."""
+class StoredCheckpoint:
+    """Contents of a checkpoint file.
+
+    Attributes:
+        path: the file.
+        arrays: arrays by name.
+        clock: numbers by name: time in s, step, and others of the time scheme.
+        mesh_digest: see `mesh_fingerprint`.
+        notes: study and monitors.
+    """
 
     path: Path
     arrays: Arrays
     clock: dict[str, Any]
-    mesh: str
-    notes: Notes
+    mesh_digest: str
+    notes: CheckpointNotes
 
 
 def checkpoint_path(folder: Path) -> Path:
-    """Where the checkpoint of a run is."""
-    return folder / CHECKPOINT
+    """Path of the checkpoint in an output folder."""
+    return folder / CHECKPOINT_FILE
 
 
-def last_checkpoint(folder: Path, t: float | None) -> str:
-    """A sentence that names the last good checkpoint of a run, of the time t, s; None: it has written none."""
+def describe_last_checkpoint(folder: Path, t: float | None) -> str:
+    """Sentence that names the last checkpoint of a run, written at time t in s; None: the run has written none."""
     if t is None:
         return "There is no checkpoint"
     return f"The last good checkpoint: {checkpoint_path(folder)} at t = {t:g} s; go on with --restart"
@@ -75,46 +104,58 @@ def last_checkpoint(folder: Path, t: float | None) -> str:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write_arrays(
-    path: Path, arrays: dict[str, Any], clock: dict[str, Any], mesh: MeshData | None, notes: Notes
+def write_checkpoint_file(
+    path: Path, arrays: dict[str, Any], clock: dict[str, Any], mesh: MeshData | None, notes: CheckpointNotes
 ) -> None:
-    """A checkpoint of arrays and numbers by name, of a state on a mesh, the old one in place until the new one is whole
-    (rank 0). Raises OSError."""
-    path.parent.mkdir(exist_ok=True)  # not its parents: a folder that is gone is to be told of
-    with replacing(path) as new:
-        with hdf5_file(new, _size(arrays, notes), begin=True) as file:
+    """Write a checkpoint in place of the previous one, which stays until the new one is complete (rank 0).
+
+    Args:
+        path: the file.
+        arrays: arrays by name.
+        clock: numbers by name.
+        mesh: mesh of the study.
+        notes: study and monitors.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(exist_ok=True)  # without parents: a deleted output folder is an error
+    with replacing(path) as temporary:
+        with writable_hdf5(temporary, _file_size(arrays, notes), new=True) as file:
             for name, values in arrays.items():
                 file[name] = values
             for name, value in clock.items():
                 file.attrs[name] = value
-            file.attrs["mesh"] = fingerprint(mesh)
+            file.attrs["mesh"] = mesh_fingerprint(mesh)
             file["notes/study"], file["notes/monitors"] = notes.study, json.dumps(notes.monitors)
-        seal(new)
+        append_digest(temporary)
 
 
-def _size(arrays: dict[str, Any], notes: Notes) -> int:
-    """Bytes, a little more than the file will have."""
-    whole = sum(values.nbytes for values in arrays.values() if values is not None)
-    return whole + len(notes.study) + 2 * ROOM + (1 << 10) * (len(arrays) + len(_NOTES))
+def _file_size(arrays: dict[str, Any], notes: CheckpointNotes) -> int:
+    """Upper bound of the size of a checkpoint file in bytes."""
+    data = sum(values.nbytes for values in arrays.values() if values is not None)
+    return data + len(notes.study) + 2 * HDF5_OVERHEAD_BYTES + (1 << 10) * (len(arrays) + len(_NOTES))
 
 
-def seal(path: Path) -> None:
-    """Add the line with the digest of a file to its end; HDF5 does not look there. Raises OSError."""
+def append_digest(path: Path) -> None:
+    """Append the line with the digest to a file. HDF5 ignores bytes after its own. Raises OSError."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     with path.open("ab") as file:
-        file.write(MARK + digest.encode() + b"\n")
+        file.write(DIGEST_MARK + digest.encode() + b"\n")
         file.flush()
-        os.fsync(file.fileno())  # before it takes the place of the last good one, which a loss of power would take
+        # on disk before the file replaces the previous checkpoint: a power failure must not destroy both
+        os.fsync(file.fileno())
 
 
-def fingerprint(mesh: MeshData | None) -> str:
-    """A short name of a mesh's nodes, cells, groups and regions (rank 0, where the mesh is)."""
+def mesh_fingerprint(mesh: MeshData | None) -> str:
+    """First 16 digits of the SHA-256 of a mesh's nodes, cells, groups and regions (rank 0, which has the mesh)."""
     assert mesh is not None
     digest = hashlib.sha256()
     for values in (mesh.points, mesh.cells, *([] if mesh.middles is None else [mesh.middles])):
         digest.update(np.ascontiguousarray(values).tobytes())
-    for name, members in sorted([*mesh.facet_groups.items(), *mesh.regions.items()], key=lambda each: each[0]):
+    groups = [*mesh.facet_groups.items(), *mesh.regions.items()]
+    for name, members in sorted(groups, key=lambda group: group[0]):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(members).tobytes())
     return digest.hexdigest()[:16]
@@ -123,87 +164,87 @@ def fingerprint(mesh: MeshData | None) -> str:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_notes(folder: Path) -> Notes:
-    """The notes of a checkpoint that is as it was written (rank 0). InputError where there is none."""
-    path = _there(folder)
-    with _refusing(path):
-        _check_seal(path)
-        with hdf5_there(path) as file:
-            return _notes(file)
+def read_notes(folder: Path) -> CheckpointNotes:
+    """Notes of the checkpoint in a folder (rank 0). Raises InputError if it is missing or damaged."""
+    path = _existing_checkpoint(folder)
+    with _input_errors(path):
+        _check_digest(path)
+        with open_hdf5(path) as file:
+            return _read_notes(file)
 
 
-def read_stored(folder: Path) -> Stored:
-    """All that a checkpoint holds (rank 0). InputError where there is none, or one that is not as it was written."""
-    path = _there(folder)
-    with _refusing(path):
-        _check_seal(path)
-        with hdf5_there(path) as file:
-            arrays = {name: _array(file, name) for name in file if name != "notes"}
-            clock = {name: _number(name, value) for name, value in file.attrs.items() if name != "mesh"}
-            mesh, notes = str(file.attrs["mesh"]), _notes(file)
+def read_checkpoint_file(folder: Path) -> StoredCheckpoint:
+    """Contents of the checkpoint in a folder (rank 0). Raises InputError if it is missing or damaged."""
+    path = _existing_checkpoint(folder)
+    with _input_errors(path):
+        _check_digest(path)
+        with open_hdf5(path) as file:
+            arrays = {name: _read_array(file, name) for name in file if name != "notes"}
+            clock = {name: _to_number(name, value) for name, value in file.attrs.items() if name != "mesh"}
+            digest, notes = str(file.attrs["mesh"]), _read_notes(file)
         _check_clock(clock)
-    return Stored(path, arrays, clock, mesh, notes)
+    return StoredCheckpoint(path, arrays, clock, digest, notes)
 
 
-def _there(folder: Path) -> Path:
-    """Where the checkpoint is. InputError where there is none."""
+def _existing_checkpoint(folder: Path) -> Path:
+    """Path of the checkpoint. Raises InputError if there is no such file."""
     path = checkpoint_path(folder)
     if not path.is_file():
         raise InputError(f"--restart: there is no checkpoint {path}; run without --restart")
     return path
 
 
-def _notes(file: Any) -> Notes:
-    """The notes, which are TOML and JSON."""
-    study, monitors = (_text(file, f"notes/{name}") for name in _NOTES)
-    notes = Notes(study, json.loads(monitors))
+def _read_notes(file: Any) -> CheckpointNotes:
+    """Notes of an open HDF5 file: TOML and JSON. Raises an error of `_READ_ERRORS` if they are neither."""
+    study, monitors = (_read_text(file, f"notes/{name}") for name in _NOTES)
+    notes = CheckpointNotes(study, json.loads(monitors))
     if not isinstance(notes.monitors, dict):
         raise ValueError("notes/monitors is no table")
-    notes.values()
+    notes.study_tables()
     return notes
 
 
-def check_mesh(stored: Stored, mesh: MeshData | None) -> None:
-    """InputError where a checkpoint is not of this mesh (rank 0)."""
-    if stored.mesh != fingerprint(mesh):
+def check_mesh(stored: StoredCheckpoint, mesh: MeshData | None) -> None:
+    """Raise InputError if a checkpoint belongs to another mesh (rank 0)."""
+    if stored.mesh_digest != mesh_fingerprint(mesh):
         raise InputError(f"--restart: {stored.path} belongs to another mesh; run without --restart in another folder")
 
 
 @contextmanager
-def _refusing(path: Path) -> Iterator[None]:
-    """InputError for whatever is wrong with a file."""
+def _input_errors(path: Path) -> Iterator[None]:
+    """Context that turns errors of reading a file into InputError."""
     try:
         yield
-    except _UNREADABLE as error:
-        said = str(error).strip("'\"") or type(error).__name__
-        raise refusal(path, said) from None
+    except _READ_ERRORS as error:
+        message = str(error).strip("'\"") or type(error).__name__
+        raise restart_error(path, message) from None
 
 
-def refusal(path: Path, why: str) -> InputError:
-    """What to say of a checkpoint that cannot be gone on from; nothing has been changed."""
+def restart_error(path: Path, why: str) -> InputError:
+    """Error for a checkpoint that cannot be used. The output folder has not been changed."""
     return InputError(
         f"--restart: cannot read {path}: {why}. Nothing was changed; put a copy of a whole checkpoint there, or run "
         "without --restart"
     )
 
 
-def _check_seal(path: Path) -> None:
-    """ValueError where the last line is not the digest of what is before it."""
-    left = path.stat().st_size - SEAL
+def _check_digest(path: Path) -> None:
+    """Raise ValueError if the last line is not the digest of the bytes before it."""
+    unread = path.stat().st_size - DIGEST_LINE_BYTES
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while left > 0 and (part := file.read(min(left, 1 << 20))):
-            digest.update(part)
-            left -= len(part)
-        last = file.read()
-    if not last.startswith(MARK):
+        while unread > 0 and (block := file.read(min(unread, 1 << 20))):
+            digest.update(block)
+            unread -= len(block)
+        last_line = file.read()
+    if not last_line.startswith(DIGEST_MARK):
         raise ValueError("it has no digest at its end: it is cut, or not of this version of fracsim")
-    if last != MARK + digest.hexdigest().encode() + b"\n":
+    if last_line != DIGEST_MARK + digest.hexdigest().encode() + b"\n":
         raise ValueError("it is damaged: its digest (SHA-256) is not that of its contents")
 
 
-def _array(file: Any, name: str) -> npt.NDArray[Any]:
-    """Of numbers that lie in the file itself, in one piece."""
+def _read_array(file: Any, name: str) -> npt.NDArray[Any]:
+    """Array of an open HDF5 file. Raises ValueError unless its numbers are stored contiguously in this file."""
     import h5py
 
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
@@ -216,8 +257,8 @@ def _array(file: Any, name: str) -> npt.NDArray[Any]:
     return np.asarray(data[()])
 
 
-def _text(file: Any, name: str) -> str:
-    """A text that lies in the file itself."""
+def _read_text(file: Any, name: str) -> str:
+    """Text of an open HDF5 file. Raises ValueError unless it is stored in this file."""
     import h5py
 
     for part in ("notes", name):
@@ -229,31 +270,39 @@ def _text(file: Any, name: str) -> str:
     return str(data.asstr()[()])
 
 
-def _number(name: str, value: Any) -> int | float:
+def _to_number(name: str, value: Any) -> int | float:
+    """Python number of an HDF5 attribute. Raises ValueError if it is none."""
     if np.ndim(value) or np.asarray(value).dtype.kind not in "fiu":
         raise ValueError(f"{name} is no number")
     return value.item() if isinstance(value, np.generic) else value
 
 
 def _check_clock(clock: dict[str, Any]) -> None:
-    """ValueError where a number of those that every run counts is missing, or cannot be."""
+    """Raise ValueError if time or step are missing, or if a number is out of its range."""
     for name, value in clock.items():
-        if not abs(value) < LARGEST:
+        if not abs(value) < CHECKPOINT_LIMITS.magnitude:
             raise ValueError(f"{name} is {value}, which is not finite")
     for name in ("t", "step"):
         if name not in clock:
             raise ValueError(f"{name} is missing")
         if clock[name] < 0:
             raise ValueError(f"{name} is {clock[name]}, less than 0")
-    if not isinstance(clock["step"], int) or clock["step"] > MOST_STEPS:
-        raise ValueError(f"step is {clock['step']}, not a whole number up to {MOST_STEPS}")
+    if not isinstance(clock["step"], int) or clock["step"] > CHECKPOINT_LIMITS.steps:
+        raise ValueError(f"step is {clock['step']}, not a whole number up to {CHECKPOINT_LIMITS.steps}")
     if (clock["step"] > 0) != (clock["t"] > 0):
         raise ValueError(f"step is {clock['step']:g} at t = {clock['t']:g} s")
 
 
-def require(found: dict[str, Any], names: set[str], known: set[str], path: Path) -> None:
-    """InputError where arrays or numbers by name are not all there, or there are others than those `known`."""
-    if missing := sorted(names - found.keys()):
-        raise refusal(path, f"{missing[0]} is missing")
-    if unknown := sorted(found.keys() - known):
-        raise refusal(path, f"it holds {unknown[0]}, which no run of this study writes")
+def check_names(values: dict[str, Any], required: set[str], allowed: set[str], path: Path) -> None:
+    """Raise InputError if a required array or number is missing, or if one is not allowed.
+
+    Args:
+        values: arrays or numbers by name.
+        required: names that must be there.
+        allowed: names that may be there.
+        path: the checkpoint, named in the error.
+    """
+    if missing := sorted(required - values.keys()):
+        raise restart_error(path, f"{missing[0]} is missing")
+    if unknown := sorted(values.keys() - allowed):
+        raise restart_error(path, f"it holds {unknown[0]}, which no run of this study writes")

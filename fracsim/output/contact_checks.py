@@ -1,120 +1,181 @@
-"""Obstacles that never met the body, met it faster than the steps could follow, or are too small: told at the end."""
+"""Monitors of obstacles: missed or too fast contact with the body, obstacles that are too small or overlap."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mpi4py import MPI
 
 from ..contact.drawing import min_extent
+from ..contact.initial_overlap import find_overlaps, free_pairs
 from ..contact.obstacle import RigidObstacle
 from ..timestepping.state import State
 
+if TYPE_CHECKING:
+    from ..contact.obstacle_term import ObstacleTerm
 
-class Met(Protocol):
-    """A term of obstacles.
+
+class ObstacleContact(Protocol):
+    """Contact term of obstacles, as the monitor sees it.
 
     Attributes:
-        obstacles: with their names.    edge: of the body's mesh in the mean, m.    width: of the barrier, m.
+        obstacles: obstacles with their names.
+        comm: the ranks of the run.
     """
 
     obstacles: tuple[RigidObstacle, ...]
     comm: MPI.Intracomm
 
     @property
-    def mean_edge_length(self) -> float: ...
+    def mean_edge_length(self) -> float:
+        """Mean edge length of the body's mesh, m."""
 
     @property
-    def barrier_width(self) -> float: ...
+    def barrier_width(self) -> float:
+        """Distance below which the contact barrier acts, m."""
 
     def closing_distances(self) -> list[float]:
-        """How far each and what it touches would have come closer in the last step, m, on this rank (collective)."""
+        """Largest decrease of each obstacle's gap in the last step without contact, m, on this rank (collective)."""
 
     def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """Each, and whether only points of the body feel it."""
+        """ObstacleTerm, each with True if only points of the body's surface are in contact with it."""
 
 
-class Meetings:
-    """What has come of each obstacle so far.
+class ObstacleContactMonitor:
+    """Gaps and closing distances between the obstacles and the body.
 
     Attributes:
-        gap: name -> (least distance to the body, m, and when, s).
-        closed: name -> (farthest that it and the body would have come closer in a step in which they met, m; when that
-            step ended, s; its size, s); of this rank.
+        least_gap: obstacle -> (least gap to the body in m, its time in s).
+        largest_closing: obstacle -> (largest decrease of the gap in a step with contact in m, end of that step in s,
+            size of that step in s), on this rank.
     """
 
-    def __init__(self, contacts: Sequence[Met]) -> None:
-        """`contacts`: terms of obstacles (collective)."""
+    def __init__(self, contacts: Sequence[ObstacleContact]) -> None:
+        """Start without any step; `contacts` are the contact terms of the obstacles (collective)."""
         self._contacts, self._edge = contacts, contacts[0].mean_edge_length
-        self._width = {each.name: contact.barrier_width for contact in contacts for each in contact.obstacles}
-        self.gap = dict.fromkeys(self._width, (math.inf, 0.0))
-        self.closed = dict.fromkeys(self.gap, (0.0, 0.0, 0.0))
+        self._width = {obstacle.name: contact.barrier_width for contact in contacts for obstacle in contact.obstacles}
+        self.least_gap = dict.fromkeys(self._width, (math.inf, 0.0))
+        self.largest_closing = dict.fromkeys(self.least_gap, (0.0, 0.0, 0.0))
 
-    def look(self, state: State, dt: float, figures: dict[str, float]) -> None:
-        """Note a step of dt s that was taken; `figures`: the columns gap_NAME of history.csv (collective)."""
+    def record_step(self, state: State, dt: float, figures: dict[str, float]) -> None:
+        """Record a finished step (collective).
+
+        Args:
+            state: state at the end of the step.
+            dt: size of the step, s.
+            figures: columns of history.csv by name; gap_NAME is used.
+        """
         closings = [closing for contact in self._contacts for closing in contact.closing_distances()]
-        for (name, gap), closing in zip(self.gap.items(), closings, strict=True):
-            if figures[f"gap_{name}"] < gap[0]:
-                self.gap[name] = figures[f"gap_{name}"], state.t
-            if closing > self.closed[name][0]:
-                self.closed[name] = closing, state.t, dt
+        for (name, least), closing in zip(self.least_gap.items(), closings, strict=True):
+            if figures[f"gap_{name}"] < least[0]:
+                self.least_gap[name] = figures[f"gap_{name}"], state.t
+            if closing > self.largest_closing[name][0]:
+                self.largest_closing[name] = closing, state.t, dt
 
-    def monitors(self) -> dict[str, Any]:
-        """What a restart goes on from, for `restore` (collective)."""
-        return {"least_gap": self.gap, "closed_in_a_step": self._over_ranks()}
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint` (collective)."""
+        return {"least_gap": self.least_gap, "closed_in_a_step": self._closing_over_ranks()}
 
-    def restore(self, monitors: dict[str, Any]) -> None:
-        """Go on from `monitors`."""
-        self.gap |= {name: tuple(found) for name, found in monitors.get("least_gap", {}).items()}
-        self.closed |= {name: tuple(found) for name, found in monitors.get("closed_in_a_step", {}).items()}
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.least_gap |= {name: tuple(entry) for name, entry in monitors.get("least_gap", {}).items()}
+        self.largest_closing |= {name: tuple(entry) for name, entry in monitors.get("closed_in_a_step", {}).items()}
 
     def summary(self) -> dict[str, Any]:
-        """For summary.json: the least gap to each, m."""
-        return {"least_gap": {name: gap for name, (gap, _) in self.gap.items() if gap < math.inf}}
+        """Part of summary.json: least gap of each obstacle, m."""
+        return {"least_gap": {name: gap for name, (gap, _) in self.least_gap.items() if gap < math.inf}}
 
     def notes(self, *, done: bool) -> list[str]:
-        """A sentence of each obstacle that has one; `done`: the run came to its end (collective)."""
-        met = [name for name, (gap, _) in self.gap.items() if gap < self._width[name]]
-        closed, sizes = self._over_ranks(), zip(self.gap, self._sizes(), strict=True)
-        missed = [self._missed(name) for name in self.gap if done and name not in met]
-        small = [_too_small(name, size, self._edge) for name, size in sizes if size < self._edge]
-        fast = [_too_fast(name, self._edge, *closed[name]) for name in met if closed[name][0] > self._edge]
+        """Sentences about obstacles; `done`: the run reached its end (collective)."""
+        touched = [name for name, (gap, _) in self.least_gap.items() if gap < self._width[name]]
+        closing, sizes = self._closing_over_ranks(), zip(self.least_gap, self._sizes(), strict=True)
+        missed = [self._missed_note(name) for name in self.least_gap if done and name not in touched]
+        small = [_size_note(name, size, self._edge) for name, size in sizes if size < self._edge]
+        fast = [_speed_note(name, self._edge, *closing[name]) for name in touched if closing[name][0] > self._edge]
         return [*missed, *small, *fast]
 
     def _sizes(self) -> list[float]:
-        """The least extent of each obstacle that points alone feel, m; infinite of a plane and of one that the body is
-        in."""
-        alone = [each for contact in self._contacts for each in contact.points_only_flags()]
-        return [min_extent(each.shape) if only else math.inf for each, only in alone]
+        """Least extent in m of each obstacle that only points of the surface touch, otherwise infinite.
 
-    def _over_ranks(self) -> dict[str, tuple[float, float, float]]:
-        """`closed` of the rank where it is largest (collective)."""
-        every: Sequence[dict[str, tuple[float, float, float]]] = self._contacts[0].comm.allgather(self.closed)
-        return {name: max(each[name] for each in every) for name in self.closed}
+        Planes, and obstacles that contain the body, have infinite extent as well.
+        """
+        obstacles = [entry for contact in self._contacts for entry in contact.points_only_flags()]
+        return [min_extent(obstacle.shape) if points_only else math.inf for obstacle, points_only in obstacles]
 
-    def _missed(self, name: str) -> str:
-        gap, t = self.gap[name]
+    def _closing_over_ranks(self) -> dict[str, tuple[float, float, float]]:
+        """`largest_closing` of the rank on which it is largest (collective)."""
+        ranks: Sequence[dict[str, tuple[float, float, float]]] = self._contacts[0].comm.allgather(self.largest_closing)
+        return {name: max(closing[name] for closing in ranks) for name in self.largest_closing}
+
+    def _missed_note(self, name: str) -> str:
+        gap, t = self.least_gap[name]
         return f"the obstacle {name} never met the body: it came no nearer than {gap:.3g} m, at t = {t:g} s"
 
 
-def _too_small(name: str, size: float, edge: float) -> str:
+def _size_note(name: str, size: float, edge: float) -> str:
+    """Sentence about an obstacle smaller than the mean edge of the mesh, both in m."""
     return (
         f"{name} is {size:.3g} m across, and an edge of the mesh {edge:.3g} m: it may pass between the points of the "
         "surface, which alone feel obstacles; a smaller mesh.h would do"
     )
 
 
-def _too_fast(name: str, edge: float, closed: float, t: float, dt: float) -> str:
+def _speed_note(name: str, edge: float, closing: float, t: float, dt: float) -> str:
+    """Sentence about a gap that closed by more than the mean edge (m) in the step of dt (s) that ended at t (s)."""
     return (
-        f"{name} and the body met faster than the step can follow: at t = {t:g} s they closed in by {closed:.3g} m in "
-        f"{dt:g} s, and an edge of the mesh is {edge:.3g} m; a time.step of {_rounded_down(dt * edge / closed):g} s "
+        f"{name} and the body met faster than the step can follow: at t = {t:g} s they closed in by {closing:.3g} m in "
+        f"{dt:g} s, and an edge of the mesh is {edge:.3g} m; a time.step of {_round_down(dt * edge / closing):g} s "
         "would do"
     )
 
 
-def _rounded_down(value: float) -> float:
-    """To one digit."""
+def _round_down(value: float) -> float:
+    """Value > 0 rounded down to one significant digit."""
     unit = 10.0 ** math.floor(math.log10(value))
     return math.floor(value / unit * (1 + 1e-9)) * unit
+
+
+class ObstacleOverlapMonitor:
+    """Deepest overlap of two obstacles, in schemes without contact between obstacles. The same on all ranks.
+
+    Attributes:
+        deepest_overlap: time in s, depth in m, and names of the two obstacles; empty if there was no overlap.
+    """
+
+    def __init__(self, contact: ObstacleTerm) -> None:
+        """Start without any frame; `contact` is the contact term of the obstacles."""
+        self._contact, self._pairs = contact, free_pairs(contact.obstacles)
+        self.deepest_overlap: dict[str, Any] = {}
+
+    def record_frame(self, t: float) -> None:
+        """Record the poses of the obstacles at time t in s (not collective)."""
+        if not self._pairs:
+            return
+        for first, second, depth in find_overlaps(self._contact.posed_obstacles(t), self._pairs):
+            if depth > self.deepest_overlap.get("depth", 0.0):
+                names = [self._contact.obstacles[number].name for number in (first, second)]
+                self.deepest_overlap = {"time": t, "depth": depth, "both": names}
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"obstacles_overlapped": self.deepest_overlap}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.deepest_overlap = monitors.get("obstacles_overlapped", {})
+
+    def summary(self) -> dict[str, Any]:
+        """Part of summary.json; empty if there was no overlap."""
+        return self.to_checkpoint() if self.deepest_overlap else {}
+
+    def notes(self) -> list[str]:
+        """Sentence about an overlap, if there was one."""
+        if not self.deepest_overlap:
+            return []
+        first, second = self.deepest_overlap["both"]
+        return [
+            f"{first} ran into {second}, by {self.deepest_overlap['depth']:.3g} m at "
+            f"t = {self.deepest_overlap['time']:g} s: in explicit steps obstacles do not feel each other"
+        ]

@@ -1,4 +1,4 @@
-"""How long cracks are and where their tip is: columns of history.csv where cracks say where they cut."""
+"""Length or area of the cracks and position of their tip: columns of history.csv in studies with defined cuts."""
 
 from __future__ import annotations
 
@@ -16,150 +16,170 @@ from ..meshes.text import AXES
 
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
-INSIDE = -1e-9  # least barycentric coordinate of a point in a cell
-PAIRINGS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])  # of four corners in two diagonals
+MIN_BARYCENTRIC = -1e-9  # a point with smaller barycentric coordinates is outside the cell (round-off)
+DIAGONAL_PAIRS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])  # of four corners in two diagonals
 
 
-class CrackFront:
-    """Length of the cracks in m (3D: area in m^2) and the place of their tip at rest, m.
+class CrackExtent:
+    """Length of all cracks in m (3D: area in m^2) and reference position of the tip, m.
 
-    The tip is that of the crack that advanced last: where it came into a cell that holds together. Where it has run
-    into a hole, out of the body or into another crack, the tip stays at the last place that it cut.
+    The tip is that of the crack that advanced last: the point at which the crack entered a cell that is not split. If
+    that crack has reached a hole, the boundary or another crack, the tip stays at the last cut.
 
-    A segment of the study ends where the study says, in a cell of which the side is cut where the crack comes in. Such
-    a cell gives way as if it were cut half-way, so that cracks are as compliant as those of their length (within 0.1 h
-    in the mean).
+    A crack segment of the study ends at its given end point. The segment cuts one edge of the cell that contains that
+    point. Such a cell is as compliant as if it were cut half-way, so that the compliance of cracks is that of their
+    length (within 0.1 h in the mean).
 
     Attributes:
-        names: columns of history.csv.
+        columns: names of the columns of history.csv.
+        values: (1 + d,) length or area and tip, as of the last update; NaN while there is no tip.
     """
 
     def __init__(self, record: EdgeRecord, cracks: Sequence[CrackPlane] = ()) -> None:
-        """`cracks`: those of the study, which were open at t = 0 (collective)."""
+        """Measure the initial cracks (collective).
+
+        Args:
+            record: history of broken edges, with the positions of their cuts.
+            cracks: cracks of the study, open at t = 0.
+        """
         graph = record.graph
         self._record, self._graph, self._domain = record, graph, graph.domain
         d = self._domain.dim
-        self.names = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
-        self._ends = ends_in_order(graph)
-        self._figures = np.array([0.0] + d * [np.nan])
-        self._pattern = np.zeros_like(graph.pattern)  # at the last look
-        self._size = np.zeros(len(self._pattern))  # of the cut through each cell
-        self._asked: dict[int, Values] = {}  # ends of segments by the cells of this rank that they lie in
+        self.columns = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
+        self._edge_ends = ends_in_order(graph)
+        self.values = np.array([0.0] + d * [np.nan])
+        self._pattern = np.zeros_like(graph.pattern)  # broken edges of each cell at the last update
+        self._cut_size = np.zeros(len(self._pattern))  # length or area of the cut through each cell
+        self._segment_ends: dict[int, Values] = {}  # local cell -> end point of a segment of the study in it
         for crack in cracks if d == 2 else ():
             for end in () if crack.corners is None else crack.corners:
-                self._ask(end)
-        self.look()
+                self._locate_segment_end(end)
+        self.update()
 
-    def __call__(self) -> Values:
-        """(1 + d,) as of the last look; nan where there has been no tip yet."""
-        return self._figures
+    def to_checkpoint(self) -> dict[str, list[float]]:
+        """Values for `from_checkpoint`: the last tip, which stays once a crack has crossed the body."""
+        return {"tip": [float(coordinate) for coordinate in self.values[1:]]}
 
-    def monitors(self) -> dict[str, list[float]]:
-        """What a restart goes on from: the last tip, which stays once a crack has run through."""
-        return {"tip": [float(each) for each in self._figures[1:]]}
+    def from_checkpoint(self, monitors: dict[str, list[float]]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.values[1:] = monitors["tip"]
 
-    def restore(self, monitors: dict[str, list[float]]) -> None:
-        """Go on from `monitors`."""
-        self._figures[1:] = monitors["tip"]
-
-    def look(self) -> None:
-        """Edges have broken (collective)."""
+    def update(self) -> None:
+        """Update length and tip after edges have broken (collective)."""
         changed = np.flatnonzero(self._graph.pattern != self._pattern)
         if not sum_over_ranks(self._domain.comm, len(changed))[0]:
             return
         self._pattern = self._graph.pattern.copy()
-        self._size[changed] = self._cut(changed)
-        held = {cell: end for cell, end in self._asked.items() if not self._graph.split[cell]}
-        size = self._size.sum() + sum(float(np.linalg.norm(end - self._entry(cell))) for cell, end in held.items())
-        self._figures[0] = sum_over_ranks(self._domain.comm, float(size))[0]
-        self._find_tip(held)
+        self._cut_size[changed] = self._cut_sizes(changed)
+        unsplit = {cell: end for cell, end in self._segment_ends.items() if not self._graph.split[cell]}
+        lengths = (float(np.linalg.norm(end - self._segment_entry(cell))) for cell, end in unsplit.items())
+        size = self._cut_size.sum() + sum(lengths)
+        self.values[0] = sum_over_ranks(self._domain.comm, float(size))[0]
+        self._find_tip(unsplit)
 
-    def _find_tip(self, held: dict[int, Values]) -> None:
-        """The tip of the crack that advanced last; `held`: ends that were asked for, by their cells (collective)."""
-        comm, graph, at = self._domain.comm, self._graph, self._record.at
-        newest = np.flatnonzero(at == comm.allreduce(float(np.fmax.reduce(at, initial=-np.inf)), MPI.MAX))
+    def _find_tip(self, segment_ends: dict[int, Values]) -> None:
+        """Find the tip of the crack that advanced last (collective).
+
+        Args:
+            segment_ends: local cell that is not split -> end point of a segment of the study in it, (d,) in m.
+        """
+        comm, graph, broken_at = self._domain.comm, self._graph, self._record.at
+        latest = comm.allreduce(float(np.fmax.reduce(broken_at, initial=-np.inf)), MPI.MAX)
+        newest = np.flatnonzero(broken_at == latest)
         cells = graph.edge_cells(newest)
         cells = cells[~graph.split[cells]]
-        which, side = np.nonzero(np.isin(graph.cell_edges[cells], newest))
-        leading = graph.cell_edges[cells][which, side]
-        places = self._places(leading)
-        for cell, end in held.items():
-            places[cells[which] == cell] = end
-        rows = concatenate_over_ranks(comm, np.column_stack([self._keys(leading), places]))
-        away = np.zeros(len(rows))
-        if not len(rows):
-            rows = concatenate_over_ranks(comm, np.column_stack([self._keys(newest), self._places(newest)]))
-            away = np.nan_to_num(np.linalg.norm(rows[:, 2:] - self._figures[1:], axis=1))
-        if len(rows):
-            self._figures[1:] = rows[np.lexsort([*rows.T[::-1], -away])[0], 2:]
+        row, side = np.nonzero(np.isin(graph.cell_edges[cells], newest))
+        leading = graph.cell_edges[cells][row, side]
+        cuts = self._cut_points(leading)
+        for cell, end in segment_ends.items():
+            cuts[cells[row] == cell] = end
+        candidates = concatenate_over_ranks(comm, np.column_stack([self._input_nodes(leading), cuts]))
+        distance = np.zeros(len(candidates))
+        if not len(candidates):
+            # all cells at the newest cuts are split: the tip is the cut farthest from the previous tip
+            candidates = concatenate_over_ranks(
+                comm, np.column_stack([self._input_nodes(newest), self._cut_points(newest)])
+            )
+            distance = np.nan_to_num(np.linalg.norm(candidates[:, 2:] - self.values[1:], axis=1))
+        if len(candidates):
+            # ties go by the input nodes of the edge, so that the tip does not depend on the partition
+            self.values[1:] = candidates[np.lexsort([*candidates.T[::-1], -distance])[0], 2:]
 
-    def _keys(self, edges: Ints) -> Values:
-        """(n, 2) input nodes of edges."""
-        return np.asarray(self._domain.node_input[self._ends[edges]], float)
+    def _input_nodes(self, edges: Ints) -> Values:
+        """Input nodes (n, 2) of edges."""
+        return np.asarray(self._domain.node_input[self._edge_ends[edges]], float)
 
-    def _ask(self, end: Values) -> None:
-        """A segment of the study ends there: in the cell that it comes into and that holds together (collective)."""
+    def _locate_segment_end(self, end: Values) -> None:
+        """Find the cell, not split, in which a segment of the study ends at the point `end` (d,) in m (collective)."""
         graph = self._graph
-        opened = self._record.at == 0
-        cells = np.flatnonzero(opened[graph.cell_edges].sum(axis=1) == 1)
+        initially_open = self._record.at == 0
+        cells = np.flatnonzero(initially_open[graph.cell_edges].sum(axis=1) == 1)
         corners = self._domain.nodes[graph.cell_nodes[cells]]
         sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-        inner = np.linalg.solve(sides, (end - corners[:, 0])[:, :, None])[:, :, 0]
-        cells = cells[(inner.min(axis=1) > INSIDE) & (inner.sum(axis=1) < 1 - INSIDE)]
-        found = [(float(np.linalg.norm(end - self._entry(k))), -int(self._domain.cell_input[k]), int(k)) for k in cells]
-        farthest = max(found, default=(-1.0, 0, -1))
-        first = max(self._domain.comm.allgather(farthest[:2]))
-        if farthest[2] >= 0 and farthest[:2] == first:
-            self._asked[farthest[2]] = end
+        barycentric = np.linalg.solve(sides, (end - corners[:, 0])[:, :, None])[:, :, 0]
+        cells = cells[(barycentric.min(axis=1) > MIN_BARYCENTRIC) & (barycentric.sum(axis=1) < 1 - MIN_BARYCENTRIC)]
+        candidates = [
+            (float(np.linalg.norm(end - self._segment_entry(cell))), -int(self._domain.cell_input[cell]), int(cell))
+            for cell in cells
+        ]
+        farthest = max(candidates, default=(-1.0, 0, -1))
+        farthest_of_all = max(self._domain.comm.allgather(farthest[:2]))
+        if farthest[2] >= 0 and farthest[:2] == farthest_of_all:
+            self._segment_ends[farthest[2]] = end
 
-    def _entry(self, cell: int) -> Values:
-        """(d,) where a segment of the study comes into a cell."""
+    def _segment_entry(self, cell: int) -> Values:
+        """Point (d,) at which a segment of the study enters a cell, m."""
         edges = self._graph.cell_edges[cell]
-        return self._places(edges[self._record.at[edges] == 0])[0]
+        return self._cut_points(edges[self._record.at[edges] == 0])[0]
 
-    def _places(self, edges: Ints) -> Values:
-        """(n, d) places of the cuts of broken edges, m."""
+    def _cut_points(self, edges: Ints) -> Values:
+        """Positions (n, d) of the cuts of broken edges, m; the middle if the position is unknown."""
         cut = self._record.cut[edges]
         share = np.where(np.isnan(cut), 0.5, cut)[:, None]
-        ends = self._domain.nodes[self._ends[edges]]
+        ends = self._domain.nodes[self._edge_ends[edges]]
         return np.asarray(ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
 
-    def _points(self, cells: npt.NDArray[np.integer]) -> Values:
-        """(n, k, d) places of the cuts of all edges of cells, m; nan of whole ones."""
+    def _cell_cut_points(self, cells: Ints) -> Values:
+        """Positions (n, k, d) of the cuts of all edges of cells, m; NaN for intact edges."""
         edges = self._graph.cell_edges[cells]
-        at = self._places(edges.reshape(-1)).reshape(*edges.shape, self._domain.dim)
-        return np.where(self._graph.broken[edges][..., None], at, np.nan)
+        cuts = self._cut_points(edges.reshape(-1)).reshape(*edges.shape, self._domain.dim)
+        return np.where(self._graph.broken[edges][..., None], cuts, np.nan)
 
-    def _cut(self, cells: npt.NDArray[np.integer]) -> Values:
-        """(n,) length or area of the cuts through cells, 0 of those that hold together."""
+    def _cut_sizes(self, cells: Ints) -> Values:
+        """Lengths or areas (n,) of the cuts through cells; 0 for cells that are not split."""
         result, split = np.zeros(len(cells)), self._graph.split[cells]
         if self._domain.dim == 2:
-            # to the middle of the cuts: two of them are a segment, three a branch
-            points, broken = self._points(cells[split]), self._graph.broken[self._graph.cell_edges[cells[split]]]
-            middle = np.where(broken[..., None], points, 0.0).sum(axis=1) / broken.sum(axis=1)[:, None]
-            arms = np.sqrt(np.square(points - middle[:, None]).sum(axis=2))
+            # arms from the centroid of the cuts: two cuts make a segment, three a branch
+            points, broken = (
+                self._cell_cut_points(cells[split]),
+                self._graph.broken[self._graph.cell_edges[cells[split]]],
+            )
+            centre = np.where(broken[..., None], points, 0.0).sum(axis=1) / broken.sum(axis=1)[:, None]
+            arms = np.sqrt(np.square(points - centre[:, None]).sum(axis=2))
             result[split] = np.where(broken, arms, 0.0).sum(axis=1)
             return result
-        many = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern[cells]]
-        for count, area in ((3, _triangles), (4, _quadrangles)):
-            some = np.flatnonzero(split & (many == count))
-            result[some] = area(self._corners(cells[some], count))
+        broken_edges = np.array([pattern.bit_count() for pattern in range(64)])[self._graph.pattern[cells]]
+        for count, area in ((3, _triangle_areas), (4, _quadrilateral_areas)):
+            chosen = np.flatnonzero(split & (broken_edges == count))
+            result[chosen] = area(self._cut_corners(cells[chosen], count))
         return result
 
-    def _corners(self, cells: npt.NDArray[np.integer], count: int) -> Values:
-        """(n, count, d) places of the cuts of cells with so many."""
-        points = self._points(cells)
+    def _cut_corners(self, cells: Ints, count: int) -> Values:
+        """Positions (n, count, d) of the cuts of cells with `count` broken edges, m."""
+        points = self._cell_cut_points(cells)
         return points[~np.isnan(points[..., 0])].reshape(len(cells), count, points.shape[-1])
 
 
-def _triangles(corners: Values) -> Values:
-    """(n,) areas of (n, 3, 3)."""
+def _triangle_areas(corners: Values) -> Values:
+    """Areas (n,) of triangles with corners (n, 3, 3), m^2."""
     sides = corners[:, 1:] - corners[:, :1]
     return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2)
 
 
-def _quadrangles(corners: Values) -> Values:
-    """(n,) areas of flat convex ones (n, 4, 3) whose corners are in any order: the diagonals are the pairs that span
-    most."""
-    a, b, c, e = np.moveaxis(corners[:, PAIRINGS], 2, 0)
+def _quadrilateral_areas(corners: Values) -> Values:
+    """Areas (n,) of plane convex quadrilaterals with corners (n, 4, 3) in any order, m^2.
+
+    The area is half the norm of the cross product of the diagonals, the pairing for which that is largest.
+    """
+    a, b, c, e = np.moveaxis(corners[:, DIAGONAL_PAIRS], 2, 0)
     return np.asarray(np.linalg.norm(np.cross(b - a, e - c), axis=2).max(axis=1, initial=0.0) / 2)

@@ -1,7 +1,7 @@
-"""fields.xdmf with fields.h5: the computational mesh in time, one grid a time with every field on it.
+"""Files fields.xdmf and fields.h5: the computational mesh in time, with one XDMF grid per time and all fields on it.
 
-Written by rank 0 in the order of the input mesh, so that the files do not depend on the partition. One grid per time
-(DOLFINx's own writer makes one per field) lets ParaView warp by displacement and colour by damage at once.
+Rank 0 writes them in the order of the input mesh, so that the files do not depend on the partition. With one grid per
+time (DOLFINx's writer makes one per field) ParaView can warp by displacement and colour by damage at once.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import data_elsewhere, replacing
-from .atomic_write import ROOM, append, hdf5_file, hdf5_there, replace_text
+from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
 
 Values = npt.NDArray[np.float64]
-TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # of a symmetric tensor in VTK's order, as ParaView names it
-EARLIER_TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")  # the order in files without the attribute COMPONENTS
-COMPONENTS = "components"  # attribute of a symmetric tensor in fields.h5: the names of its columns
-# XDMF's own Tensor6 has another order, by which ParaView's older reader fills 9 columns. A Matrix is read as it lies.
-# It has one row: that reader takes the last dimension for the columns of the array in VTK 9.3, the last two in VTK 9.7.
-_KINDS = {1: "Scalar", 3: "Vector", len(TENSOR): "Matrix"}
-_CELLS = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}  # by their nodes
-_NAMES = np.bytes_(" ".join(TENSOR))
+TENSOR_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")  # symmetric tensor, in the order of VTK and ParaView
+EARLIER_TENSOR_COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")  # order in files without COMPONENTS_ATTRIBUTE
+COMPONENTS_ATTRIBUTE = "components"  # attribute of a symmetric tensor in fields.h5: names of its columns
+# XDMF's own Tensor6 has another order, and ParaView's older reader expands it to 9 columns. A Matrix is read unchanged.
+# It has one row: that reader takes the last dimension for the columns in VTK 9.3, the last two in VTK 9.7.
+_ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", len(TENSOR_COMPONENTS): "Matrix"}
+_TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}  # by nodes per cell
+_COMPONENT_NAMES = np.bytes_(" ".join(TENSOR_COMPONENTS))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
     '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
@@ -36,7 +36,13 @@ _HEAD = (
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a frame: an array of rows in input order (None on ranks other than 0); `centre` is Node or Cell."""
+    """One field of a frame.
+
+    Attributes:
+        name: name of the field.
+        centre: "Node" or "Cell".
+        values: array with a row per node or cell, in the order of the input mesh; None on ranks other than 0.
+    """
 
     name: str
     centre: str
@@ -44,10 +50,25 @@ class Field:
 
 
 class FieldsFile:
-    """Appends frames; the XML is closed after each, so that the file can be opened while the run goes on."""
+    """Writer of fields.xdmf and fields.h5. The XML is complete after each frame and can be opened during the run.
+
+    Attributes:
+        xdmf, h5: the two files.
+        times: times of the frames, s.
+    """
 
     def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
-        """`resume_at`: keep the frames up to this time (s). InputError where they cannot be read."""
+        """Open the files.
+
+        Args:
+            folder: output folder.
+            mesh: input mesh.
+            resume_at: keep the frames up to this time, s; None: a new run.
+
+        Raises:
+            InputError: the frames of the earlier run cannot be read.
+            OSError: the files cannot be written.
+        """
         self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
         self._mesh = mesh
         self.times: list[float] = []
@@ -55,86 +76,102 @@ class FieldsFile:
         if resume_at is not None and self.h5.exists():
             grids = self._resume(resume_at)
         else:
-            self._begin()
+            self._create()
         replace_text(self.xdmf, _HEAD + grids + _TAIL)
 
-    def _begin(self) -> None:
-        size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * ROOM
-        with replacing(self.h5) as new, hdf5_file(new, size, begin=True) as file:
-            file["points"] = padded(self._mesh.points)
+    def _create(self) -> None:
+        """Create fields.h5 with the mesh and without frames."""
+        size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * HDF5_OVERHEAD_BYTES
+        with replacing(self.h5) as temporary, writable_hdf5(temporary, size, new=True) as file:
+            file["points"] = pad_to_3d(self._mesh.points)
             file["cells"] = self._mesh.cells.astype(np.int32)
             file.create_group("frames")
 
     def _resume(self, until: float) -> str:
-        """The XML of the frames that stay; where some go, a file without them takes the place of the old one."""
-        times = read_times(self.h5)
-        kept = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
-        with hdf5_there(self.h5) as file:
-            earlier = any(_has_earlier_order(data) for name in kept for data in file["frames"][name].values())
-        shared = self.h5.stat().st_nlink > 1  # a backup by hard links stays as it is
-        if earlier or shared or len(kept) < len(times):
-            self._keep(kept)
-        with hdf5_there(self.h5) as file:
-            return "".join(self._again(name, file["frames"][name]) for name in kept)
+        """XML of the frames up to the time `until` in s. If later frames exist, fields.h5 is replaced without them."""
+        times = read_frame_times(self.h5)
+        remaining = [name for name, t in times.items() if t <= until * (1 + 1e-12)]
+        with open_hdf5(self.h5) as file:
+            earlier = any(_has_earlier_order(data) for name in remaining for data in file["frames"][name].values())
+        # a backup made with hard links shares the file, which must then not be changed in place
+        shared = self.h5.stat().st_nlink > 1
+        if earlier or shared or len(remaining) < len(times):
+            self._rewrite(remaining)
+        with open_hdf5(self.h5) as file:
+            return "".join(self._stored_grid(name, file["frames"][name]) for name in remaining)
 
-    def _keep(self, kept: list[str]) -> None:
-        """A file of these frames alone takes the place of the file, with tensors in the order of TENSOR."""
+    def _rewrite(self, names: list[str]) -> None:
+        """Replace fields.h5 by a file with these frames only, and with tensors in the order of `TENSOR_COMPONENTS`."""
         size = self.h5.stat().st_size
-        with replacing(self.h5) as new, hdf5_there(self.h5) as old, hdf5_file(new, size, begin=True) as file:
+        with (
+            replacing(self.h5) as temporary,
+            open_hdf5(self.h5) as old,
+            writable_hdf5(temporary, size, new=True) as file,
+        ):
             for name in ("points", "cells"):
                 old.copy(name, file)
             frames = file.create_group("frames")
-            for name in kept:
+            for name in names:
                 old.copy(old["frames"][name], frames, name)
                 for data in filter(_has_earlier_order, frames[name].values()):
-                    data[...] = read_values(data)
-                    data.attrs[COMPONENTS] = _NAMES
+                    data[...] = read_field(data)
+                    data.attrs[COMPONENTS_ATTRIBUTE] = _COMPONENT_NAMES
 
-    def _again(self, name: str, frame: Any) -> str:
+    def _stored_grid(self, name: str, frame: Any) -> str:
+        """XML of a frame that is in fields.h5."""
         fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
         return self._grid(name, float(frame.attrs["time"]), fields)
 
-    def write(self, t: float, fields: list[Field]) -> None:
-        """Append the fields at time t (s). Vectors and symmetric tensors may have their 2D number of components.
+    def append_frame(self, t: float, fields: list[Field]) -> None:
+        """Append a frame.
 
-        Raises OSError where there is no room, with the frames before it as they were.
+        Args:
+            t: time, s.
+            fields: fields of the frame. Vectors of 2D bodies may have two components.
+
+        Raises:
+            OSError: the disk is full; the earlier frames are unchanged.
         """
-        fields = [Field(field.name, field.centre, padded(field.values)) for field in fields]
+        fields = [Field(field.name, field.centre, pad_to_3d(field.values)) for field in fields]
         name = f"{len(self.times):06d}"
-        with hdf5_file(self.h5, ROOM + sum(field.values.nbytes + ROOM for field in fields)) as file:
+        size = HDF5_OVERHEAD_BYTES + sum(field.values.nbytes + HDF5_OVERHEAD_BYTES for field in fields)
+        with writable_hdf5(self.h5, size) as file:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
                 data = frame.create_dataset(field.name, data=field.values)
                 data.attrs["centre"] = field.centre
                 if is_tensor(field.values):
-                    data.attrs[COMPONENTS] = _NAMES
-        append(self.xdmf, (self._grid(name, t, fields) + _TAIL).encode(), over=len(_TAIL))
+                    data.attrs[COMPONENTS_ATTRIBUTE] = _COMPONENT_NAMES
+        append_bytes(self.xdmf, (self._grid(name, t, fields) + _TAIL).encode(), over=len(_TAIL))
 
     def _grid(self, name: str, t: float, fields: list[Field]) -> str:
-        """The XML of one frame, which counts from now on."""
+        """XML of one frame; its time is added to `times`."""
         self.times.append(t)
         attributes = "".join(self._attribute(name, field) for field in fields)
-        kind = _CELLS[self._mesh.cells.shape[1]]
+        nodes = self._data_item("points", (len(self._mesh.points), 3))
+        topology = _TOPOLOGY_TYPES[self._mesh.cells.shape[1]]
         return (
             f'      <Grid Name="body" GridType="Uniform">\n        <Time Value="{t:.12g}"/>\n'
-            f'        <Topology TopologyType="{kind}" NumberOfElements="{len(self._mesh.cells)}">'
-            f"{self._item('cells', self._mesh.cells.shape, 'Int')}</Topology>\n"
-            f'        <Geometry GeometryType="XYZ">{self._item("points", (len(self._mesh.points), 3))}</Geometry>\n'
+            f'        <Topology TopologyType="{topology}" NumberOfElements="{len(self._mesh.cells)}">'
+            f"{self._data_item('cells', self._mesh.cells.shape, 'Int')}</Topology>\n"
+            f'        <Geometry GeometryType="XYZ">{nodes}</Geometry>\n'
             f"{attributes}      </Grid>\n"
         )
 
     def _attribute(self, frame: str, field: Field) -> str:
+        """XML of one field."""
         shape = field.values.shape
-        kind = _KINDS[shape[1] if len(shape) > 1 else 1]
+        kind = _ATTRIBUTE_TYPES[shape[1] if len(shape) > 1 else 1]
         number = "Int" if field.values.dtype.kind == "i" else "Float"
         if is_tensor(field.values):
             shape = (shape[0], 1, shape[1])
-        item = self._item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
+        item = self._data_item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
         head = f'<Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">'
         return f"        {head}{item}</Attribute>\n"
 
-    def _item(self, path: str, shape: tuple[int, ...], number: str = "Float", size: int = 0) -> str:
+    def _data_item(self, path: str, shape: tuple[int, ...], number: str = "Float", size: int = 0) -> str:
+        """XML that refers to a data set of fields.h5; `size`: bytes of a number, 0 for the default."""
         precision = size or (4 if number == "Int" else 8)
         dimensions = " ".join(map(str, shape))
         return (
@@ -143,51 +180,52 @@ class FieldsFile:
         )
 
 
-def check_whole(h5: Path) -> None:
-    """InputError where a fields.h5 that is to be appended to is a link, or has data in other files."""
-    wrong = "is a link, not a file" if h5.is_symlink() else ""
-    if not wrong:
+def check_self_contained(h5: Path) -> None:
+    """Raise InputError if a fields.h5 to continue is a symbolic link or refers to data in other files."""
+    problem = "is a link, not a file" if h5.is_symlink() else ""
+    if not problem:
         try:
-            with hdf5_there(h5) as file:
+            with open_hdf5(h5) as file:
                 if name := data_elsewhere(file):
-                    wrong = f"has the data of '{name}' in another file"
+                    problem = f"has the data of '{name}' in another file"
         except (OSError, RuntimeError):
-            return  # read_times says what is wrong
-    if wrong:
-        raise InputError(f"--restart: {h5} {wrong}; move it away to go on without its frames")
+            return  # read_frame_times reports an unreadable file
+    if problem:
+        raise InputError(f"--restart: {h5} {problem}; move it away to go on without its frames")
 
 
-def read_times(h5: Path) -> dict[str, float]:
-    """Name -> time (s) of every frame of a fields.h5. InputError where it cannot be read."""
+def read_frame_times(h5: Path) -> dict[str, float]:
+    """Time in s of each frame of a fields.h5, by the name of the frame. Raises InputError if it cannot be read."""
     try:
-        with hdf5_there(h5) as file:
+        with open_hdf5(h5) as file:
             return {name: float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])}
     except (OSError, KeyError, RuntimeError) as error:
         raise InputError(f"--restart: cannot read {h5} ({error}); move it away to go on without its frames") from None
 
 
 def is_tensor(values: Any) -> bool:
-    """Whether an array has the rows of a symmetric tensor."""
-    return len(values.shape) == 2 and values.shape[1] == len(TENSOR)
+    """True if an array has the shape (n, 6) of symmetric tensors."""
+    return len(values.shape) == 2 and values.shape[1] == len(TENSOR_COMPONENTS)
 
 
 def _has_earlier_order(data: Any) -> bool:
-    return is_tensor(data) and COMPONENTS not in data.attrs
+    """True for a tensor that an earlier version wrote, in the order of `EARLIER_TENSOR_COMPONENTS`."""
+    return is_tensor(data) and COMPONENTS_ATTRIBUTE not in data.attrs
 
 
-def read_values(data: Any) -> npt.NDArray[np.generic]:
-    """The values of a data set of fields.h5, tensors in the order of TENSOR whichever version wrote them."""
+def read_field(data: Any) -> npt.NDArray[np.generic]:
+    """Values of a data set of fields.h5, tensors in the order of `TENSOR_COMPONENTS` whichever version wrote them."""
     values: npt.NDArray[np.generic] = data[()]
-    return from_earlier(values) if _has_earlier_order(data) else values
+    return reorder_earlier_tensor(values) if _has_earlier_order(data) else values
 
 
-def from_earlier(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-    """(n, 6) symmetric tensors in the order of EARLIER_TENSOR -> in that of TENSOR."""
-    return values[:, [EARLIER_TENSOR.index(name) for name in TENSOR]]
+def reorder_earlier_tensor(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """Symmetric tensors (n, 6) in the order of `EARLIER_TENSOR_COMPONENTS`, put in that of `TENSOR_COMPONENTS`."""
+    return values[:, [EARLIER_TENSOR_COMPONENTS.index(name) for name in TENSOR_COMPONENTS]]
 
 
-def padded(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-    """Vectors of 2 components with a third that is zero: what ParaView's filters take."""
+def pad_to_3d(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """Vectors (n, 2) with a third component 0, which ParaView's filters need; other arrays unchanged."""
     if values.ndim == 2 and values.shape[1] == 2:
         return np.pad(values, ((0, 0), (0, 1)))
     return values

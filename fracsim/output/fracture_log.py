@@ -1,4 +1,4 @@
-"""What is told of the edges that broke: when and where, how many there are, and the pieces that they leave."""
+"""Log of broken edges: time and position of each break, and the fragments that the breaks leave."""
 
 from __future__ import annotations
 
@@ -19,94 +19,106 @@ if TYPE_CHECKING:
     from ..mesh.fragments import Fragments
 
 
-class Breaks:
-    """The breaks of a run, and their figures.
+class FractureLog:
+    """Broken edges and fragments of a run.
 
     Attributes:
-        record: time and place of each; None where nothing breaks.
-        surfaces: what starts surfaces, where the study has [brittle]; None elsewhere.
-        pieces: of the body as it is; None where nothing breaks.
-        figures: (broken edges, split cells, pieces) over all ranks.
+        record: time and position of each break; None without fracture.
+        surfaces: start points of brittle surfaces, in a study with [brittle]; None otherwise.
+        fragments: present fragments; None without fracture.
+        counts: numbers of broken edges, split cells and fragments over all ranks.
     """
 
     def __init__(self, stress: Stress, breaking: Breaking | None, *, cut_by_forces: bool = False) -> None:
-        """`breaking`: what breaks; `cut_by_forces`: edges are cut where nodal forces say, not in the middle
-        (collective)."""
+        """Record the initially open edges (collective).
+
+        Args:
+            stress: stress term of the body.
+            breaking: fracture pass, in a study with fracture.
+            cut_by_forces: cut edges at a position that the nodal forces determine, not in the middle.
+        """
         self._stress, self._domain, self._by_forces = stress, stress.domain, cut_by_forces
         self.record: EdgeRecord | None = None
         self.surfaces: BrittleSurfaces | None = None
-        self.pieces: Fragments | None = None
-        self.figures = (0, 0, _bodies(self._domain))
-        self._cut_by: npt.NDArray[np.float64] | None = None
+        self.fragments: Fragments | None = None
+        self.counts = (0, 0, _count_bodies(self._domain))
+        self._cut_by_criterion: npt.NDArray[np.float64] | None = None
         self._carried: npt.NDArray[np.float64] | None = None
         if breaking is not None:
             from ..fracture.edge_history import EdgeRecord
             from ..mesh.incremental_fragments import IncrementalFragments
 
-            self.record, self._parting = EdgeRecord(breaking.graph), IncrementalFragments(breaking.graph)
-            if hasattr(breaking.criterion, "starts"):  # not isinstance: that would import what is off
+            self.record, self._fragment_search = EdgeRecord(breaking.graph), IncrementalFragments(breaking.graph)
+            # not isinstance: that would import the brittle room, which other studies do not need
+            if hasattr(breaking.criterion, "starts"):
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
-            self._cut_by = breaking.criterion.cut
+            self._cut_by_criterion = breaking.criterion.cut
             self._carried = breaking.criterion.carried
             if breaking.opened is not None:
                 self.record.note(0.0, breaking.opened)
-            self.count()
+            self.update_counts()
 
-    def note(self, t: float) -> None:
-        """Edges that broke since the last call did so at t (s), and pieces are those of now (collective)."""
+    def record_breaks(self, t: float) -> None:
+        """Record the edges that broke since the last call, at time t in s, and find the fragments (collective)."""
         if self.record is None:
             return
-        if self._cut_by is not None:  # a surface knows where it cuts, and so does a crack
-            self.record.note(t, self._cut_by)
+        if self._cut_by_criterion is not None:
+            # surfaces and cracks define the position of the cut themselves
+            self.record.note(t, self._cut_by_criterion)
         else:
-            self.record.note(t, self._cuts() if self._by_forces else None)
-        self.count()
+            self.record.note(t, self._cuts_by_forces() if self._by_forces else None)
+        self.update_counts()
 
-    def remember(self) -> None:
-        """A checkpoint is written: edges that cracks have cut and that hold on are cut there, and tips run
-        (collective)."""
-        if self.record is not None and self._cut_by is not None:
-            self.record.remember(self._cut_by, self._carried)
+    def prepare_checkpoint(self) -> None:
+        """Add to the record the cuts of edges that are not broken yet, and the state of crack tips (collective)."""
+        if self.record is not None and self._cut_by_criterion is not None:
+            self.record.remember(self._cut_by_criterion, self._carried)
 
-    def restored(self) -> None:
-        """The record was read from a checkpoint: so were the places of cuts (collective)."""
-        if self.record is not None and self._cut_by is not None:
-            self._cut_by[:] = self.record.cut
+    def apply_checkpoint(self) -> None:
+        """Set cuts and crack tips of the criterion from the record, which was read from a checkpoint (collective)."""
+        if self.record is not None and self._cut_by_criterion is not None:
+            self._cut_by_criterion[:] = self.record.cut
             if self._carried is not None and self.record.carried is not None:
-                known = ~np.isnan(self.record.carried[:, 0])
-                self._carried[known] = self.record.carried[known]
-        self.count()
+                defined = ~np.isnan(self.record.carried[:, 0])
+                self._carried[defined] = self.record.carried[defined]
+        self.update_counts()
 
-    def count(self) -> None:
-        """Bring `pieces` and `figures` up to date, as after the damage of a checkpoint was read (collective)."""
+    def update_counts(self) -> None:
+        """Find the fragments and update `counts` (collective)."""
         if self.record is None:
             return
         graph = self.record.graph
         broken, split = sum_over_ranks(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
-        self.pieces = self._parting.update()
-        self.figures = int(broken), int(split), self.pieces.count
+        self.fragments = self._fragment_search.update()
+        self.counts = int(broken), int(split), self.fragments.count
 
-    def dust(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:
-        """Pieces of a single corner of cells, and their mass, kg; `mass` (cells,) of cells, kg (collective)."""
-        if self.pieces is None:
+    def count_single_nodes(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:
+        """Number of fragments that are one corner node, and their mass in kg (collective).
+
+        Args:
+            mass: masses (cells,) of the cells, kg.
+        """
+        if self.fragments is None:
             return 0, 0.0
-        domain, of_node = self._domain, self.pieces.node_fragment
-        size = sum_over_ranks(domain.comm, np.bincount(of_node[domain.owned_corners], minlength=self.pieces.count))
-        alone = (size == 1)[of_node]
-        share = np.count_nonzero(alone[domain.cell_nodes], axis=1) / (domain.dim + 1)
+        domain, of_node = self._domain, self.fragments.node_fragment
+        size = sum_over_ranks(domain.comm, np.bincount(of_node[domain.owned_corners], minlength=self.fragments.count))
+        single = (size == 1)[of_node]
+        # each corner has an equal share of the mass of its cells
+        share = np.count_nonzero(single[domain.cell_nodes], axis=1) / (domain.dim + 1)
         return int(np.count_nonzero(size == 1)), float(sum_over_ranks(domain.comm, np.array([share @ mass]))[0])
 
-    def _cuts(self) -> npt.NDArray[np.float64]:
-        """(edges,) cuts in inverse proportion to the nodal forces of now (M22 fig. 12)."""
+    def _cuts_by_forces(self) -> npt.NDArray[np.float64]:
+        """Cuts (edges,) in inverse proportion to the nodal forces (Mandal et al. 2022, figure 12)."""
         from ..fracture.edge_history import cut_by_forces
 
         assert self.record is not None
         domain, ends = self._domain, self.record.graph.edge_nodes
         force = domain.with_ghosts(self._stress.assemble_forces()).reshape(-1, domain.dim)
+        # ends in the order of the input mesh, so that a cut does not depend on the partition
         swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
         return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 
 
-def _bodies(domain: Domain) -> int:
-    """Bodies of the mesh that share no node (collective)."""
+def _count_bodies(domain: Domain) -> int:
+    """Number of bodies of the mesh that share no node (collective)."""
     return int(domain.comm.bcast(bodies_of(domain.source)[0] if domain.source is not None else None))

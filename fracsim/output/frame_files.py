@@ -1,28 +1,152 @@
-"""A frame of a run in all files that have frames: fields.xdmf, and the split surface where it is wanted."""
+"""Frames of a run: the fields that a frame has, and the files to which it is written."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
+import ufl
+from ufl.core.expr import Expr
+
+from ..forms.energies import Energy, full_cauchy_stress, von_mises
+from ..forms.kinematics import deformation_gradient, embed, green_strain
 from ..mechanics.balance import Balance
+from ..mechanics.jit import CellExpression
+from ..mechanics.stress import Stress
 from ..timestepping.state import State
-from .atomic_write import written
-from .fields import Frames
-from .fields_file import Field, FieldsFile
-from .fracture_log import Breaks
+from .atomic_write import write_on_root
+from .fields_file import TENSOR_COMPONENTS, Field, FieldsFile
+from .fracture_log import FractureLog
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import Breaking
-    from .interpenetration_check import Passing
+    from ..mesh.fragments import Fragments
+    from .result_checks import InterpenetrationMonitor
     from .surface.surface_output import SurfaceOutput
+
+Values = npt.NDArray[np.generic]
+_TENSOR_INDICES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENSOR_COMPONENTS]
+
+
+class FieldEvaluator:
+    """Values of the fields of a frame, gathered on rank 0. Expressions are compiled at the first frame."""
+
+    def __init__(self, stress: Stress, names: list[str], fracture: Breaking | None = None) -> None:
+        """Choose the fields.
+
+        Args:
+            stress: stress term of the body.
+            names: names of output.fields.
+            fracture: fracture pass with the broken edges, in a study with fracture.
+        """
+        self._stress, self._domain, self._fracture = stress, stress.domain, fracture
+        self._names = names
+        self._compiled: dict[str, CellExpression] = {}
+
+    def __call__(self, state: State, fragments: Fragments | None) -> list[Field]:
+        """Displacement and the chosen fields, in the order of the input mesh (complete on rank 0; collective)."""
+        d = self._domain.dim
+        fields = [self._nodal_field("displacement", state.u.reshape(-1, d))]
+        for name in self._names:
+            if name == "velocity":
+                fields.append(self._nodal_field(name, state.v.reshape(-1, d)))
+            elif name == "piece":
+                assert fragments is not None
+                fields.append(
+                    self._nodal_field(name, fragments.node_fragment[: self._domain.node_count].astype(np.int32))
+                )
+            else:
+                fields.append(Field(name, "Cell", self._domain.gather_cells(self._cell_values(name))))
+        return fields
+
+    def _nodal_field(self, name: str, owned: Values) -> Field:
+        """Nodal field from the values at the nodes that this rank owns (collective)."""
+        return Field(name, "Node", self._domain.gather_nodes(owned))
+
+    def _cell_values(self, name: str) -> Values:
+        """Values of a cell field on the cells of this rank, (cells,) or (cells, components)."""
+        if name == "region":
+            return self._domain.region.astype(np.int32)
+        if name == "plastic_strain":
+            plastic = self._stress.material.plastic
+            strain: Values = plastic.cell_means(plastic.accumulated_strain)
+            return strain
+        if name == "damage":
+            return self._broken_share()
+        if name == "chi":
+            assert self._stress.chi is not None
+            return self._stress.chi.x.array[: self._domain.cell_count]
+        values = self._expression_values(name)
+        return values[:, 0] if values.shape[1] == 1 else values
+
+    def _broken_share(self) -> Values:
+        """Share (cells,) of the edges of each cell that are broken, 0 to 1."""
+        assert self._fracture is not None
+        graph = self._fracture.graph
+        return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
+
+    def _expression_values(self, name: str) -> Values:
+        """Values (cells, components) of an expression of the deformation; stress and energy are multiplied by chi."""
+        if name not in self._compiled:
+            expression = _EXPRESSIONS[name](self._stress)
+            self._compiled[name] = CellExpression(
+                self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
+            )
+        values = self._compiled[name]()
+        if (chi := self._stress.energy_multiplier) is not None and name != "strain":
+            values *= chi.x.array[: self._domain.cell_count, None]
+        if self._fracture is not None and name == "strain":
+            # the nodes of a split cell belong to several fragments, which have no strain in common
+            values[self._fracture.graph.split] = 0.0
+        # cells crushed flat have no finite stress; they carry none
+        return np.nan_to_num(values, posinf=0.0, neginf=0.0)
+
+
+def _kinematics(stress: Stress) -> tuple[Energy, Expr, Expr | None]:
+    """Energy, deformation gradient, and rotation of the corotated energy."""
+    return stress.energy, deformation_gradient(stress.u), stress.rotation_field
+
+
+def _cauchy_stress(stress: Stress) -> Expr:
+    """Components of the Cauchy stress in the order of `TENSOR_COMPONENTS`, Pa."""
+    tensor = full_cauchy_stress(*_kinematics(stress))
+    return ufl.as_vector([tensor[i, j] for i, j in _TENSOR_INDICES])
+
+
+def _von_mises(stress: Stress) -> Expr:
+    """Von Mises equivalent of the Cauchy stress, Pa."""
+    return von_mises(full_cauchy_stress(*_kinematics(stress)))
+
+
+def _energy_density(stress: Stress) -> Expr:
+    """Elastic energy per reference volume, J/m^3."""
+    energy, F, rotation = _kinematics(stress)
+    return energy.psi(F, rotation)
+
+
+def _equivalent_strain(stress: Stress) -> Expr:
+    """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (Mandal et al. 2022, figure 2)."""
+    E = green_strain(embed(deformation_gradient(stress.u), 1.0))
+    return ufl.sqrt(2 / 3 * ufl.inner(ufl.dev(E), ufl.dev(E)))
+
+
+_EXPRESSIONS: dict[str, Callable[[Stress], Expr]] = {
+    "stress": _cauchy_stress,
+    "von_mises": _von_mises,
+    "energy_density": _energy_density,
+    "strain": _equivalent_strain,
+}
 
 
 class FrameFiles:
-    """Writes frames.
+    """Writer of frames: fields.xdmf, and the split surface if the study asks for it.
 
     Attributes:
-        surface: the split surface; None where it is not wanted.    fields: fields.xdmf on rank 0, None elsewhere.
+        surface: split surface; None without surface output.
+        fields: fields.xdmf on rank 0, None on the other ranks.
     """
 
     def __init__(
@@ -30,60 +154,74 @@ class FrameFiles:
         folder: Path,
         balance: Balance,
         breaking: Breaking | None,
-        breaks: Breaks,
+        breaks: FractureLog,
         *,
         fields: list[str],
         surface: bool,
         smooth: bool = False,
-        passing: Passing | None = None,
+        passing: InterpenetrationMonitor | None = None,
         resume_at: float | None = None,
         thickness: float = 1.0,
     ) -> None:
-        """`fields`: by the names of output.fields; `smooth`: cracks are drawn so; `passing`: watches
-        pieces that nothing keeps apart; `resume_at`: keep the frames up to this time, s; `thickness`: m, of a 2D body
-        (collective).
+        """Open the files (collective).
 
-        Raises CannotWrite.
+        Args:
+            folder: output folder.
+            balance: balance of forces of the body.
+            breaking: fracture pass, in a study with fracture.
+            breaks: log of broken edges.
+            fields: names of output.fields.
+            surface: write the split surface.
+            smooth: draw cracks smooth.
+            passing: monitor of interpenetration, in a study without contact between fragments.
+            resume_at: keep the frames up to this time, s; None: a new run.
+            thickness: thickness of a 2D body, m; 1 in 3D.
+
+        Raises:
+            CannotWrite: a file cannot be written.
         """
         stress = balance.stress
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
-        self._values, source = Frames(stress, fields, breaking), stress.domain.mesh_of_nodes()
-        self.fields = written(self._comm, self._path, lambda: FieldsFile(folder, source, resume_at) if source else None)
+        self._evaluate, mesh = FieldEvaluator(stress, fields, breaking), stress.domain.mesh_of_nodes()
+        self.fields = write_on_root(
+            self._comm, self._path, lambda: FieldsFile(folder, mesh, resume_at) if mesh else None
+        )
         self.surface = None
         if surface:
-            self.surface = _surface(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
+            self.surface = _surface_output(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Frames in each file (rank 0; none elsewhere)."""
+    def frame_counts(self) -> dict[str, int]:
+        """Number of frames in each file (rank 0; empty on the other ranks)."""
         if self.fields is None:
             return {}
-        surface = {} if self.surface is None or self.surface.made is None else self.surface.made[1].counts
-        return {"fields.h5": len(self.fields.times), **surface}
+        opened = None if self.surface is None else self.surface.surface_and_files
+        return {"fields.h5": len(self.fields.times), **({} if opened is None else opened[1].frame_counts)}
 
-    def write(self, state: State) -> None:
-        """A frame at the time of the state, where there is none yet. Raises CannotWrite (collective)."""
-        fields = self._values(state, self._breaks.pieces)
-        written(self._comm, self._path, lambda: self._write_fields(state.t, fields))
+    def write_frame(self, state: State) -> None:
+        """Write a frame at the time of the state, if there is none yet. Raises CannotWrite (collective)."""
+        fields = self._evaluate(state, self._breaks.fragments)
+        write_on_root(self._comm, self._path, lambda: self._write_fields(state.t, fields))
         if self.surface is not None:
-            self.surface.write(state, fields)
+            self.surface.write_frame(state, fields)
 
     def _write_fields(self, t: float, fields: list[Field]) -> None:
         if self.fields is not None and t not in self.fields.times:
-            self.fields.write(t, fields)
+            self.fields.append_frame(t, fields)
 
 
-def _surface(
+def _surface_output(
     folder: Path,
     balance: Balance,
-    breaks: Breaks,
-    passing: Passing | None,
+    breaks: FractureLog,
+    passing: InterpenetrationMonitor | None,
     resume_at: float | None,
     thickness: float,
     *,
     smooth: bool,
 ) -> SurfaceOutput:
-    """The split surface: imported, built and kept only where it is wanted."""
+    """Split surface of a run; arguments of `FrameFiles`."""
+    # imported here: runs without surface output do not need VTK
     from .surface.surface_output import SurfaceOutput
 
     density, terms = balance.stress.material.density * thickness, balance.terms

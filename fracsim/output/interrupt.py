@@ -1,4 +1,4 @@
-"""Ending early on a signal or at the wall-time limit, on all ranks in the same step."""
+"""Early end of a run by a signal or at the wall-time limit, on all ranks in the same step."""
 
 from __future__ import annotations
 
@@ -14,121 +14,136 @@ from mpi4py import MPI
 
 from ..errors import SAME_REQUEST, STOP_SIGNALS, FracsimError, Stopped
 
-SHORT = 0.5  # s: a step that has taken no longer is not abandoned
+MAX_UNINTERRUPTED_SECONDS = 0.5  # a step that has taken no longer is finished before the run stops
 _SOURCE = Path(__file__).with_name("signals.c")
 
 
-class Interrupt:
-    """Catches signals while it is entered, as often as one likes; `reason` agrees over the ranks.
+class InterruptHandler:
+    """Handler of stop signals and of the wall-time limit. The ranks agree on the reason to stop.
 
-    A second signal ends the process at once, whatever it does (SAME_REQUEST s after the first or later). Signals that
-    were ignored before stay so.
+    The handler is a context manager that can be entered again inside. A second signal ends the process at once if it
+    comes `SAME_REQUEST` seconds after the first or later. Signals that were ignored before stay ignored.
 
     Attributes:
-        writing: something has been written. Before that Ctrl-C ends the program at once, there is nothing to save; so
-        do other signals on a single rank.
+        comm: the ranks of the run.
+        has_output: True once the run has written something. Before that Ctrl-C ends the program at once, and on a
+            single rank other signals do too: there is nothing to save.
     """
 
     def __init__(self, comm: MPI.Comm, wall_limit: float | None, *, alone: bool | None = None) -> None:
-        """`wall_limit`: s from now; `alone`: whether the run is on one rank; None: as `comm` is."""
+        """Start the clock of the wall-time limit.
+
+        Args:
+            comm: the ranks of the run.
+            wall_limit: wall-time limit from now, s; None: no limit.
+            alone: the run has a single rank; None: as `comm` says.
+        """
         self.comm = comm
-        self.writing = False
+        self.has_output = False
         self._alone = comm.size == 1 if alone is None else alone
         self._deadline = np.inf if wall_limit is None else time.monotonic() + wall_limit
         self._signal = 0
         self._step_began = -np.inf
-        self._entered = 0
-        self._before: dict[int, object] = {}
+        self._depth = 0  # how often the context is entered
+        self._previous_handlers: dict[int, object] = {}
 
-    def __enter__(self) -> Interrupt:
-        self._entered += 1
-        if self._entered > 1:
+    def __enter__(self) -> InterruptHandler:
+        self._depth += 1
+        if self._depth > 1:
             return self
-        code = _code()
+        code = _signal_library()
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is signal.SIG_IGN:
-                signal.signal(number, signal.SIG_IGN)  # PETSc may have taken it since
+                signal.signal(number, signal.SIG_IGN)  # PETSc may have installed a handler since
                 continue
-            self._before[number] = signal.signal(number, self._note)
+            self._previous_handlers[number] = signal.signal(number, self._on_signal)
             if code is not None:
                 code.watch_signal(int(number), SAME_REQUEST)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._entered -= 1
-        if not self._entered:
-            for number, handler in self._before.items():
+        self._depth -= 1
+        if not self._depth:
+            for number, handler in self._previous_handlers.items():
                 signal.signal(number, handler)  # type: ignore[arg-type]
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGINT and not self.writing:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not self.has_output:
             raise KeyboardInterrupt
         self._signal = self._signal or number
-        if self._alone and not self.writing:
-            raise self.stopped_in_setup(signal.Signals(number).name)
+        if self._alone and not self.has_output:
+            raise self.setup_stop_error(signal.Signals(number).name)
 
     @staticmethod
-    def stopped_in_setup(name: str) -> Stopped:
-        """What ends a run on the signal of a name, before it has written anything."""
+    def setup_stop_error(name: str) -> Stopped:
+        """Error that ends a run before it has written anything; `name` is the name of the signal."""
         return Stopped(f"stopped by signal {name} while the run was set up; nothing was written")
 
-    def check_setup(self) -> None:
-        """Raises Stopped where a signal has come to any rank while the run was set up (collective)."""
-        if name := self.signalled():
-            raise self.stopped_in_setup(name.removeprefix("signal "))
+    def check_setup_signals(self) -> None:
+        """Raise Stopped if any rank received a signal while the run was set up (collective)."""
+        if name := self.received_signal():
+            raise self.setup_stop_error(name.removeprefix("signal "))
 
-    def signalled(self) -> str:
-        """The name of a signal that has come to any rank, empty where there is none (collective)."""
-        number, _ = self._agreed(False)
+    def received_signal(self) -> str:
+        """Name of a signal that any rank received, as in "signal SIGTERM"; empty if there is none (collective)."""
+        number, _ = self._agree(False)
         return f"signal {signal.Signals(number).name}" if number else ""
 
-    def reason(self) -> str:
-        """Why to stop now, empty to go on (collective)."""
-        number, late = self._agreed(time.monotonic() > self._deadline)
+    def stop_reason(self) -> str:
+        """Reason to stop now, empty to continue (collective)."""
+        number, late = self._agree(time.monotonic() > self._deadline)
         if number:
             return f"signal {signal.Signals(number).name}"
         return "the wall-time limit" if late else ""
 
-    def _agreed(self, late: bool) -> tuple[int, bool]:
-        """The signal that has come to any rank, 0: none; and whether it is `late` on any (collective)."""
+    def _agree(self, late: bool) -> tuple[int, bool]:
+        """Number of a signal that any rank received (0: none), and True if any rank is late (collective)."""
         if self.comm.size == 1:
             return self._signal, late
-        own, worst = np.array([self._signal, late], np.int32), np.empty(2, np.int32)
-        self.comm.Allreduce(own, worst, op=MPI.MAX)
-        return int(worst[0]), bool(worst[1])
+        local, largest = np.array([self._signal, late], np.int32), np.empty(2, np.int32)
+        self.comm.Allreduce(local, largest, op=MPI.MAX)
+        return int(largest[0]), bool(largest[1])
 
     # --- inside a step ---
 
     def begin_step(self) -> None:
-        """A step begins now."""
+        """Record that a step begins now."""
         self._step_began = time.monotonic()
 
-    def abandons(self) -> bool:
-        """Whether the step is to be abandoned: there is a reason to stop, and the step is not short (collective)."""
-        now = time.monotonic()
-        number, late = self._agreed(now > self._deadline)
-        return (number > 0 or late) and self._is_long(now)
+    def must_abandon_step(self) -> bool:
+        """True if there is a reason to stop and the present step has taken long (collective)."""
+        clock = time.monotonic()
+        number, late = self._agree(clock > self._deadline)
+        return (number > 0 or late) and self._is_long(clock)
 
-    def _is_long(self, now: float) -> bool:
-        """Whether the step has taken longer than SHORT s, as rank 0 says (collective)."""
-        long = now - self._step_began > SHORT
+    def _is_long(self, clock: float) -> bool:
+        """True if, by the clock of rank 0, the step is longer than `MAX_UNINTERRUPTED_SECONDS` (collective)."""
+        long = clock - self._step_began > MAX_UNINTERRUPTED_SECONDS
         return long if self.comm.size == 1 else bool(self.comm.bcast(long))
 
 
-def end_with(launcher: int, *, parent: int) -> None:
-    """Have this process end with the launcher of ranks, its `parent` or an ancestor, in whatever way that ends: the
-    ranks would wait for ever (Linux)."""
-    if (code := _code()) is None:
+def end_with_launcher(launcher: int, *, parent: int) -> None:
+    """End this process as soon as the launcher of the ranks ends (Linux). Otherwise ranks could wait forever.
+
+    Args:
+        launcher: process id of the launcher, which is the parent or an ancestor.
+        parent: process id of the parent.
+    """
+    if (code := _signal_library()) is None:
         return
     if launcher == parent:
         code.end_with_parent(parent, int(signal.SIGRTMAX) - 1)
-    else:  # a shell is between them, which goes on
+    else:
+        # a shell stands between the two and outlives the launcher
         code.end_with_process(launcher)
 
 
 @cache
-def _code() -> CDLL | None:
-    """What signals do at once; None where there is no compiler: then a second signal waits for Python, too."""
+def _signal_library() -> CDLL | None:
+    """Compiled signal handlers, which act at once; None without a compiler.
+
+    Without them a second signal is handled only when Python executes its next instruction.
+    """
     from ..mesh.c_library import load_library
 
     try:

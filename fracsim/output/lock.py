@@ -1,7 +1,7 @@
-"""A lock on an output folder: one run at a time writes there.
+"""Lock on an output folder: one run at a time writes there.
 
-The kernel keeps the lock (flock on a file in the folder) and releases it when the process ends, in whatever way. So a
-lock file that a killed run left behind means nothing. Rank 0 alone takes the lock.
+The kernel keeps the lock (flock on a file in the folder) and releases it when the process ends, also if it is killed.
+So a lock file without a living process has no effect. Only rank 0 takes the lock.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from weakref import WeakValueDictionary
 
 from ..errors import InputError
 
-LOCK = ".fracsim.lock"
-PATIENCE = 0.3  # s that a lock is tried for: who asks whether a run goes on holds it for a moment
-# a file system without locks, such as NFS or Lustre mounted without them
+LOCK_FILE = ".fracsim.lock"
+# How long a lock is tried for. A process that only asks whether a run is active holds the lock for a moment.
+LOCK_WAIT_SECONDS = 0.3
+# error numbers of file systems without locks, such as NFS or Lustre mounted without them
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 
 
-class _Handle:
-    """A lock that this process holds; it goes with the last reference."""
+class _LockHandle:
+    """Lock that this process holds. It is released with the last reference."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path, self._descriptor, self._process = path, descriptor, os.getpid()
@@ -37,43 +38,49 @@ class _Handle:
         self.close()
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Release the lock and delete the lock file."""
         if self._descriptor < 0:
             return
-        if os.getpid() == self._process:  # a child shares the lock, and must not end it
+        # a forked child shares the lock and must not end it
+        if os.getpid() == self._process:
             with contextlib.suppress(OSError):
-                os.unlink(self._path)  # while the lock is held: nobody else can hold this very file
+                os.unlink(self._path)  # still locked here, so no other process can hold this very file
         with contextlib.suppress(OSError):
             os.close(self._descriptor)
         self._descriptor = -1
 
 
-_of_process: WeakValueDictionary[Path, _Handle] = WeakValueDictionary()  # by folder
+_handles: WeakValueDictionary[Path, _LockHandle] = WeakValueDictionary()  # locks of this process by folder
 
 
 @atexit.register
 def _close_all() -> None:
-    """No lock file stays behind a process that ends by itself."""
-    for handle in list(_of_process.values()):
+    """Delete the lock files of a process that ends normally."""
+    for handle in list(_handles.values()):
         handle.close()
 
 
 class FolderLock:
-    """The lock on a folder. Several in one process share it.
+    """Lock on a folder. Several locks of one process on the same folder share it.
 
     Attributes:
-        folder: that is locked.
+        folder: the folder.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._handle: _Handle | None = None
+        self._handle: _LockHandle | None = None
 
     def acquire(self, *, make: bool = False) -> bool:
-        """Take the lock; returns whether this object has not held it before. `make`: the folder, where it is missing.
+        """Take the lock; returns True unless this object holds it already.
 
-        A folder that is not there is not locked, without `make`; one whose file system has no locks is not either, with
-        a note. InputError where another process holds the lock, or where nothing can be written.
+        A missing folder is not locked. On a file system without locks a note is printed instead.
+
+        Args:
+            make: create the folder if it is missing.
+
+        Raises:
+            InputError: another process holds the lock, or the folder cannot be written to.
         """
         if self._handle is not None:
             return False
@@ -82,13 +89,13 @@ class FolderLock:
                 self.folder.mkdir(parents=True, exist_ok=True)
             elif not self.folder.is_dir():
                 return False
-            self._handle = _locked(self.folder.resolve(), self.folder)
+            self._handle = _take_lock(self.folder.resolve(), self.folder)
         except OSError as error:
             raise InputError(f"--out {self.folder}: cannot write there: {error.strerror}") from None
         return True
 
     def release(self) -> None:
-        """Give the lock back; nothing where it is not held."""
+        """Release the lock if it is held."""
         self._handle = None
 
     def __enter__(self) -> FolderLock:
@@ -98,43 +105,58 @@ class FolderLock:
         self.release()
 
 
-def claim(lock: FolderLock, check: Callable[[], object], *, make: bool = False) -> None:
-    """Take a lock on a folder that passes a check, and passes it still once the lock is held. Raises InputError."""
+def lock_checked_folder(lock: FolderLock, check: Callable[[], object], *, make: bool = False) -> None:
+    """Take a lock on a folder that passes a check before and after locking.
+
+    Args:
+        lock: the lock.
+        check: raises InputError if the folder must not be used.
+        make: create the folder if it is missing; without the check before locking.
+
+    Raises:
+        InputError: the check failed, or another process holds the lock.
+    """
     if not make:
-        if os.path.lexists(lock.folder / LOCK):  # a run that goes on is to be told of before what it has written
+        # an active run is reported before the files that it has written
+        if os.path.lexists(lock.folder / LOCK_FILE):
             lock.acquire()
         check()
     if lock.acquire(make=make):
         check()
 
 
-def holder(folder: Path) -> str | None:
-    """Who else holds the lock on a folder, in words; None: nobody."""
-    if folder.resolve() in _of_process:
+def describe_lock_holder(folder: Path) -> str | None:
+    """Description of another process that holds the lock on a folder; None if there is none."""
+    if folder.resolve() in _handles:
         return None
     try:
-        descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError as error:
-        return _words(descriptor) if error.errno == errno.EWOULDBLOCK else None
+        return _read_holder(descriptor) if error.errno == errno.EWOULDBLOCK else None
     finally:
         os.close(descriptor)
     return None
 
 
-def _locked(folder: Path, name: Path) -> _Handle:
-    """The lock on a folder that users call `name`."""
-    if (held := _of_process.get(folder)) is not None:
-        return held
-    path, until = folder / LOCK, time.monotonic() + PATIENCE
+def _take_lock(folder: Path, name: Path) -> _LockHandle:
+    """Lock on a folder.
+
+    Args:
+        folder: resolved path.
+        name: path as the user gave it, for messages.
+    """
+    if (shared := _handles.get(folder)) is not None:
+        return shared
+    path, deadline = folder / LOCK_FILE, time.monotonic() + LOCK_WAIT_SECONDS
     while True:
-        descriptor = _opened(path, name)
+        descriptor = _open_lock_file(path, name)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is_at(descriptor, path):
+            if _is_file_at(descriptor, path):
                 break
         except OSError as error:
             if error.errno in _UNSUPPORTED:
@@ -144,24 +166,26 @@ def _locked(folder: Path, name: Path) -> _Handle:
                     file=sys.stderr,
                 )
                 break
-            if error.errno != errno.EWOULDBLOCK or time.monotonic() > until:
-                words = _words(descriptor)
+            if error.errno != errno.EWOULDBLOCK or time.monotonic() > deadline:
+                holder = _read_holder(descriptor)
                 os.close(descriptor)
                 raise InputError(
-                    f"--out {name}: a run is going on there ({words}); wait for its end, or give another folder"
+                    f"--out {name}: a run is going on there ({holder}); wait for its end, or give another folder"
                 ) from None
-        os.close(descriptor)  # of a file that its holder has deleted since, or of one that is held
+        # the holder has deleted this file since, or holds it still
+        os.close(descriptor)
         time.sleep(0.02)
-    with contextlib.suppress(OSError):  # on a full disk nobody is told who holds it
+    # on a full disk the holder cannot be written, and the lock holds all the same
+    with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
         since = time.strftime("%Y-%m-%d %H:%M:%S")
         os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}, since {since}\n".encode(), 0)
-    _of_process[folder] = handle = _Handle(path, descriptor)
+    _handles[folder] = handle = _LockHandle(path, descriptor)
     return handle
 
 
-def _opened(path: Path, name: Path) -> int:
-    """A descriptor of the lock file, which is a plain file. Raises OSError, InputError."""
+def _open_lock_file(path: Path, name: Path) -> int:
+    """Descriptor of the lock file. Raises InputError if it is not a regular file, and OSError."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     except OSError as error:
@@ -175,15 +199,15 @@ def _opened(path: Path, name: Path) -> int:
     return descriptor
 
 
-def _is_at(descriptor: int, path: Path) -> bool:
-    """Whether a path still leads to the file of a descriptor."""
+def _is_file_at(descriptor: int, path: Path) -> bool:
+    """True if the path still leads to the open file."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.lstat(path))
     except FileNotFoundError:
         return False
 
 
-def _words(descriptor: int) -> str:
-    """What the holder has written of itself."""
+def _read_holder(descriptor: int) -> str:
+    """Description of the holder in the lock file."""
     text = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
     return text or "of a process that did not say which"

@@ -1,7 +1,7 @@
-"""What a run tells of how far it is, on rank 0 and to stderr: a line that rewrites itself, or a line a minute.
+"""Progress of a run on stderr, on rank 0: a line that rewrites itself, or a line per minute in a log.
 
-Under Open MPI the stdout of a rank is a pseudo-terminal and its stderr a pipe, whoever watches. So under a launcher it
-is the launcher's stderr that says whether a terminal is there.
+Under Open MPI the stdout of a rank is always a pseudo-terminal and its stderr a pipe. Therefore under a launcher the
+stderr of the launcher decides whether there is a terminal.
 """
 
 from __future__ import annotations
@@ -17,116 +17,146 @@ from dataclasses import dataclass
 from ..errors import STOP_SIGNALS
 from ..mesh.parallel import starts_ranks
 
-VARIABLE = "FRACSIM_PROGRESS"
-FIRST, PERIOD = 5.0, 60.0  # s until the first line of a log, and from one line to the next
-REWRITTEN = 0.2  # s that a line on a terminal stays at least
-COLUMNS = 110  # of a terminal that does not say
+PROGRESS_VARIABLE = "FRACSIM_PROGRESS"
 
 
 @dataclass(frozen=True)
-class Done:
-    """What is done of a run.
+class ProgressTiming:
+    """Times between lines, and the width of a line.
 
     Attributes:
-        t, dt: time reached, and size of the last step, s.    step: its number.    broken, pieces: edges, and pieces.
-        more: of the last step, in words.
+        first_line: time until the first line of a log, s. Short runs leave no line.
+        line_period: time between lines of a log, s.
+        min_rewrite: least time between two states of the line on a terminal, s.
+        terminal_columns: width of a terminal that does not report its own.
+    """
+
+    first_line: float = 5.0
+    line_period: float = 60.0
+    min_rewrite: float = 0.2
+    terminal_columns: int = 110
+
+
+PROGRESS_TIMING = ProgressTiming()
+
+
+@dataclass(frozen=True)
+class ProgressState:
+    """State of a run after a step.
+
+    Attributes:
+        t: time reached, s.
+        dt: size of the last step, s.
+        step: number of the last step.
+        broken_edges: number of broken edges.
+        fragments: number of fragments.
+        details: further text about the last step.
     """
 
     t: float
     dt: float
     step: int
-    broken: int
-    pieces: int
-    more: str = ""
+    broken_edges: int
+    fragments: int
+    details: str = ""
 
 
-class Progress:
-    """Tells how far a run is while it is entered, as often as one likes; a log has no control characters.
+class ProgressReporter:
+    """Reporter of progress while its context is entered; the context can be entered again inside.
 
-    FRACSIM_PROGRESS: "live" a line that rewrites itself; a number a line each so many seconds; "off" nothing. Without
-    it: live on a terminal, a line a minute elsewhere, the first after five seconds.
+    The environment variable FRACSIM_PROGRESS selects the form: "live" for a line that rewrites itself, a number for a
+    line every so many seconds, "off" for nothing. Without it the line is live on a terminal; elsewhere there is a line
+    per minute, the first after five seconds. A log has no control characters.
     """
 
     def __init__(self, *, first: bool, end: float) -> None:
-        """`first`: on rank 0, the others are silent; `end`: of the run, s."""
-        self._end, self._began = end, time.monotonic()
-        self._stage, self._done = "", None  # type: tuple[str, Done | None]
-        self._from, self._stepping = 0.0, self._began  # time of the run, and when, as the first step began
-        self._shown = -math.inf
-        self._live, self._period, columns = _wanted() if first else (False, math.inf, 0)
-        self._columns = columns - 1
-        self._over = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._entered = 0
+        """Start the clock.
 
-    def __enter__(self) -> Progress:
-        self._entered += 1
-        if self._entered == 1 and not self._live and self._period < math.inf:
-            self._thread = threading.Thread(target=self._tell_a_log, name="progress", daemon=True)
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # they are for the thread of the run
+        Args:
+            first: this is rank 0; the other ranks print nothing.
+            end: end time of the run, s.
+        """
+        self._end, self._began = end, time.monotonic()
+        self._stage = ""
+        self._state: ProgressState | None = None
+        self._first_step_t, self._first_step_clock = 0.0, self._began  # simulated and wall time, start of first step
+        self._last_write = -math.inf
+        self._is_live, self._period, columns = _chosen_form() if first else (False, math.inf, 0)
+        self._columns = columns - 1
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._depth = 0  # how often the context is entered
+
+    def __enter__(self) -> ProgressReporter:
+        self._depth += 1
+        if self._depth == 1 and not self._is_live and self._period < math.inf:
+            self._thread = threading.Thread(target=self._write_log, name="progress", daemon=True)
+            # the new thread inherits the mask: signals must go to the thread of the run
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
             self._thread.start()
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._entered -= 1
-        if self._entered:
+        self._depth -= 1
+        if self._depth:
             return
-        self._over.set()
+        self._stop.set()
         if self._thread is not None:
             self._thread.join()
         self.end_line()
 
     def end_line(self) -> None:
-        """Other words come next: they begin on a line of their own."""
-        if self._live and self._shown > -math.inf:
+        """End the line, so that other output begins on a new one."""
+        if self._is_live and self._last_write > -math.inf:
             self._rewrite(self._line())
             _write("\n")
-            self._shown = -math.inf
+            self._last_write = -math.inf
 
-    # --- what the run tells ---
+    # --- called by the run ---
 
-    def stage(self, name: str) -> None:
-        """What the run does now, beside steps: "building the mesh"."""
+    def set_stage(self, name: str) -> None:
+        """Set what the run does outside steps, as in "building the mesh"."""
         self._stage = name
-        if self._live:
+        if self._is_live:
             self._rewrite(self._line())
 
-    def update(self, done: Done) -> None:
-        """A step is done."""
-        if self._stage or self._done is None:
+    def update(self, state: ProgressState) -> None:
+        """Set the state after a step."""
+        if self._stage or self._state is None:
             self._stage = ""
-            if self._done is None:
-                self._from, self._stepping = done.t - done.dt, time.monotonic()
-        self._done = done
-        if self._live and time.monotonic() - self._shown > REWRITTEN:
+            if self._state is None:
+                self._first_step_t, self._first_step_clock = state.t - state.dt, time.monotonic()
+        self._state = state
+        if self._is_live and time.monotonic() - self._last_write > PROGRESS_TIMING.min_rewrite:
             self._rewrite(self._line())
 
-    # --- how it is shown ---
+    # --- text ---
 
     def _line(self) -> str:
-        elapsed, done, stage = _clock(time.monotonic() - self._began), self._done, self._stage
-        if done is None:
+        elapsed, state, stage = _format_clock(time.monotonic() - self._began), self._state, self._stage
+        if state is None:
             return f"[{elapsed}] {stage}"
-        words = (
-            f"[{elapsed}] {done.t / self._end:6.1%}  t = {done.t:.4g} s  step {done.step}  broken edges {done.broken}  "
-            f"pieces {done.pieces}"
+        text = (
+            f"[{elapsed}] {state.t / self._end:6.1%}  t = {state.t:.4g} s  step {state.step}  "
+            f"broken edges {state.broken_edges}  pieces {state.fragments}"
         )
-        return f"{words}  {stage}" if stage else f"{words}  {self._left(done)}  {done.more}".rstrip()
+        return f"{text}  {stage}" if stage else f"{text}  {self._time_left(state)}  {state.details}".rstrip()
 
-    def _left(self, done: Done) -> str:
-        """The time left, as the steps so far have taken."""
-        share = (done.t - self._from) / max(self._end - self._from, done.dt)
-        seconds = time.monotonic() - self._stepping
-        return f"left {_clock(seconds * (1 - share) / share)}" if share > 0 and seconds > 0 else ""
+    def _time_left(self, state: ProgressState) -> str:
+        """Estimate of the remaining wall time, in proportion to the simulated time so far."""
+        share = (state.t - self._first_step_t) / max(self._end - self._first_step_t, state.dt)
+        seconds = time.monotonic() - self._first_step_clock
+        return f"left {_format_clock(seconds * (1 - share) / share)}" if share > 0 and seconds > 0 else ""
 
     def _rewrite(self, line: str) -> None:
         _write("\r" + line[: self._columns].ljust(self._columns))
-        self._shown = time.monotonic()
+        self._last_write = time.monotonic()
 
-    def _tell_a_log(self) -> None:
-        wait = min(FIRST, self._period)
-        while not self._over.wait(wait):
+    def _write_log(self) -> None:
+        """Write a line per period until the context is left (thread)."""
+        wait = min(PROGRESS_TIMING.first_line, self._period)
+        while not self._stop.wait(wait):
             _write(self._line() + "\n")
             wait = self._period
 
@@ -136,44 +166,53 @@ def _write(text: str) -> None:
     sys.stderr.flush()
 
 
-def _wanted() -> tuple[bool, float, int]:
-    """(a line that rewrites itself, else s between lines, columns of the terminal): as the variable says, or as
-    somebody watches."""
-    columns = _terminal()
-    wish = os.environ.get(VARIABLE, "").strip()
-    if wish == "off":
+def _chosen_form() -> tuple[bool, float, int]:
+    """Form of the report, from the environment variable or the terminal.
+
+    Returns:
+        True for a line that rewrites itself; otherwise the time between lines in s; columns of the terminal.
+    """
+    columns = _terminal_columns()
+    setting = os.environ.get(PROGRESS_VARIABLE, "").strip()
+    if setting == "off":
         return False, math.inf, 0
-    if wish == "live":
-        return True, math.inf, columns or COLUMNS
-    if wish:
+    if setting == "live":
+        return True, math.inf, columns or PROGRESS_TIMING.terminal_columns
+    if setting:
         try:
-            if 0 < (seconds := float(wish)) < math.inf:
+            if 0 < (seconds := float(setting)) < math.inf:
                 return False, seconds, 0
         except ValueError:
             pass
-        _write(f'fracsim: note: {VARIABLE}={wish} is none of "live", "off" or a number of seconds: it is ignored\n')
-    return columns > 0, PERIOD, columns
+        _write(
+            f'fracsim: note: {PROGRESS_VARIABLE}={setting} is none of "live", "off" or a number of seconds: '
+            "it is ignored\n"
+        )
+    return columns > 0, PROGRESS_TIMING.line_period, columns
 
 
-def _terminal() -> int:
-    """Columns of the terminal that stderr comes out at; 0: it does not."""
+def _terminal_columns() -> int:
+    """Columns of the terminal that shows stderr; 0 if there is none."""
     try:
         if sys.stderr.isatty():
-            return os.get_terminal_size(sys.stderr.fileno()).columns or COLUMNS
+            return os.get_terminal_size(sys.stderr.fileno()).columns or PROGRESS_TIMING.terminal_columns
         if not starts_ranks(parent := os.getppid()):
             return 0
         descriptor = os.open(f"/proc/{parent}/fd/2", os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
     except (OSError, ValueError):
         return 0
     try:
-        return (os.get_terminal_size(descriptor).columns or COLUMNS) if os.isatty(descriptor) else 0
+        if not os.isatty(descriptor):
+            return 0
+        return os.get_terminal_size(descriptor).columns or PROGRESS_TIMING.terminal_columns
     except OSError:
-        return COLUMNS
+        return PROGRESS_TIMING.terminal_columns
     finally:
         os.close(descriptor)
 
 
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(int(seconds + 0.5), 60)
+def _format_clock(seconds: float) -> str:
+    """Duration as H:MM:SS or M:SS."""
+    minutes, seconds_left = divmod(int(seconds + 0.5), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{seconds_left:02d}" if hours else f"{minutes}:{seconds_left:02d}"

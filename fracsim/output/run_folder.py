@@ -1,9 +1,8 @@
-"""The output folder: what is in it, when a frame is due, and what ran.
+"""Output folder of a run: who may write there, what may change on a restart, and when a frame is due.
 
-What may change on a restart: how long, in what steps and with which solver a study runs, and what it writes.
-
-Everything else is the body, its load or the law it follows, of which half a run would be of one kind and half of
-another. The mesh is compared by its nodes, cells and groups, not by its keys: a file may have moved.
+On a restart the duration, the time steps, the solver and the output may change. All other keys define the body, its
+loads and its laws, which must be the same throughout a run. The mesh is compared by its nodes, cells and groups and not
+by its keys, since a mesh file may have moved.
 """
 
 from __future__ import annotations
@@ -21,68 +20,78 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError
 from ..timestepping.stepper import count_intervals
-from .atomic_write import reason, replace_text
+from .atomic_write import error_reason, replace_text
 from .checkpoint_file import checkpoint_path, read_notes
-from .fields_file import check_whole, read_times
-from .file_ownership import STUDY, check_not_resumable, check_owner, check_plain, clear
-from .history import read_earlier
+from .fields_file import check_self_contained, read_frame_times
+from .file_ownership import STUDY_FILE, check_file_types, check_not_resumable, check_ownership, delete_own_files
+from .history import read_earlier_rows
 
-FREE = (
+CHANGEABLE_KEYS = (
     "title", "time.step", "time.end", "time.adapt", "time.smallest", "time.breaking_step", "time.until", "solver",
     "output", "mesh",
 )  # fmt: skip
-# tables that may come or go while nothing has broken or flowed, which the checkpoint is asked for; with the key of a
-# region that comes and goes with them
-LATE = {"fracture": "strength", "plasticity": "yield_stress", "brittle": ""}
-_SAID = 4  # keys that a message names
+# Tables that a restart may add or remove while nothing has broken or yielded; the checkpoint is asked for that. Each
+# with the key of a material that is added or removed with it.
+OPTIONAL_TABLES = {"fracture": "strength", "plasticity": "yield_stress", "brittle": ""}
+_MAX_NAMED_KEYS = 4  # differing keys listed in a message
 
 
-def check_same_study(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
-    """InputError where the study of a checkpoint (`then`, at `path`) is not the one that is to go on.
+def check_same_study(path: Path, earlier: dict[str, Any], present: dict[str, Any]) -> None:
+    """Raise InputError if the study of a checkpoint is not the one that is to continue.
 
-    Both as they stand in study.toml, every default written out.
+    Args:
+        path: the checkpoint, named in the error.
+        earlier: tables of the study in the checkpoint, with all defaults.
+        present: tables of the study to continue, with all defaults.
     """
-    found = list(differences(then, now))
-    if not found:
+    differences = list(study_differences(earlier, present))
+    if not differences:
         return
-    more = f"; and {len(found) - _SAID} more" if len(found) > _SAID else ""
+    unnamed = f"; and {len(differences) - _MAX_NAMED_KEYS} more" if len(differences) > _MAX_NAMED_KEYS else ""
     raise InputError(
-        f"--restart: {path} is of another study: {'; '.join(found[:_SAID])}{more}. Only time.step, time.end, "
-        "time.adapt, time.smallest, time.breaking_step, time.until, [solver], [output] and the title may change; put "
-        "the others back, or run without --restart in another folder"
+        f"--restart: {path} is of another study: {'; '.join(differences[:_MAX_NAMED_KEYS])}{unnamed}. Only time.step, "
+        "time.end, time.adapt, time.smallest, time.breaking_step, time.until, [solver], [output] and the title may "
+        "change; put the others back, or run without --restart in another folder"
     )
 
 
-def differences(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
-    """A phrase for each key that may not differ and does."""
-    old, new = dict(_leaves(then)), dict(_leaves(now))
-    moved = _moved(then, now)
-    orders = [each["mesh"].get("order", 1) for each in (then, now)]  # all else of it is compared by what it makes
+def study_differences(earlier: dict[str, Any], present: dict[str, Any]) -> Iterator[str]:
+    """Phrases about the keys that differ and must not; arguments of `check_same_study`."""
+    old, new = dict(_dotted_keys(earlier)), dict(_dotted_keys(present))
+    changed_tables = _changed_tables(earlier, present)
+    # the only key of [mesh] that is compared: all others are compared by the mesh that they make
+    orders = [study["mesh"].get("order", 1) for study in (earlier, present)]
     if orders[0] != orders[1]:
         yield f"mesh.order was {orders[0]}, is {orders[1]}"
     for key in dict.fromkeys([*old, *new]):
-        if old.get(key) != new.get(key) and not _within(key, FREE) and not _of_moved(key, moved):
-            yield f"{key} was {_said(old, key)}, is {_said(new, key)}"
+        fixed = not _is_within(key, CHANGEABLE_KEYS) and not _belongs_to(key, changed_tables)
+        if fixed and old.get(key) != new.get(key):
+            yield f"{key} was {_format_value(old, key)}, is {_format_value(new, key)}"
 
 
-def _moved(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Tables of LATE that only one of the studies has; brittle surfaces come and go with [fracture] alone."""
-    moved = [name for name in LATE if (name in then) != (name in now)]
-    return [name for name in moved if name != "brittle" or "fracture" in moved]
+def _changed_tables(earlier: dict[str, Any], present: dict[str, Any]) -> list[str]:
+    """Optional tables that only one of the studies has; [brittle] counts only together with [fracture]."""
+    changed = [name for name in OPTIONAL_TABLES if (name in earlier) != (name in present)]
+    return [name for name in changed if name != "brittle" or "fracture" in changed]
 
 
-def _of_moved(key: str, moved: list[str]) -> bool:
+def _belongs_to(key: str, tables: list[str]) -> bool:
+    """True if a key is in one of the tables or is the key of a material that goes with one of them."""
     table, _, last = key.rpartition(".")
-    return _within(key, moved) or (table.startswith("material.") and last in [LATE[name] for name in moved])
+    in_material = table.startswith("material.") and last in [OPTIONAL_TABLES[name] for name in tables]
+    return _is_within(key, tables) or in_material
 
 
-def _within(key: str, names: list[str] | tuple[str, ...]) -> bool:
+def _is_within(key: str, names: list[str] | tuple[str, ...]) -> bool:
+    """True if a dotted key is one of the names or lies in a table of that name."""
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of a TOML document; entries of lists of tables by their number. An empty list is no key:
-    tables that an earlier version did not know are empty."""
+def _dotted_keys(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Pairs (dotted key, value) of a TOML document; entries of arrays of tables by their number.
+
+    Empty lists are left out: an earlier version did not write the tables that it did not know.
+    """
     if value == []:
         return
     if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -91,17 +100,18 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
         return
     for name, inner in value.items():
-        yield from _leaves(inner, f"{key}.{name}" if key else str(name))
+        yield from _dotted_keys(inner, f"{key}.{name}" if key else str(name))
 
 
-def _said(values: dict[str, Any], key: str) -> str:
+def _format_value(values: dict[str, Any], key: str) -> str:
+    """Value of a key for a message; "absent" if there is none."""
     if key not in values:
         return "absent"
     value = values[key]
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-def check_folder(
+def check_output_folder(
     folder: Path,
     study: str,
     *,
@@ -110,43 +120,63 @@ def check_folder(
     inputs: Iterable[Path | None],
     completed: Callable[[dict[str, Any]], dict[str, Any]],
 ) -> None:
-    """InputError where a run of this study may not write there, or cannot go on from there; changes nothing (rank 0).
+    """Raise InputError if a run may not write to a folder or cannot continue there. Nothing is changed (rank 0).
 
-    `study`: as it would stand in study.toml; `overwrite`: a run that may go on may be thrown away; `inputs`: files
-    that the study is read from; `completed` gives an earlier version's study the defaults of keys that it did not know.
+    Args:
+        folder: output folder.
+        study: text of study.toml.
+        restart: continue the run in the folder.
+        overwrite: an unfinished run in the folder may be deleted.
+        inputs: files from which the study is read.
+        completed: returns the tables of an earlier version's study with the defaults of keys added since.
     """
-    check_plain(folder)
+    check_file_types(folder)
     if restart:
-        then = completed(read_notes(folder).values())
-        check_same_study(checkpoint_path(folder), then, tomllib.loads(study))
-        inputs = ()  # study.toml of the run itself is what one goes on with
-    check_owner(folder, inputs)
+        earlier = completed(read_notes(folder).study_tables())
+        check_same_study(checkpoint_path(folder), earlier, tomllib.loads(study))
+        inputs = ()  # a restart may read study.toml of the run itself
+    check_ownership(folder, inputs)
     if not restart and not overwrite:
         check_not_resumable(folder)
 
 
-def make_folder(folder: Path, study: str, *, restart: bool) -> None:
-    """Make the output folder and write study.toml; an earlier run's files go, unless it is continued (rank 0)."""
+def make_output_folder(folder: Path, study: str, *, restart: bool) -> None:
+    """Create the output folder and write study.toml; files of an earlier run are deleted unless it continues (rank 0).
+
+    Args:
+        folder: output folder.
+        study: text of study.toml.
+        restart: continue the run in the folder.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not restart:
-            clear(folder)
-        replace_text(folder / STUDY, study)
+            delete_own_files(folder)
+        replace_text(folder / STUDY_FILE, study)
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot write there: {reason(error)}") from None
+        raise InputError(f"--out {folder}: cannot write there: {error_reason(error)}") from None
 
 
-def check_readable(folder: Path, columns: list[str], step: int) -> None:
-    """InputError where what a run has written so far cannot be continued; changes nothing (rank 0)."""
-    read_earlier(folder / "history.csv", columns, step)
+def check_continuable(folder: Path, columns: list[str], step: int) -> None:
+    """Raise InputError if the files of a run cannot be continued. Nothing is changed (rank 0).
+
+    Args:
+        folder: output folder.
+        columns: columns of history.csv.
+        step: step of the checkpoint.
+    """
+    read_earlier_rows(folder / "history.csv", columns, step)
     if (h5 := folder / "fields.h5").exists():
-        check_whole(h5)
-        read_times(h5)
-    check_text(folder)
+        check_self_contained(h5)
+        read_frame_times(h5)
+    check_text_files(folder)
 
 
-def check_text(folder: Path) -> None:
-    """InputError where what tells of frames of the surface is not text; changes nothing (rank 0)."""
+def check_text_files(folder: Path) -> None:
+    """Raise InputError if surface.pvd or pieces.csv is not a text file. Nothing is changed (rank 0)."""
     for path in (folder / "surface.pvd", folder / "pieces.csv"):
         try:
             if path.exists():
@@ -157,17 +187,23 @@ def check_text(folder: Path) -> None:
             ) from None
 
 
-def missing_frames(folder: Path, had: dict[str, int], has: dict[str, int]) -> list[str]:
-    """Notes on files by name that have fewer frames than they `had` as the run wrote its checkpoint."""
+def missing_frame_notes(folder: Path, expected: dict[str, int], present: dict[str, int]) -> list[str]:
+    """Sentences about files with fewer frames than when the checkpoint was written.
+
+    Args:
+        folder: output folder.
+        expected: numbers of frames by file name, from the checkpoint.
+        present: numbers of frames by file name, after the restart.
+    """
     return [
-        f"{folder / name} has {has[name]} of the {count} frames that the run had written: the others are missing"
-        for name, count in had.items()
-        if has.get(name, count) < count
+        f"{folder / name} has {present[name]} of the {count} frames that the run had written: the others are missing"
+        for name, count in expected.items()
+        if present.get(name, count) < count
     ]
 
 
-def versions(comm: MPI.Comm) -> dict[str, str]:
-    """What ran: programs, versions, ranks; by the words of own_files.HEAD, which the head of study.toml has."""
+def software_versions(comm: MPI.Comm) -> dict[str, str]:
+    """Versions of the programs and the number of ranks, by `STUDY_HEADER_WORDS`."""
     return {
         "fracsim": __version__,
         "dolfinx": version("fenics-dolfinx"),
@@ -177,21 +213,26 @@ def versions(comm: MPI.Comm) -> dict[str, str]:
     }
 
 
-class OutputClock:
-    """When a frame is due."""
+class FrameSchedule:
+    """Schedule of the frames of a run."""
 
     def __init__(self, every: int | None, interval: float) -> None:
-        """Every so many steps; with None, every so many seconds of simulated time."""
-        self._every, self._interval = every, interval
-        self._passed = 0  # intervals, at the last frame
+        """Start without a frame.
 
-    def due(self, t: float, step: int) -> bool:
-        """Whether it is, at the end of this step at time t, s."""
+        Args:
+            every: number of steps between frames; None: frames are due by time.
+            interval: simulated time between frames, s.
+        """
+        self._every, self._interval = every, interval
+        self._intervals_done = 0  # whole intervals at the last frame
+
+    def is_due(self, t: float, step: int) -> bool:
+        """True if a frame is due at the end of a step, at time t in s."""
         if self._every is not None:
             return step % self._every == 0
-        return count_intervals(t, self._interval) > self._passed
+        return count_intervals(t, self._interval) > self._intervals_done
 
-    def wrote(self, t: float) -> None:
-        """A frame was written at time t, s. A late one does not push back the others, which are at whole intervals."""
+    def record_frame(self, t: float) -> None:
+        """Record a frame at time t in s. A late frame does not delay the next, which are due at whole intervals."""
         if self._every is None:
-            self._passed = count_intervals(t, self._interval)
+            self._intervals_done = count_intervals(t, self._interval)

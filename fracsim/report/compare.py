@@ -13,18 +13,18 @@ import numpy as np
 
 from ..errors import InputError
 from ..meshes.plain_files import check_readable
-from .content import Cell, Picture, Plot, Section, Series, Table
+from .content import Picture, Plot, ReportTable, Section, Series, TableCell
 from .pareto import pareto_front
-from .runs import PHASES, RunData, Values, differing
+from .runs import PHASES, RunData, Values, differing_settings
 
-ENERGIES = {
+ENERGY_LABELS = {
     "external_work": "external work", "elastic": "elastic", "kinetic": "kinetic", "dissipated": "dissipated",
 }  # fmt: skip
-MOST_POINTS = 600  # of a curve on the page: more cannot be told apart
+MAX_CURVE_POINTS = 600  # of a curve on the page: more cannot be told apart
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceCurve:
     """A curve to compare with: the first column of a CSV against the others, named as columns of history.csv."""
 
     name: str
@@ -33,20 +33,20 @@ class Reference:
 
 
 def run_sections(
-    runs: list[RunData], references: list[Reference], *, quantity: str | None, exact: float | None
+    runs: list[RunData], references: list[ReferenceCurve], *, quantity: str | None, exact: float | None
 ) -> list[Section]:
     """The whole report on some runs."""
-    parts = [overview(runs)]
+    parts = [overview_section(runs)]
     if quantity is not None:
-        parts.append(precision(runs, quantity, exact))
+        parts.append(work_precision_section(runs, quantity, exact))
     if references:
-        parts.append(against(runs, references))
-    return [*parts, *pictures(runs), curves(runs), energies(runs), cost(runs)]
+        parts.append(reference_section(runs, references))
+    return [*parts, *picture_sections(runs), curve_section(runs), energy_section(runs), cost_section(runs)]
 
 
-def overview(runs: list[RunData]) -> Section:
+def overview_section(runs: list[RunData]) -> Section:
     """The table of the runs, with the settings in which they differ."""
-    keys = differing(runs)
+    keys = differing_settings(runs)
     peaks = list(dict.fromkeys(key for run in runs for key in run.summary.get("peak_reactions", {})))
     columns = (
         "run", *keys, "outcome", "pieces", "broken edges", "split cells", *(f"peak {key} N" for key in peaks),
@@ -57,10 +57,10 @@ def overview(runs: list[RunData]) -> Section:
     titles = dict.fromkeys(str(run.settings.get("title", "")) for run in runs)
     text = f"{'; '.join(titles)}. Each run again: fracsim run study.toml, in its folder."
     caption = "Settings that differ, and what came out" if keys else "What came out"
-    return Section("Runs", text, tables=(Table("runs", caption, columns, rows),))
+    return Section("Runs", text, tables=(ReportTable("runs", caption, columns, rows),))
 
 
-def _row(run: RunData, keys: list[str], peaks: list[str]) -> tuple[Cell, ...]:
+def _row(run: RunData, keys: list[str], peaks: list[str]) -> tuple[TableCell, ...]:
     get, history = run.summary.get, run.history
     seconds, reactions = get("seconds", {}), get("peak_reactions", {})
     last: Any = {key: values[-1] if len(values) else None for key, values in history.items()}
@@ -73,21 +73,21 @@ def _row(run: RunData, keys: list[str], peaks: list[str]) -> tuple[Cell, ...]:
     )  # fmt: skip
 
 
-def _cell(value: Any) -> Cell:
+def _cell(value: Any) -> TableCell:
     return value if value is None or isinstance(value, str | int | float | bool) else str(value)
 
 
-def series(run: RunData, x: str, y: str, label: str) -> Series:
+def history_series(run: RunData, x: str, y: str, label: str) -> Series:
     """A curve of a run, thinned where it has more points than a page can show; its extremes are kept."""
     a, b = run.history[x], run.history[y]
     chosen = np.arange(len(a))
-    if len(a) > MOST_POINTS:
+    if len(a) > MAX_CURVE_POINTS:
         ends = [int(np.argmin(b)), int(np.argmax(b))]
-        chosen = np.unique([*np.linspace(0, len(a) - 1, MOST_POINTS).astype(int), *ends])
+        chosen = np.unique([*np.linspace(0, len(a) - 1, MAX_CURVE_POINTS).astype(int), *ends])
     return Series(label, tuple(a[chosen].tolist()), tuple(b[chosen].tolist()), style="line")
 
 
-def curves(runs: list[RunData]) -> Section:
+def curve_section(runs: list[RunData]) -> Section:
     """Reactions and forces of contact over the motion of their group or obstacle (where it moves) and over time, and
     probes over time."""
     kinds = ("reaction_", "contact_", "probe_")
@@ -98,7 +98,7 @@ def curves(runs: list[RunData]) -> Section:
         if not _worth_showing(having, column):
             continue
         for x in (*_motions_of(column, having), "time"):
-            lines = tuple(series(run, x, column, run.name if len(runs) > 1 else "") for run in having)
+            lines = tuple(history_series(run, x, column, run.name if len(runs) > 1 else "") for run in having)
             plots.append(Plot(f"{column} over {x}", _axis(x), _axis(column), lines))
     text = "" if plots else "These runs record no reaction and no probe ([[probe]] in the study)."
     return Section("Reactions and probes", text, plots=tuple(plots))
@@ -129,19 +129,24 @@ def _axis(column: str) -> str:
     return f"{column}, {units[kind]}" if kind in units else column
 
 
-def energies(runs: list[RunData]) -> Section:
+def energy_section(runs: list[RunData]) -> Section:
     """One plot of all energies for a single run, else one plot an energy."""
     if len(runs) == 1:
-        lines = tuple(series(runs[0], "time", key, label) for key, label in ENERGIES.items())
+        lines = tuple(history_series(runs[0], "time", key, label) for key, label in ENERGY_LABELS.items())
         return Section("Energies", plots=(Plot("Energies over time", "time, s", "J", lines),))
     plots = tuple(
-        Plot(f"{label} over time", "time, s", f"{label}, J", tuple(series(run, "time", key, run.name) for run in runs))
-        for key, label in ENERGIES.items()
+        Plot(
+            f"{label} over time",
+            "time, s",
+            f"{label}, J",
+            tuple(history_series(run, "time", key, run.name) for run in runs),
+        )
+        for key, label in ENERGY_LABELS.items()
     )
     return Section("Energies", plots=plots)
 
 
-def cost(runs: list[RunData]) -> Section:
+def cost_section(runs: list[RunData]) -> Section:
     """Wall time a step over what has broken: it should not grow."""
     plots = [_steps(runs)]
     if any(np.any(run.history["broken_edges"] > 0) for run in runs):
@@ -150,22 +155,22 @@ def cost(runs: list[RunData]) -> Section:
             for run in runs
         )
         plots.insert(0, Plot("Wall time of each step over the edges broken so far", "broken edges", "s a step", lines))
-        pieces = tuple(series(run, "time", "pieces", run.name if len(runs) > 1 else "") for run in runs)
+        pieces = tuple(history_series(run, "time", "pieces", run.name if len(runs) > 1 else "") for run in runs)
         plots.append(Plot("Pieces over time", "time, s", "pieces", pieces))
     return Section("Cost of a step", plots=tuple(plots))
 
 
 def _steps(runs: list[RunData]) -> Plot:
-    lines = tuple(series(run, "time", "wall_step", run.name if len(runs) > 1 else "") for run in runs)
+    lines = tuple(history_series(run, "time", "wall_step", run.name if len(runs) > 1 else "") for run in runs)
     return Plot("Wall time of each step", "time, s", "s a step", lines, kind="logy")
 
 
 def _thin(run: RunData, x: str, y: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    thinned = series(run, x, y, "")
+    thinned = history_series(run, x, y, "")
     return thinned.x, thinned.y  # type: ignore[return-value]
 
 
-def pictures(runs: list[RunData]) -> list[Section]:
+def picture_sections(runs: list[RunData]) -> list[Section]:
     """The last frames, where runs drew them. Paths are absolute: the runs may lie anywhere."""
     drawn = [run for run in runs if (run.folder / "last.png").is_file()]
     shown = tuple(Picture(f"{run.name}: the last frame", str(run.folder.resolve() / "last.png")) for run in drawn)
@@ -175,7 +180,7 @@ def pictures(runs: list[RunData]) -> list[Section]:
 # --- curves of references -------------------------------------------------------------------------------------------
 
 
-def read_reference(path: Path) -> Reference:
+def read_reference(path: Path) -> ReferenceCurve:
     """A CSV with a header: the x column first, then one or more y columns. InputError where it is not that."""
     try:
         check_readable(path)
@@ -192,10 +197,10 @@ def read_reference(path: Path) -> Reference:
         ) from None
     order = np.argsort(table[:, 0], kind="stable")
     columns = dict(zip(header, table[order].T, strict=True))
-    return Reference(path.stem, header[0].strip(), {name.strip(): values for name, values in columns.items()})
+    return ReferenceCurve(path.stem, header[0].strip(), {name.strip(): values for name, values in columns.items()})
 
 
-def against(runs: list[RunData], references: list[Reference]) -> Section:
+def reference_section(runs: list[RunData], references: list[ReferenceCurve]) -> Section:
     """Plots of the runs with the references, and how far they are apart."""
     plots, rows = [], []
     for reference in references:
@@ -204,20 +209,20 @@ def against(runs: list[RunData], references: list[Reference]) -> Section:
             rows += [(reference.name, y, run.name, *_apart(run, reference, y)) for run in runs]
     columns = ("reference", "quantity", "run", "peak", "peak of the reference", "peak, relative", "rms, relative")
     caption = "Runs beside references: rms over the range that both cover, relative to the largest reference value"
-    return Section("References", tables=(Table("references", caption, columns, tuple(rows)),), plots=tuple(plots))
+    return Section("References", tables=(ReportTable("references", caption, columns, tuple(rows)),), plots=tuple(plots))
 
 
-def _compared(runs: list[RunData], reference: Reference, y: str) -> Plot:
+def _compared(runs: list[RunData], reference: ReferenceCurve, y: str) -> Plot:
     option = f"--reference {reference.name}"
     for run in runs:
-        run.column(reference.x, option), run.column(y, option)
+        run.history_column(reference.x, option), run.history_column(y, option)
     x, wanted = (tuple(map(float, reference.columns[name])) for name in (reference.x, y))
     given = Series(reference.name, x, wanted, style="reference")
-    lines = tuple(series(run, reference.x, y, run.name) for run in runs)
+    lines = tuple(history_series(run, reference.x, y, run.name) for run in runs)
     return Plot(f"{y} beside {reference.name}", _axis(reference.x), _axis(y), (*lines, given))
 
 
-def _apart(run: RunData, reference: Reference, y: str) -> tuple[Cell, ...]:
+def _apart(run: RunData, reference: ReferenceCurve, y: str) -> tuple[TableCell, ...]:
     a, b = run.history[reference.x], run.history[y]
     x, wanted = reference.columns[reference.x], reference.columns[y]
     peak, most = float(np.max(np.abs(b), initial=0.0)), float(np.max(np.abs(wanted)))
@@ -232,18 +237,18 @@ def _apart(run: RunData, reference: Reference, y: str) -> tuple[Cell, ...]:
 # --- error against run time -----------------------------------------------------------------------------------------
 
 
-def precision(runs: list[RunData], quantity: str, exact: float | None) -> Section:
+def work_precision_section(runs: list[RunData], quantity: str, exact: float | None) -> Section:
     """Error of a quantity against wall time and core-seconds; without `exact` against the finest run that was done."""
     done = [run for run in runs if run.outcome == "done"]
     if not done:
         raise InputError(f"--quantity {quantity}: none of the runs ended well")
     finest = max(done, key=lambda run: (run.summary.get("cells", 0), run.summary.get("steps", 0)))
-    reference = exact if exact is not None else finest.figure(quantity)
+    reference = exact if exact is not None else finest.quantity(quantity)
     if reference == 0 or not math.isfinite(reference):
         raise InputError(f"--quantity {quantity}: its reference is {reference:g}, which no error can be relative to")
     shown = [run for run in done if exact is not None or run is not finest]
-    errors = {run.name: abs(run.figure(quantity) / reference - 1) for run in shown}
-    keys = differing(runs)
+    errors = {run.name: abs(run.quantity(quantity) / reference - 1) for run in shown}
+    keys = differing_settings(runs)
     front = {shown[i].name for i in pareto_front([(run.wall, errors[run.name]) for run in shown])}
     rows = tuple(
         (run.name, *(_cell(run.settings.get(key)) for key in keys), run.outcome, _figure(run, quantity),
@@ -253,12 +258,12 @@ def precision(runs: list[RunData], quantity: str, exact: float | None) -> Sectio
     columns = ("run", *keys, "outcome", quantity, "error, relative", "wall s", "core s", "on the Pareto front")
     source = f"{exact:g}, as given" if exact is not None else f"{reference:.6g}, that of the finest run, {finest.name}"
     plots = tuple(_work_precision(shown, errors, cores) for cores in (False, True)) if shown else ()
-    table = Table("precision", f"{quantity}: reference {source}", columns, rows)
+    table = ReportTable("precision", f"{quantity}: reference {source}", columns, rows)
     return Section(f"Error of {quantity}", tables=(table,), plots=plots)
 
 
 def _figure(run: RunData, quantity: str) -> float | None:
-    return run.figure(quantity) if run.outcome == "done" else None
+    return run.quantity(quantity) if run.outcome == "done" else None
 
 
 def _work_precision(runs: list[RunData], errors: dict[str, float], cores: bool) -> Plot:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-Cell = str | float | int | bool | None
+TableCell = str | float | int | bool | None
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Rows under named columns, also written as NAME.csv. Numbers stay numbers: the page rounds them, the CSV does not.
 
     Attributes:
@@ -30,7 +30,7 @@ class Table:
     name: str
     caption: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[TableCell, ...], ...]
     command: str = ""
     marked: tuple[int, ...] = ()
 
@@ -96,7 +96,7 @@ class Section:
     title: str
     text: str = ""
     claims: tuple[Claim, ...] = ()
-    tables: tuple[Table, ...] = ()
+    tables: tuple[ReportTable, ...] = ()
     plots: tuple[Plot, ...] = ()
     pictures: tuple[Picture, ...] = ()
     first: bool = False
@@ -123,9 +123,9 @@ def from_data(data: list[dict[str, Any]]) -> list[Section]:
     ]
 
 
-def _table(data: dict[str, Any]) -> Table:
+def _table(data: dict[str, Any]) -> ReportTable:
     rows = tuple(tuple(row) for row in data["rows"])
-    return Table(**data | {"columns": tuple(data["columns"]), "rows": rows, "marked": tuple(data["marked"])})
+    return ReportTable(**data | {"columns": tuple(data["columns"]), "rows": rows, "marked": tuple(data["marked"])})
 
 
 def _plot(data: dict[str, Any]) -> Plot:

@@ -1,4 +1,4 @@
-"""The machine and the programs, for the foot of a page: nothing that tells whose they are."""
+"""The machine_info and the program_versions, for the foot of a page: nothing that tells whose they are."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PROGRAMS = ("fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy")
+PROGRAM_PACKAGES = ("fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy")
 
 
-def machine() -> dict[str, str]:
+def machine_info() -> dict[str, str]:
     """Processor, cores that may be used, memory, system."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     try:
@@ -21,12 +21,12 @@ def machine() -> dict[str, str]:
     return {"processor": _processor(), "cores": str(cores), "memory": f"{memory:.0f} GiB", "system": system}
 
 
-def programs() -> dict[str, str]:
+def program_versions() -> dict[str, str]:
     """Versions of what computes, as far as it is installed; nothing heavy is imported."""
     from .. import __version__
 
     found = {"fracsim": __version__, "python": platform.python_version()}
-    for name in PROGRAMS:
+    for name in PROGRAM_PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -17,18 +17,18 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.plain_files import replacing_all
 from .pictures.colour_maps import rgb
-from .pictures.frame_geometry import is_crack, without_dust
-from .pictures.frames import CLOSE, Shot, film_interval, find_frames, load, study_of
-from .pictures.material_looks import Skin, skin_of
+from .pictures.frame_geometry import is_crack, without_single_nodes
+from .pictures.frames import CLOSE, FrameSource, film_interval, find_frames, load_grid, read_study
+from .pictures.material_looks import MaterialLook, material_look
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-FORMATS = ("ply", "obj", "glb", "usd")
+EXPORT_FORMATS = ("ply", "obj", "glb", "usd")
 USD_RATE = 24.0  # pictures a second, which its time codes do not depend on
 
 
 @dataclass(frozen=True)
-class Piece:
+class FragmentMesh:
     """A closed surface.
 
     Attributes:
@@ -41,13 +41,13 @@ class Piece:
     crack: npt.NDArray[np.bool_]
 
 
-def export(
+def export_surfaces(
     folder: Path, kind: str, target: Path | None = None, *, frame: int | None = None, dust: bool = True, look: str = ""
 ) -> list[Path]:
     """Write all frames, or one, into the folder `target` (OUT/export); returns the files. Without `dust`: no pieces of
     a single node."""
-    if kind not in FORMATS:
-        raise InputError(f"--format {kind}: must be one of {', '.join(FORMATS)}")
+    if kind not in EXPORT_FORMATS:
+        raise InputError(f"--format {kind}: must be one of {', '.join(EXPORT_FORMATS)}")
     shots = find_frames(folder)
     if shots[0].index >= 0:
         raise InputError(f"{folder} has no surface.pvd: set output.surface = true in the study, and run it again")
@@ -57,8 +57,8 @@ def export(
     if target is None and (folder / "export").is_symlink():
         raise InputError(f"{folder / 'export'} is a link: name the folder for the files with -o")
     target = target or folder / "export"
-    skin = skin_of(look or study_of(folder).get("output", {}).get("look", "plain"))
-    frames = ((number, pieces_of(shots[number], dust)) for number in chosen)
+    skin = material_look(look or read_study(folder).get("output", {}).get("look", "plain"))
+    frames = ((number, read_fragments(shots[number], dust)) for number in chosen)
     times = [shot.t for shot in shots]
     name = folder.resolve().name
     target.mkdir(parents=True, exist_ok=True)
@@ -75,9 +75,9 @@ def export(
     return made
 
 
-def pieces_of(shot: Shot, dust: bool = True) -> list[Piece]:
+def read_fragments(shot: FrameSource, dust: bool = True) -> list[FragmentMesh]:
     """The pieces of a frame, by their numbers. InputError of a body in 2D, which has no surface."""
-    grid = load(shot) if dust else without_dust(load(shot))
+    grid = load_grid(shot) if dust else without_single_nodes(load_grid(shot))
     if not np.all(grid.celltypes == 5):
         raise InputError(f"{shot.folder}: a body in 2D has no closed surface to export")
     triangles, crack = np.asarray(grid.cell_connectivity).reshape(-1, 3), is_crack(grid)
@@ -88,9 +88,9 @@ def pieces_of(shot: Shot, dust: bool = True) -> list[Piece]:
     return [_piece(f"piece_{number:06d}", points, triangles[part], crack[part]) for number, part in parts]
 
 
-def _piece(name: str, points: Values, triangles: Ints, crack: npt.NDArray[np.bool_]) -> Piece:
+def _piece(name: str, points: Values, triangles: Ints, crack: npt.NDArray[np.bool_]) -> FragmentMesh:
     used, numbered = np.unique(triangles, return_inverse=True)
-    return Piece(name, points[used], numbered.reshape(-1, 3), crack)
+    return FragmentMesh(name, points[used], numbered.reshape(-1, 3), crack)
 
 
 # --- formats ---
@@ -105,34 +105,34 @@ def _needed(name: str, package: str) -> Any:
         raise InputError(f"--format: this one needs {package} (pip install {package})") from None
 
 
-def _colours(piece: Piece, skin: Skin) -> npt.NDArray[np.uint8]:
+def _colours(piece: FragmentMesh, skin: MaterialLook) -> npt.NDArray[np.uint8]:
     """(k, 4) of the triangles."""
-    table = np.array([[*rgb(each), 255] for each in (skin.skin, skin.inside)], np.uint8)
+    table = np.array([[*rgb(each), 255] for each in (skin.boundary_colour, skin.crack_colour)], np.uint8)
     return np.asarray(table[piece.crack.astype(int)])
 
 
-def _mesh(piece: Piece, skin: Skin, points: Values | None = None) -> Any:
+def _mesh(piece: FragmentMesh, skin: MaterialLook, points: Values | None = None) -> Any:
     """As trimesh has it, with colours of faces."""
     trimesh = _needed("trimesh", "trimesh")
     at = piece.points if points is None else points
     return trimesh.Trimesh(at, piece.triangles, face_colors=_colours(piece, skin), process=False)
 
 
-def _together(pieces: list[Piece]) -> Piece:
+def _together(pieces: list[FragmentMesh]) -> FragmentMesh:
     """All as one surface."""
     start = np.cumsum([0, *(len(each.points) for each in pieces)])
     triangles = [each.triangles + first for each, first in zip(pieces, start[:-1], strict=True)]
     points, crack = np.concatenate([p.points for p in pieces]), np.concatenate([p.crack for p in pieces])
-    return Piece("body", points, np.concatenate(triangles), crack)
+    return FragmentMesh("body", points, np.concatenate(triangles), crack)
 
 
-def _ply(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
+def _ply(path: Path, pieces: list[FragmentMesh], skin: MaterialLook, t: float) -> None:
     """One surface; double precision. Its time, s, is a comment."""
     head, data = _mesh(_together(pieces), skin).export(file_type="ply", vertex_normal=False).split(b"\nelement", 1)
     path.write_bytes(head + f"\ncomment t = {t:.9g} s\nelement".encode() + data)
 
 
-def _obj(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
+def _obj(path: Path, pieces: list[FragmentMesh], skin: MaterialLook, t: float) -> None:
     """An object a piece: OBJ has no colours of faces, so groups say what is skin and what inside."""
     lines, first = ["# m", f"# t = {t:.9g} s"], 1
     for piece in pieces:
@@ -145,7 +145,7 @@ def _obj(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _glb(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
+def _glb(path: Path, pieces: list[FragmentMesh], skin: MaterialLook, t: float) -> None:
     """A node a piece, at its middle: in single precision small pieces far away keep their shape. GLB has y upwards; the
     time, s, is in the extras of the scene."""
     trimesh = _needed("trimesh", "trimesh")
@@ -159,7 +159,7 @@ def _glb(path: Path, pieces: list[Piece], skin: Skin, t: float) -> None:
     path.write_bytes(scene.export(file_type="glb"))
 
 
-def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, times: list[float]) -> None:
+def _usd(path: Path, frames: Iterator[tuple[int, list[FragmentMesh]]], skin: MaterialLook, times: list[float]) -> None:
     """One mesh whose points and triangles are of their time, in m, z upwards; `piece` of each triangle beside them.
 
     `times`: s of all frames of the run. A time code is the time between two of them, so that programs that show a code
@@ -178,7 +178,7 @@ def _usd(path: Path, frames: Iterator[tuple[int, list[Piece]]], skin: Skin, time
     api = UsdGeom.PrimvarsAPI(mesh)
     colour = api.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.uniform)
     piece_of = api.CreatePrimvar("piece", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
-    attributes: list[tuple[Any, Callable[[Piece], Any]]] = [
+    attributes: list[tuple[Any, Callable[[FragmentMesh], Any]]] = [
         (mesh.CreatePointsAttr(), lambda one: Vt.Vec3fArray.FromNumpy(one.points.astype(np.float32))),
         (
             mesh.CreateFaceVertexCountsAttr(),

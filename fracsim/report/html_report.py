@@ -9,7 +9,7 @@ from pathlib import Path
 from ..errors import FalseClaim, InputError
 from .compare import read_reference, run_sections
 from .content import Section, from_data
-from .environment_info import machine, programs
+from .environment_info import machine_info, program_versions
 from .page import write_page
 from .runs import RunData, find_runs
 
@@ -73,7 +73,7 @@ def _today() -> str:
 
 
 def _about(runs: list[RunData]) -> dict[str, str]:
-    """Versions that ran, where all runs agree; the machine is that of the page."""
+    """Versions that ran, where all runs agree; the machine_info is that of the page."""
     ran = [json.dumps({k: v for k, v in run.summary.get("versions", {}).items() if k != "ranks"}) for run in runs]
-    found = dict(json.loads(ran[0])) if len(set(ran)) == 1 and ran[0] != "{}" else programs()
-    return found | {f"page made on: {key}": value for key, value in machine().items()}
+    found = dict(json.loads(ran[0])) if len(set(ran)) == 1 and ran[0] != "{}" else program_versions()
+    return found | {f"page made on: {key}": value for key, value in machine_info().items()}

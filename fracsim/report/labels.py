@@ -15,7 +15,7 @@ PLACES = [(side, up) for up in (4.0, -10.0, 14.0, -20.0, 24.0, -30.0) for side i
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 
-def name_points(axes: Any, named: Iterable[tuple[float, float, str]], points: Iterable[tuple[float, float]]) -> None:
+def label_points(axes: Any, named: Iterable[tuple[float, float, str]], points: Iterable[tuple[float, float]]) -> None:
     """Write (x, y, name) beside their points, clear of one another, of all `points` and of the frame. What has no room
     is in the tables. The frame must have its scales and its legend."""
     axes.figure.draw_without_rendering()  # the layout is worked out as it is drawn

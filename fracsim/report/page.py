@@ -11,8 +11,8 @@ from typing import Any
 
 from ..errors import InputError
 from ..meshes.plain_files import check_replaceable, replacing_all
-from .content import Cell, Picture, Section, Table
-from .plots import draw
+from .content import Picture, ReportTable, Section, TableCell
+from .plots import draw_plot
 
 
 def write_page(
@@ -48,7 +48,7 @@ def write_page(
             )
         csvs.mkdir(parents=True, exist_ok=True)
         for table in (table for section in sections for table in section.tables):
-            write_csv(csvs / f"{table.name}.csv", table)
+            write_table_csv(csvs / f"{table.name}.csv", table)
         with replacing_all(target) as new:
             new.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -56,7 +56,7 @@ def write_page(
     return target
 
 
-def write_csv(path: Path, table: Table) -> None:
+def write_table_csv(path: Path, table: ReportTable) -> None:
     """All digits of a table."""
     with replacing_all(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -73,16 +73,19 @@ def _section(section: Section, number: int, pictures: Path, csvs: str) -> dict[s
         "paragraphs": [part for part in re.split(r"\n\s*\n", section.text.strip()) if part],
         "tables": [_table(table, csvs) for table in section.tables],
         "plots": [
-            {"svg": draw(plot, f"{number}-{i}"), "caption": plot.caption, "command": plot.command}
+            {"svg": draw_plot(plot, f"{number}-{i}"), "caption": plot.caption, "command": plot.command}
             for i, plot in enumerate(section.plots)
         ],
         "pictures": [_picture(picture, pictures) for picture in section.pictures],
     }
 
 
-def _table(table: Table, csvs: str) -> dict[str, Any]:
+def _table(table: ReportTable, csvs: str) -> dict[str, Any]:
     rows = [
-        {"cells": [{"text": shown(cell), "number": _is_number(cell)} for cell in row], "marked": i in table.marked}
+        {
+            "cells": [{"text": format_cell(cell), "number": _is_number(cell)} for cell in row],
+            "marked": i in table.marked,
+        }
         for i, row in enumerate(table.rows)
     ]
     return {
@@ -91,7 +94,7 @@ def _table(table: Table, csvs: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def shown(cell: Cell) -> str:
+def format_cell(cell: TableCell) -> str:
     """A cell as the page shows it: four digits of a number, nothing for None."""
     if cell is None:
         return ""
@@ -102,7 +105,7 @@ def shown(cell: Cell) -> str:
     return f"{cell:,}" if isinstance(cell, int) else cell
 
 
-def _is_number(cell: Cell) -> bool:
+def _is_number(cell: TableCell) -> bool:
     return isinstance(cell, int | float) and not isinstance(cell, bool)
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from .content import Plot, Series
-from .labels import name_points
+from .labels import label_points
 from .pareto import pareto_front
 
 # Colours that colour-blind readers can tell apart (Okabe and Ito), for light and for dark pages.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6bb1", "#a6761d")
+SERIES_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6bb1", "#a6761d")
 MARKERS = "osD^vP*X"
 INK, FAINT = "#010203", "#888889"  # INK becomes the text colour of the page
 STYLE: dict[str, Any] = {
@@ -25,10 +25,10 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False, "legend.fontsize": 8.5, "lines.markersize": 5,
     "text.parse_math": False,
 }  # fmt: skip
-MOST_IN_LEGEND = 12
+MAX_LEGEND_ENTRIES = 12
 
 
-def draw(plot: Plot, name: str) -> str:
+def draw_plot(plot: Plot, name: str) -> str:
     """The plot as an <svg> element; `name` keeps its inner ids apart from those of other plots."""
     with _figure(name) as figure:
         axes = figure.add_subplot()
@@ -44,10 +44,10 @@ def draw(plot: Plot, name: str) -> str:
                 _add_slope(axes, plot, slope)
         axes.set(xlabel=plot.x, ylabel=plot.y)
         if axes.get_legend_handles_labels()[1]:
-            many = len(plot.series) > MOST_IN_LEGEND // 2
+            many = len(plot.series) > MAX_LEGEND_ENTRIES // 2
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0)) if many else axes.legend()
         if named := _named(plot):
-            name_points(axes, named, _points(plot))
+            label_points(axes, named, _points(plot))
         return _svg(figure)
 
 
@@ -63,18 +63,21 @@ def _figure(name: str) -> Iterator[Any]:
         yield figure
 
 
-def values(numbers: Any) -> Any:
+def gapped_array(numbers: Any) -> Any:
     """Numbers as an array, None as a gap."""
     return np.array([np.nan if number is None else number for number in numbers], float)
 
 
 def _add(axes: Any, series: Series, number: int) -> None:
-    x, y = values(series.x), values(series.y)
+    x, y = gapped_array(series.x), gapped_array(series.y)
     label = series.label or None
     if series.style == "reference":
         axes.plot(x, y, color=FAINT, linestyle="--", linewidth=1.5, label=label, zorder=1)
         return
-    colour, turn = COLOURS[number % len(COLOURS)], number + number // len(COLOURS)  # another marker with each round
+    colour, turn = (
+        SERIES_COLOURS[number % len(SERIES_COLOURS)],
+        number + number // len(SERIES_COLOURS),
+    )  # another marker with each round
     line = "" if series.style == "points" else "-"
     marker = "" if series.style == "line" else MARKERS[turn % len(MARKERS)]
     if series.spread:
@@ -85,7 +88,9 @@ def _add(axes: Any, series: Series, number: int) -> None:
 
 def _scale(axes: Any, plot: Plot) -> None:
     """Logarithmic axes, where there is anything above 0 to show on them."""
-    every = [np.concatenate([values(getattr(series, axis)) for series in plot.series] or [[]]) for axis in ("x", "y")]
+    every = [
+        np.concatenate([gapped_array(getattr(series, axis)) for series in plot.series] or [[]]) for axis in ("x", "y")
+    ]
     for axis, kinds, numbers in (("x", ("loglog", "logx"), every[0]), ("y", ("loglog", "logy"), every[1])):
         if plot.kind in kinds and np.any(numbers > 0):
             getattr(axes, f"set_{axis}scale")("log", nonpositive="mask")
@@ -107,7 +112,7 @@ def _points(plot: Plot) -> list[tuple[float, float]]:
         (float(a), float(b))
         for series in plot.series
         if series.style != "reference"
-        for a, b in zip(values(series.x), values(series.y), strict=True)
+        for a, b in zip(gapped_array(series.x), gapped_array(series.y), strict=True)
     ]
 
 
@@ -116,7 +121,7 @@ def _named(plot: Plot) -> list[tuple[float, float, str]]:
     return [
         (float(x), float(y), name)
         for series in plot.series
-        for x, y, name in zip(values(series.x), values(series.y), series.names, strict=False)
+        for x, y, name in zip(gapped_array(series.x), gapped_array(series.y), series.names, strict=False)
         if name
     ]
 

@@ -50,7 +50,7 @@ class RunData:
         """Seconds of wall time; of an unfinished run those of its steps."""
         return float(self.summary.get("wall", self.history["wall_step"].sum()))
 
-    def figure(self, name: str) -> float:
+    def quantity(self, name: str) -> float:
         """A quantity by its name: peak_COLUMN, final_COLUMN, or a number of summary.json. InputError where unknown."""
         kind, _, column = name.partition("_")
         if column in self.history and kind in ("peak", "final"):
@@ -64,7 +64,7 @@ class RunData:
             f"columns {columns}; or one of {figures or 'the figures of summary.json, which it does not have'}"
         )
 
-    def column(self, name: str, option: str) -> Values:
+    def history_column(self, name: str, option: str) -> Values:
         """A column of the history. InputError where there is none of that name."""
         if name not in self.history:
             raise InputError(f"{option}: {self.name} has no column {name}; it has: {', '.join(self.history)}")
@@ -132,7 +132,7 @@ def read_run(folder: Path, name: str) -> RunData:
         summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{folder}: its files are not those of a run: {error}") from None
-    return RunData(name, folder, flattened(study), history, summary)
+    return RunData(name, folder, flatten_tables(study), history, summary)
 
 
 def _read_history(path: Path) -> dict[str, Values]:
@@ -145,17 +145,17 @@ def _read_history(path: Path) -> dict[str, Values]:
     return dict(zip(header, table.T, strict=True))
 
 
-def flattened(data: Any, prefix: str = "") -> dict[str, Any]:
+def flatten_tables(data: Any, prefix: str = "") -> dict[str, Any]:
     """Nested tables as "a.b.0.c" -> value; lists of plain values stay whole."""
     if isinstance(data, list) and any(isinstance(item, dict) for item in data):
         data = dict(enumerate(data))
     if not isinstance(data, dict):
         return {prefix: data}
-    parts = [flattened(value, f"{prefix}.{key}" if prefix else str(key)) for key, value in data.items()]
+    parts = [flatten_tables(value, f"{prefix}.{key}" if prefix else str(key)) for key, value in data.items()]
     return {key: value for part in parts for key, value in part.items()}
 
 
-def differing(runs: list[RunData]) -> list[str]:
+def differing_settings(runs: list[RunData]) -> list[str]:
     """Settings that are not the same in all runs, in the order of the study; titles left out."""
     keys = list(dict.fromkeys(key for run in runs for key in run.settings))
     return [key for key in keys if key != "title" and len({repr(run.settings.get(key)) for run in runs}) > 1]

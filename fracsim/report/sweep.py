@@ -19,17 +19,17 @@ from typing import Any
 
 from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import create, replacing_all
-from ..output.file_ownership import check_owner, resumable
-from ..output.lock import FolderLock, holder
+from ..output.file_ownership import check_ownership, has_resumable_run
+from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
 from ..study.reader import load_study, study_text
-from .exit_status import OUTCOMES, SPEAKER, last_words
+from .exit_status import MESSAGE_PREFIX, OUTCOMES, read_last_message
 
-LONGEST_NAME = 100
+MAX_FOLDER_NAME = 100
 
 
 @dataclass(frozen=True)
-class Case:
+class SweepCase:
     """One combination: its values as texts by key, and its folder."""
 
     values: dict[str, str]
@@ -48,7 +48,7 @@ def run_sweep(
     have not ended may be thrown away."""
     if not only_list:
         _refuse_mpirun()
-    cases = combinations(sets, out)
+    cases = sweep_cases(sets, out)
     studies = [_validated(path, case) for case in cases]
     for case, text in zip(cases, studies, strict=True):
         _check_folder(case, text, path, overwrite)
@@ -65,14 +65,14 @@ def run_sweep(
         raise NotConverged(f"{len(failed)} of {len(cases)} runs did not end well: {'; '.join(failed)}")
 
 
-def _run_all(study: str, cases: list[tuple[Case, str]], out: Path, ranks: int) -> dict[str, str]:
+def _run_all(study: str, cases: list[tuple[SweepCase, str]], out: Path, ranks: int) -> dict[str, str]:
     """Outcomes in words of all cases, each with its study as text, by their names. Raises Stopped."""
     outcomes: dict[str, str] = {}
     for number, (case, text) in enumerate(cases, 1):
         print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
         outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
         print(one_line(outcome), flush=True)
-        collect([each for each, _ in cases], outcomes, out)
+        write_sweep_table([each for each, _ in cases], outcomes, out)
         if outcome.startswith("interrupted"):
             raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
     return outcomes
@@ -81,7 +81,7 @@ def _run_all(study: str, cases: list[tuple[Case, str]], out: Path, ranks: int) -
 # --- combinations ---------------------------------------------------------------------------------------------------
 
 
-def combinations(sets: list[str], out: Path) -> list[Case]:
+def sweep_cases(sets: list[str], out: Path) -> list[SweepCase]:
     """All combinations of the values given, the last key changing fastest. InputError where one comes up twice."""
     values: dict[str, list[str]] = {}
     for text in sets:
@@ -91,7 +91,7 @@ def combinations(sets: list[str], out: Path) -> list[Case]:
             raise InputError(f"--set {text}: write key=a,b,c, for example --set mesh.h=0.02,0.01")
         if key in values:
             raise InputError(f"--set {text}: {key} is given twice; put all its values in one list")
-        values[key] = [part.strip() for part in split_list(rest)]
+        values[key] = [part.strip() for part in split_values(rest)]
         if "" in values[key]:
             raise InputError(f"--set {text}: there is an empty value in the list")
         if repeated := {value for value in values[key] if values[key].count(value) > 1}:
@@ -100,10 +100,12 @@ def combinations(sets: list[str], out: Path) -> list[Case]:
         raise InputError("a sweep needs values to vary: --set mesh.h=0.02,0.01 --set time.step=1e-3,5e-4")
     short = short_keys(list(values))
     chosen = [dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values())]
-    return [Case(case, out / name_of({short[key]: value for key, value in case.items()})) for case in chosen]
+    return [
+        SweepCase(case, out / case_folder_name({short[key]: value for key, value in case.items()})) for case in chosen
+    ]
 
 
-def split_list(text: str) -> list[str]:
+def split_values(text: str) -> list[str]:
     """Parts between the commas that are not inside brackets, braces or quotes."""
     parts, depth, quote = [""], 0, ""
     for character in text:
@@ -128,13 +130,13 @@ def short_keys(keys: list[str]) -> dict[str, str]:
     }
 
 
-def name_of(values: dict[str, str]) -> str:
+def case_folder_name(values: dict[str, str]) -> str:
     """A folder name that can be read: h-0.02_scheme-newmark. A few digits of a hash where characters had to go."""
     whole = "_".join(f"{key}-{value}" for key, value in values.items())
     safe = "_".join(f"{key}-{_plain(value)}" for key, value in values.items())
-    if safe == whole and len(safe) <= LONGEST_NAME:
+    if safe == whole and len(safe) <= MAX_FOLDER_NAME:
         return safe
-    return f"{safe[:LONGEST_NAME]}-{hashlib.sha256(whole.encode()).hexdigest()[:6]}"
+    return f"{safe[:MAX_FOLDER_NAME]}-{hashlib.sha256(whole.encode()).hexdigest()[:6]}"
 
 
 def _plain(value: str) -> str:
@@ -144,7 +146,7 @@ def _plain(value: str) -> str:
     return re.sub(r"[^A-Za-z0-9.+]+", "-", value).strip("-.")
 
 
-def _validated(path: Path, case: Case) -> str:
+def _validated(path: Path, case: SweepCase) -> str:
     """The study of a case as its run would write it. InputError, with the combination, where it cannot be run."""
     try:
         study = load_study(path, case.overrides)
@@ -154,10 +156,10 @@ def _validated(path: Path, case: Case) -> str:
     return study_text(study)
 
 
-def _check_folder(case: Case, study: str, path: Path, overwrite: bool) -> None:
+def _check_folder(case: SweepCase, study: str, path: Path, overwrite: bool) -> None:
     """InputError where a run would meet, or its log replace, what a sweep of this study has not written."""
-    check_owner(case.folder, [path])
-    if _state(case, study) == "new" and resumable(case.folder) and not overwrite:
+    check_ownership(case.folder, [path])
+    if _state(case, study) == "new" and has_resumable_run(case.folder) and not overwrite:
         raise InputError(
             f"--out {case.folder}: a run of another study that has not ended left a checkpoint there; throw it away "
             "with --overwrite, or give another folder. Nothing was run"
@@ -175,7 +177,7 @@ def _refuse_mpirun() -> None:
 # --- one run --------------------------------------------------------------------------------------------------------
 
 
-def command(study: str, case: Case, ranks: int, how: str = "") -> list[str]:
+def run_command(study: str, case: SweepCase, ranks: int, how: str = "") -> list[str]:
     """What runs one case; `how`: "restart", "overwrite" or ""."""
     work = ["fracsim", "run", study]
     for override in case.overrides:
@@ -184,12 +186,12 @@ def command(study: str, case: Case, ranks: int, how: str = "") -> list[str]:
     return work if ranks == 1 else ["mpirun", "-n", str(ranks), *work]
 
 
-def _listed(study: str, case: Case, text: str, ranks: int, *, overwrite: bool) -> list[str]:
+def _listed(study: str, case: SweepCase, text: str, ranks: int, *, overwrite: bool) -> list[str]:
     """The line of a case for a job array. A case that is done has one that does nothing: numbers of lines stay."""
     state = _state(case, text)
     if state == "done":
         return ["true", f"{case.folder}: done before"]
-    return command(study, case, ranks, "restart" if state == "begun" else "overwrite" if overwrite else "")
+    return run_command(study, case, ranks, "restart" if state == "begun" else "overwrite" if overwrite else "")
 
 
 def _environment() -> dict[str, str]:
@@ -198,7 +200,7 @@ def _environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith(heads)}
 
 
-def _state(case: Case, study: str) -> str:
+def _state(case: SweepCase, study: str) -> str:
     """ "done", "begun" (there is a checkpoint) or "new"; what is there of another study counts for nothing."""
     try:
         if tomllib.loads((case.folder / "study.toml").read_text()) != tomllib.loads(study):
@@ -210,7 +212,7 @@ def _state(case: Case, study: str) -> str:
     return "begun" if (case.folder / "checkpoint" / "state.h5").is_file() else "new"
 
 
-def _summary(case: Case) -> dict[str, Any]:
+def _summary(case: SweepCase) -> dict[str, Any]:
     """summary.json of a case, empty where there is none."""
     try:
         return dict(json.loads((case.folder / "summary.json").read_text()))
@@ -218,12 +220,12 @@ def _summary(case: Case) -> dict[str, Any]:
         return {}
 
 
-def _run(study: str, case: Case, text: str, ranks: int) -> str:
+def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
     """The outcome in words, with the reason where it failed."""
     state = _state(case, text)
     if state == "done":
         return "done before"
-    if (words := holder(case.folder)) is not None:  # of a job array, or of a sweep that was killed
+    if (words := describe_lock_holder(case.folder)) is not None:  # of a job array, or of a sweep that was killed
         return f"refused: a run is going on there ({words})"
     try:
         case.folder.mkdir(parents=True, exist_ok=True)
@@ -231,7 +233,7 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
     except OSError as error:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
     # what is there may be overwritten: _check_folder has looked
-    log, work = case.folder / "log.txt", command(study, case, ranks, "restart" if state == "begun" else "overwrite")
+    log, work = case.folder / "log.txt", run_command(study, case, ranks, "restart" if state == "begun" else "overwrite")
     create(log).close()
     with log.open("w") as file, _Forwarding() as forwarding:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
@@ -242,7 +244,7 @@ def _run(study: str, case: Case, text: str, ranks: int) -> str:
     outcome = OUTCOMES.get(code, f"failed with exit code {code}")
     if code == Exit.DONE:
         return outcome
-    return f"{outcome}: {last_words(log).removeprefix(SPEAKER) or 'it said nothing'}"
+    return f"{outcome}: {read_last_message(log).removeprefix(MESSAGE_PREFIX) or 'it said nothing'}"
 
 
 class _Forwarding:
@@ -288,7 +290,7 @@ class _Forwarding:
 # --- the table ------------------------------------------------------------------------------------------------------
 
 
-def collect(cases: list[Case], outcomes: dict[str, str], out: Path) -> None:
+def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Path) -> None:
     """sweep.csv: settings, outcome and the figures of summary.json of every run so far; replaced in one go."""
     rows = []
     for case in cases:
@@ -302,11 +304,8 @@ def collect(cases: list[Case], outcomes: dict[str, str], out: Path) -> None:
         writer.writerows(rows)
 
 
-def _figures(case: Case) -> dict[str, Any]:
+def _figures(case: SweepCase) -> dict[str, Any]:
     summary = _summary(case)
     plain = {key: value for key, value in summary.items() if isinstance(value, int | float)}
     peaks = {f"peak_{key}": value for key, value in summary.get("peak_reactions", {}).items()}
     return plain | peaks | {f"seconds_{key}": value for key, value in summary.get("seconds", {}).items()}
-
-
-__all__ = ["Case", "collect", "combinations", "command", "name_of", "run_sweep", "split_list"]

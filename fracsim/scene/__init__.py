@@ -29,7 +29,7 @@ from ..mechanics.material_fields import MaterialFields  # noqa: E402
 from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
 from ..mesh.parallel import on_root  # noqa: E402
-from ..output.history import Probe, Probes  # noqa: E402
+from ..output.history import ProbeGroup, ProbeReader  # noqa: E402
 from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
 from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
 from ..study import Study, TimeSettings  # noqa: E402
@@ -63,7 +63,7 @@ class Scene:
     solver: NonlinearSolver | None
     stepper: Stepper
     fracture: EdgeBreaking | None
-    probes: Probes
+    probes: ProbeReader
 
     def start(self) -> State:
         """The state at t = 0 (collective)."""
@@ -115,7 +115,7 @@ def scene_on(
     ways = {
         each.name: each.displacement for each in obstacle_placements(study, domain.dim) if each.displacement is not None
     }
-    probes = Probes(balance, _probes(study, domain), ways=ways, thickness=study.thickness)
+    probes = ProbeReader(balance, _probes(study, domain), motions=ways, thickness=study.thickness)
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
 
 
@@ -150,7 +150,7 @@ def make_stepper(
     return QuasiStaticStepper(balance, sizes, flow, breaking, solver)
 
 
-def _probes(study: Study, domain: Domain) -> list[Probe]:
+def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
     """[[probe]] entries with the nodes that they look at."""
     probes = []
     for i, entry in enumerate(study.probe):
@@ -161,5 +161,5 @@ def _probes(study: Study, domain: Domain) -> list[Probe]:
             assert entry.on is not None
             key = f"probe.{i}.on"
             nodes = domain.select_nodes(find_selector(entry.on, domain.dim, key), key)
-        probes.append(Probe(entry.name, entry.quantity, nodes))
+        probes.append(ProbeGroup(entry.name, entry.quantity, nodes))
     return probes

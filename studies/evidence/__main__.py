@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ...report.content import Section, to_data
-from ...report.environment_info import machine, programs
+from ...report.environment_info import machine_info, program_versions
 from .runner import RECORD, fingerprint, folder_in, run_trial, time_again
 from .trial import Trial
 
@@ -90,7 +90,7 @@ def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any
     groups |= {name: {"sections": _sections(makers[name], group)} for name, group in records.items()}
     ordered = {name: groups[name] for name in GROUPS if name in groups}
     out.mkdir(parents=True, exist_ok=True)
-    about = programs() | machine() | {"trials run on": date.today().isoformat()}
+    about = program_versions() | machine_info() | {"trials run on": date.today().isoformat()}
     path.write_text(json.dumps({"about": about, "groups": ordered}, indent=1) + "\n")
     return path
 

@@ -230,10 +230,10 @@ def _impulse_error(run: Path, force: Values) -> float:
 
 def surfaces(run: Path) -> Iterator[tuple[float, Values]]:
     """(s, (n, 3) m) the points of the split surface in each frame."""
-    from ...output.surface.collection import read_collection
+    from ...output.surface.vtk_files import read_body_frames
     from .survival import read_surface
 
-    for t, file in read_collection(run / "surface.pvd"):
+    for t, file in read_body_frames(run / "surface.pvd"):
         yield t, np.asarray(read_surface(run / file).points, float)
 
 

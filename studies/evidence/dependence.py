@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import results, slit
-from .section import Cell, Picture, Plot, Section, Series, Table, folder_of
+from .section import Picture, Plot, ReportTable, Section, Series, TableCell, folder_of
 from .survival import read_surface
 from .trial import Trial
 
@@ -109,9 +109,9 @@ def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
 def crack_corners(run: Path, time: float | None = None) -> npt.NDArray[np.float64]:
     """(n, 2 or 3, 3) ends or corners of those faces at rest, m; of the last frame, or of that nearest to a time, s."""
     from fracsim.mesh.split_surface.entity_numbering import CRACK
-    from fracsim.output.surface.collection import read_collection
+    from fracsim.output.surface.vtk_files import read_body_frames
 
-    frames = read_collection(run / "surface.pvd")
+    frames = read_body_frames(run / "surface.pvd")
     chosen = frames[-1] if time is None else min(frames, key=lambda frame: abs(float(frame[0]) - time))
     grid = read_surface(run / chosen[1])
     points = np.asarray(grid.points, float) - np.asarray(grid.point_data["displacement"], float)
@@ -149,10 +149,10 @@ def sections(records: list[Record]) -> list[Section]:
         "min) / mean over the meshes, as found."
     )
     tables = (
-        Table(
+        ReportTable(
             "dependence-spread", "Spread over the meshes", ("specimen", "meshes", *FIGURES), tuple(_spreads(records))
         ),
-        Table("dependence", "All runs", COLUMNS, rows),
+        ReportTable("dependence", "All runs", COLUMNS, rows),
     )
     plots = (*(_plot(records, key) for key in ("peak_load", "dissipated")), *_plates(records))
     pictures = tuple(
@@ -161,7 +161,7 @@ def sections(records: list[Record]) -> list[Section]:
     return [Section("Dependence on the mesh", text, tables=tables, plots=plots, pictures=pictures[:12])]
 
 
-def _row(record: Record) -> tuple[Cell, ...]:
+def _row(record: Record) -> tuple[TableCell, ...]:
     figures, settings = record["figures"], record["settings"]
     measured = (figures.get(key) for key in (*FIGURES, "left"))
     return (record["case"], settings["h"], settings["pattern"], record["outcome"], *measured)
@@ -172,8 +172,8 @@ def spread(values: list[float]) -> float:
     return (max(values) - min(values)) / (sum(values) / len(values)) if any(values) else 0.0
 
 
-def _spreads(records: list[Record]) -> list[tuple[Cell, ...]]:
-    found: list[tuple[Cell, ...]] = []
+def _spreads(records: list[Record]) -> list[tuple[TableCell, ...]]:
+    found: list[tuple[TableCell, ...]] = []
     for case in dict.fromkeys(record["case"] for record in records):
         done = [record["figures"] for record in records if record["case"] == case and record["outcome"] == "done"]
         if done:

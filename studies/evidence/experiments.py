@@ -14,7 +14,7 @@ import numpy.typing as npt
 from .. import folder as packaged
 from . import published, results, splitting
 from .dependence import crack_faces, spread
-from .section import Cell, Claim, Picture, Plot, Section, Series, Table, folder_of
+from .section import Claim, Picture, Plot, ReportTable, Section, Series, TableCell, folder_of
 from .trial import Trial
 
 GROUP = "experiments"
@@ -309,8 +309,8 @@ TEXT = (
 def sections(records: list[Record]) -> list[Section]:
     """Tables, claims, curves and pictures."""
     tables = (
-        Table("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
-        Table("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", SPREADS,
+        ReportTable("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
+        ReportTable("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", SPREADS,
               tuple(_spreads(records))),
         *splitting.table([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"]),
         *published.table(records),
@@ -331,7 +331,7 @@ def _compared(record: Record) -> float | None:
     return found
 
 
-def _row(record: Record) -> tuple[Cell, ...]:
+def _row(record: Record) -> tuple[TableCell, ...]:
     found, peak = record["figures"], _compared(record)
     over = None if peak is None or not BY_CASE[record["case"]].peak else peak / BY_CASE[record["case"]].peak
     loads, others = ("peak", "second", "plateau", "last"), ("absorbed", "travel", "pieces")
@@ -339,8 +339,8 @@ def _row(record: Record) -> tuple[Cell, ...]:
             *(found.get(key) for key in others))  # fmt: skip
 
 
-def _spreads(records: list[Record]) -> list[tuple[Cell, ...]]:
-    found: list[tuple[Cell, ...]] = []
+def _spreads(records: list[Record]) -> list[tuple[TableCell, ...]]:
+    found: list[tuple[TableCell, ...]] = []
     for case, experiment in BY_CASE.items():
         peaks = [p for r in records if r["case"] == case and r["outcome"] == "done" and (p := _compared(r)) is not None]
         if peaks:

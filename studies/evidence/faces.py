@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from . import extremes
-from .section import Claim, Section, Table
+from .section import Claim, ReportTable, Section
 from .trial import Trial
 
 KINDS = ("flat", "edge")
@@ -132,7 +132,7 @@ def section(records: list[dict[str, Any]]) -> Section:
         "faces may make endless, is asked of all that is near. In the first dozen steps, in which the bodies meet, "
         "faces take 1.8 times as long as edges."
     )
-    table = Table("faces", "Costs", columns, tuple(map(_row, records)))
+    table = ReportTable("faces", "Costs", columns, tuple(map(_row, records)))
     title = "Contact: flat on flat, edge on edge"
     return Section(title, text, _claims({record["name"]: record["figures"] for record in records}), (table,))
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .section import Section, Table
+from .section import ReportTable, Section
 
 Values = npt.NDArray[np.float64]
 APPROACHES = ("pseudo-inverse", "projected-stress", "projected-strain", "chi")
@@ -263,7 +263,7 @@ def section(records: list[dict[str, Any]]) -> Section:
         "this small bar. The degraded energy `chi` is what fracsim does."
     )
     name = "Two failed approaches"
-    return Section(name, text, tables=(Table("failed-approaches", "After the break", columns, tuple(rows)),))
+    return Section(name, text, tables=(ReportTable("failed-approaches", "After the break", columns, tuple(rows)),))
 
 
 def judged(figures: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..bench import OPTIONS, break_now
-from .section import Cell, Claim, Picture, Plot, Section, Series, Table, folder_of
+from .section import Claim, Picture, Plot, ReportTable, Section, Series, TableCell, folder_of
 from .trial import Trial
 
 CUTS = (0, 1, 10, 100)
@@ -242,7 +242,7 @@ def _stage(whole: Any, cut: Any, other: VirtualNodes | None) -> dict[str, Any]:
                 continue
             times[name].append(timed(cut.comm, step))
             krylov[name].append(int(loops[name].solver.snes.getLinearSolveIterations()))
-    broken, split, pieces = cut.breaks.figures
+    broken, split, pieces = cut.breaks.counts
     dofs = int(sum_over_ranks(cut.comm, len(cut.state.u))[0])
     ratios = {
         f"{name}_ratio": median(a / b for a, b in zip(times[name][WARM:], times["whole"][WARM:], strict=False))
@@ -289,7 +289,7 @@ def _growth(records: list[dict[str, Any]]) -> Section:
     )
     return Section(
         "Growth: cost of a step against the number of cracks", text, (_claim(records),),
-        (Table("growth", caption, columns, rows),), tuple(_plots(records)),
+        (ReportTable("growth", caption, columns, rows),), tuple(_plots(records)),
     )  # fmt: skip
 
 
@@ -297,7 +297,7 @@ def _stages(record: dict[str, Any]) -> list[dict[str, Any]]:
     return list(record["figures"].get("stages", []))
 
 
-def _rows(record: dict[str, Any]) -> list[tuple[Cell, ...]]:
+def _rows(record: dict[str, Any]) -> list[tuple[TableCell, ...]]:
     figures = record["figures"]
     head = (record["case"], record["ranks"], figures.get("tets"), figures.get("nodes"))
     keys = (
@@ -359,7 +359,7 @@ def _resolution(records: list[dict[str, Any]]) -> Section:
         "and 4.38 s a frame on 12 threads). The radius of the average stays 12 mm, less than an edge of the coarsest "
         "mesh."
     )
-    table = Table("resolution", "The loaf at three resolutions; s a step: solve and fracture", columns, rows)
+    table = ReportTable("resolution", "The loaf at three resolutions; s a step: solve and fracture", columns, rows)
     pictures = tuple(
         Picture(
             f"{record['name']}: h = {record['settings']['h']} m", f"{folder_of(record)}/run/last.png", record["command"]
@@ -369,7 +369,7 @@ def _resolution(records: list[dict[str, Any]]) -> Section:
     return Section("Resolution of the loaf", text, tables=(table,), pictures=pictures)
 
 
-def _loaf_row(record: dict[str, Any]) -> tuple[Cell, ...]:
+def _loaf_row(record: dict[str, Any]) -> tuple[TableCell, ...]:
     summary = record["summary"] or {}
     steps = summary.get("steps")
     seconds = record["stepping"][-1] / steps if steps and record["stepping"] else None

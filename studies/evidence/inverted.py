@@ -41,7 +41,7 @@ def main() -> None:
 def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
     """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
     from ...mesh.parallel import sum_over_ranks
-    from ...output.inverted_cells import InvertedCells
+    from ...output.result_checks import InvertedCellMonitor
     from ...scene import build_scene
     from ...study.reader import validate
 
@@ -58,12 +58,13 @@ def turned(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
         state, report = stepper.advance(state)
         energies.append(report.elastic + report.kinetic)
         newton.append(report.solve.newton_iterations)
-    watch = InvertedCells(scene.balance.stress)
-    watch.look(state.t)
+    watch = InvertedCellMonitor(scene.balance.stress)
+    watch.record_frame(state.t)
     if comm.rank == 0 and (note := watch.note(energy)):
         print(f"fracsim: note: {note}", file=sys.stderr)
     return {
-        "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.least, "error": abs(watch.least - 1),
+        "finite": bool(np.isfinite(energies).all()), "smallest_J": watch.min_jacobian,
+        "error": abs(watch.min_jacobian - 1),
         "steps": state.step, "newton_max": max(newton), "newton_mean": float(np.mean(newton)),
         "growth": float(np.max(np.diff(energies)).clip(0) / energies[0]) if energies[0] else 0.0,
         "halved": stepper.failures.steps_failed,

@@ -25,7 +25,7 @@ from ...study import Study
 from ..bench import study as bench_study
 from ..bench import timed
 from . import faces, solvers, steps
-from .section import Cell, Claim, Plot, Section, Series, Table
+from .section import Claim, Plot, ReportTable, Section, Series, TableCell
 from .trial import Trial
 
 WARM, STEPS = 3, 12
@@ -320,7 +320,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         "Seconds per step over those of the scene compared with",
         "scene, in the order of the table", "ratio", _bars(records), levels=(1.0, LIMIT),
     )  # fmt: skip
-    table = Table("ladder", "What each feature costs", columns, rows)
+    table = ReportTable("ladder", "What each feature costs", columns, rows)
     title = "Ladder: the cost of what is used, and of what is not"
     first = Section(title, text, _claims(records), (table,), (plot,))
     return [first, *(PARTS[case].section(found) for case, found in by_itself.items() if found)]
@@ -331,7 +331,7 @@ def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:
     return {module for modules in elastic for module in modules}
 
 
-def _row(record: dict[str, Any], base: set[str]) -> tuple[Cell, ...]:
+def _row(record: dict[str, Any], base: set[str]) -> tuple[TableCell, ...]:
     get, cells = record["figures"].get, record["figures"].get("cells")
     modules = get("modules", [])
     beyond = ", ".join(sorted(name.removeprefix("fracsim.") for name in set(modules) - base))

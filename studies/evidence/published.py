@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from .section import Cell, Table
+from .section import ReportTable, TableCell
 
 Record = dict[str, Any]
 
 CASE = "notched-tension"
 COLUMNS = ("single-edge notched tension, 1 mm, 2.7 kJ/m2", "h, m", "peak, N", "at, m", "stiffness, N/m")
 # figures that were collected for this project beforehand; the paper's curve itself was not laid beside
-OTHERS: tuple[tuple[Cell, ...], ...] = (
+OTHERS: tuple[tuple[TableCell, ...], ...] = (
     ("phase field (Miehe et al. 2010)", None, 701.0, 5.55e-6, "1.37e8 to 1.42e8"),
     ("Griffith, sharp crack", None, 645.0, 4.56e-6, None),
 )
@@ -33,11 +33,15 @@ PANEL = (
 MEASURED = {"l-panel": (tuple(way * 1e-3 for way, _ in PANEL), tuple(load for _, load in PANEL))}
 
 
-def table(records: list[Record]) -> tuple[Table, ...]:
+def table(records: list[Record]) -> tuple[ReportTable, ...]:
     """Peak, the grip's motion there and the stiffness before it; none where the plate was not run."""
     done = [r for r in records if r["case"] == CASE and r["outcome"] == "done" and "curve" in r["figures"]]
     ours = [(f"{CASE}, {r['name']}", r["settings"]["h"], *read(*r["figures"]["curve"])) for r in done]
-    return (Table("published", "The notched plate beside others' results", COLUMNS, (*ours, *OTHERS)),) if ours else ()
+    return (
+        (ReportTable("published", "The notched plate beside others' results", COLUMNS, (*ours, *OTHERS)),)
+        if ours
+        else ()
+    )
 
 
 def read(way: list[float], load: list[float]) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...output.fields_file import read_values
+from ...output.fields_file import read_field
 
 Values = npt.NDArray[Any]
 
@@ -34,7 +34,7 @@ def last_frame(run: Path) -> dict[str, Any]:
 
     with h5py.File(run / "fields.h5") as file:
         frame = file["frames"][max(file["frames"])]
-        found = {name: read_values(data) for name, data in frame.items()}
+        found = {name: read_field(data) for name, data in frame.items()}
         return {"time": float(frame.attrs["time"]), "points": file["points"][()], "cells": file["cells"][()]} | found
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..table import COLUMNS, SCENES, run
-from .section import Cell, Claim, Section, Table, again
+from .section import Claim, ReportTable, Section, TableCell, again
 from .trial import Trial
 
 RANKS = 2
@@ -39,11 +39,11 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     """The table, and whether each row is at or below the paper's seconds."""
     done = {record["name"]: record["figures"] for record in records if record["outcome"] == "done"}
     rows = tuple(_row(record) for record in records)
-    table = Table("paper-rows", "M22's table 2; s: of a step", (*COLUMNS, "outcome"), rows)
+    table = ReportTable("paper-rows", "M22's table 2; s: of a step", (*COLUMNS, "outcome"), rows)
     return [Section("The paper's table", TEXT + again(records), (_claim(done, len(records)), _small(done)), (table,))]
 
 
-def _row(record: dict[str, Any]) -> tuple[Cell, ...]:
+def _row(record: dict[str, Any]) -> tuple[TableCell, ...]:
     figures = record["figures"] if record["outcome"] == "done" else {"scene": record["name"]}
     return (*(figures.get(column) for column in COLUMNS), record["outcome"])
 

@@ -20,7 +20,7 @@ import tomli_w
 
 import fracsim as root
 from fracsim import forms, meshes
-from fracsim.report.exit_status import OUTCOMES, all_words, last_words
+from fracsim.report.exit_status import OUTCOMES, read_last_message, read_log_messages
 
 from .trial import Trial
 
@@ -131,7 +131,7 @@ def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
     return {
         "outcome": outcome,
         "wall": time.perf_counter() - began,
-        "message": (all_words if outcome == "done" else last_words)(folder / "log.txt"),
+        "message": (read_log_messages if outcome == "done" else read_last_message)(folder / "log.txt"),
         "summary": json.loads(summary.read_text()) if summary.exists() else None,
     }
 

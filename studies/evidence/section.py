@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from ...report.content import Cell, Claim, Picture, Plot, Section, Series, Table
+from ...report.content import Claim, Picture, Plot, ReportTable, Section, Series, TableCell
 from ...report.pareto import pareto_front
 from .trial import Setting
 
 __all__ = [
-    "Cell", "Claim", "Picture", "Plot", "Point", "Section", "Series", "Table",
+    "Claim", "Picture", "Plot", "Point", "ReportTable", "Section", "Series", "TableCell",
     "again", "fitted_order", "folder_of", "pareto_front", "recommended", "timed",
 ]  # fmt: skip
 

@@ -22,7 +22,7 @@ import numpy as np
 from .precision import brazilian
 from .precision.common import QUIET
 from .precision.solver import DIRECT
-from .section import Claim, Section, Table, again
+from .section import Claim, ReportTable, Section, again
 from .trial import Trial
 
 LIMIT = 1.3  # of the best
@@ -144,7 +144,9 @@ def section(records: list[dict[str, Any]]) -> Section:
     columns = ("study", "dofs", *(f"{way}, s" for way in WAYS), "default over best",
                *(f"{way}: Newton / Krylov" for way in WAYS), "default apart from factors", "outcome")  # fmt: skip
     rows = tuple(_row(record, share.get(record["settings"]["of"])) for record in records)
-    return Section("The solver that nobody chose", text, (claim,), (Table("ladder-solvers", "Solvers", columns, rows),))
+    return Section(
+        "The solver that nobody chose", text, (claim,), (ReportTable("ladder-solvers", "Solvers", columns, rows),)
+    )
 
 
 def _best(figures: dict[str, Any]) -> float:

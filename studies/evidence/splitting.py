@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from . import results
 from .dependence import crack_corners
-from .section import Cell, Claim, Table
+from .section import Claim, ReportTable, TableCell
 
 Record = dict[str, Any]
 Values = npt.NDArray[np.float64]
@@ -64,14 +64,14 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def table(records: list[Record]) -> tuple[Table, ...]:
+def table(records: list[Record]) -> tuple[ReportTable, ...]:
     """A row a mesh; none where nothing was run."""
     keys = [f"{name}_{key}" for name in ("split", "end") for key in ("along", "covered", "area")]
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
+    rows: tuple[tuple[TableCell, ...], ...] = tuple(
         (r["settings"]["h"], *(r["figures"][key] for key in (*keys, "pieces"))) for r in records
     )
     words = "Crack faces of the cylinder: share within a tenth of the radius of the loaded diameter"
-    return (Table("experiments-split", words, COLUMNS, rows),) if rows else ()
+    return (ReportTable("experiments-split", words, COLUMNS, rows),) if rows else ()
 
 
 def claims(figures: list[Record], peak: float, within: float) -> tuple[Claim, ...]:

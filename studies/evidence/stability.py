@@ -9,7 +9,7 @@ from typing import Any
 
 from . import contacts
 from . import extremes as x
-from .section import Cell, Claim, Section, Table
+from .section import Claim, ReportTable, Section, TableCell
 from .trial import Setting, Trial
 
 GROUP = "stability"
@@ -341,11 +341,11 @@ def _iterations(records: list[Record]) -> Section | None:
         "and their pattern changes with what does. Without contact: the same bar in flight, and the stack as one block."
     )
     return Section(
-        "Contact: iterations", text, tables=(Table("contact-iterations", "Iterations", columns, tuple(rows)),)
+        "Contact: iterations", text, tables=(ReportTable("contact-iterations", "Iterations", columns, tuple(rows)),)
     )
 
 
-def _counts(name: str, *both: Record) -> tuple[Cell, ...]:
+def _counts(name: str, *both: Record) -> tuple[TableCell, ...]:
     found = [[each.get(key) for key in COUNTS] for each in both]
     each_time = [counts[2] / counts[0] if counts[0] else None for counts in found]
     return name, *found[0], each_time[0], *found[1], each_time[1]
@@ -360,12 +360,12 @@ DAMAGE = ("broken", "broken_in_a_step", "pieces")
 FIGURES = ("error", "growth", "newton_mean", "newton_max", "krylov_mean", "smallest_J")
 
 
-def _table(records: list[Record]) -> Table:
+def _table(records: list[Record]) -> ReportTable:
     rows = tuple(_row(one, others) for one, *others in _by_place(records))
-    return Table("stability", "What survives, and what does not", COLUMNS, rows)
+    return ReportTable("stability", "What survives, and what does not", COLUMNS, rows)
 
 
-def _row(one: Record, others: list[Record]) -> tuple[Cell, ...]:
+def _row(one: Record, others: list[Record]) -> tuple[TableCell, ...]:
     figures, summary = one["figures"], one["summary"] or {}
     words = list(dict.fromkeys(verdict(record) for record in (one, *others)))
     return (

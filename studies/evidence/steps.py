@@ -18,7 +18,7 @@ from statistics import median
 from typing import Any
 
 from .precision.common import QUIET
-from .section import Claim, Section, Table, again
+from .section import Claim, ReportTable, Section, again
 from .trial import Trial
 
 Data = dict[str, Any]
@@ -98,7 +98,7 @@ def collapsed(name: str) -> Data:
             spent, reports = _steps(run, 1)
             seconds.append(spent)
             newton += sum(report.solve.newton_iterations for report in reports)
-        cells, broken = run.scene.domain.cell_count, run.breaks.figures[0]
+        cells, broken = run.scene.domain.cell_count, run.breaks.counts[0]
         run.scene.destroy()
     return {"cells": cells, "steps": len(seconds), "worst": max(seconds), "all": sum(seconds), "newton": newton,
             "broken": broken}  # fmt: skip
@@ -127,7 +127,7 @@ def _in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
                 took, reports_of = _steps(run, block)
                 spent.append(took)
             reports += reports_of
-        cells, broken = runs[0].scene.domain.cell_count, runs[1].breaks.figures[0]
+        cells, broken = runs[0].scene.domain.cell_count, runs[1].breaks.counts[0]
     share = median((b - w) / w for w, b in zip(*seconds, strict=True))
     breaking = sum(report.broken > 0 for report in reports)
     spent_whole, spent_more = map(sum, seconds)
@@ -197,7 +197,7 @@ def section(records: list[Data]) -> Section:
         "scene", "cells", "steps", "worst step, s", "all steps, s", "of a body that does not break, s",
         "Newton iterations", "broken edges", "outcome",
     )  # fmt: skip
-    table = Table("ladder-steps", "Hard steps", columns, tuple(map(_row, records)))
+    table = ReportTable("ladder-steps", "Hard steps", columns, tuple(map(_row, records)))
     return Section("Hard steps", text, claims, (table,))
 
 

@@ -138,9 +138,9 @@ def surface_is_finite(run: Path) -> bool:
     """Whether every point of the last frame of the split surface is a number, where there is a surface."""
     if not (run / "surface.pvd").exists():
         return True
-    from fracsim.output.surface.collection import read_collection
+    from fracsim.output.surface.vtk_files import read_body_frames
 
-    frames = read_collection(run / "surface.pvd")
+    frames = read_body_frames(run / "surface.pvd")
     return not frames or bool(np.isfinite(read_surface(run / frames[-1][1]).points).all())
 
 

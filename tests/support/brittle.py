@@ -16,7 +16,7 @@ from fracsim.fracture.brittle.surface_pass import Load, Opened, Pattern
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
-from fracsim.output.surface.fragment_table import volumes
+from fracsim.output.surface.fragment_table import enclosed_volumes
 from fracsim.scene import Scene
 
 Values = npt.NDArray[np.float64]
@@ -88,7 +88,7 @@ def cut_points(points: Values, keys: Ints, cut: Values) -> Values:
 
 def enclosed(made: SplitSurface) -> Values:
     """(pieces,) volumes inside a surface, by the divergence theorem."""
-    return volumes(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)
+    return enclosed_volumes(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)
 
 
 def scene_surface(scene: Scene) -> SplitSurface:

@@ -159,7 +159,7 @@ def numbers(run: Run) -> Numbers:
         if each.name not in ("history", "previous_increment")
     }
     found = {key: np.array(value) for key, value in every.items() if value is not None and key != "elastic"}
-    found |= {"probes": scene.probes(), "figures": np.array(run.breaks.figures)}
+    found |= {"probes": scene.probes(), "figures": np.array(run.breaks.counts)}
     found |= {f"term.{key}": np.array(value) for key, value in scene.balance.to_checkpoint().items()}
     if scene.balance.stress.chi is not None:
         found["chi"] = scene.balance.stress.chi.x.array.copy()

@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from fracsim.output.checkpoint_file import SEAL, seal
+from fracsim.output.checkpoint_file import DIGEST_LINE_BYTES, append_digest
 
 Damage = Callable[[Path], None]
 Edit = Callable[[h5py.File], None]
@@ -44,7 +44,7 @@ RAW: dict[str, Damage] = {
     **{f"cut to {share:g}": _cut(share) for share in (0.01, 0.3, 0.9, 0.999)},
     **{f"a bit at {share:g}": _flipped(share) for share in (0.0, 0.05, 0.2, 0.5, 0.8, 0.97, 0.995, 1.0)},
     "longer": _to(lambda whole: whole + b"more"),
-    "without its digest": _to(lambda whole: whole[:-SEAL]),
+    "without its digest": _to(lambda whole: whole[:-DIGEST_LINE_BYTES]),
     "twice": _to(lambda whole: whole + whole),
     "begun later": _to(lambda whole: whole[512:]),
 }
@@ -157,8 +157,8 @@ EDITS: dict[str, Edit] = {
 
 def edit(path: Path, change: Edit) -> None:
     """Change what a checkpoint holds; its digest stays at its end."""
-    last = path.read_bytes()[-SEAL:]
-    path.write_bytes(path.read_bytes()[:-SEAL])
+    last = path.read_bytes()[-DIGEST_LINE_BYTES:]
+    path.write_bytes(path.read_bytes()[:-DIGEST_LINE_BYTES])
     with h5py.File(path, "r+") as file:
         change(file)
     path.write_bytes(path.read_bytes() + last)
@@ -167,5 +167,5 @@ def edit(path: Path, change: Edit) -> None:
 def resealed(path: Path, change: Edit) -> None:
     """Change what a checkpoint holds, and give it the digest of that."""
     edit(path, change)
-    path.write_bytes(path.read_bytes()[:-SEAL])
-    seal(path)
+    path.write_bytes(path.read_bytes()[:-DIGEST_LINE_BYTES])
+    append_digest(path)

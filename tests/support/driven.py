@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.output.inverted_cells import InvertedCells
+from fracsim.output.result_checks import InvertedCellMonitor
 from fracsim.scene import Scene, build_scene
 from fracsim.studies.evidence import extremes
 from fracsim.study.reader import validate
@@ -46,9 +46,9 @@ def nearly_incompressible(scheme: str) -> list[float]:
 def crushed() -> list[float]:
     """(cells, smallest J, s) that are told of a block mirrored along x."""
     scene, state, _ = stepped(extremes.block(-1.0, steps=1, confined=True), 1)
-    watch = InvertedCells(scene.balance.stress)
-    watch.look(state.t)
-    return [watch.count, watch.least, watch.since]
+    watch = InvertedCellMonitor(scene.balance.stress)
+    watch.record_frame(state.t)
+    return [watch.inverted_count, watch.min_jacobian, watch.first_time]
 
 
 def flown() -> list[float]:

@@ -22,7 +22,7 @@ class WrittenSurface:
         self._scene, self._steps = scene, 0
         self._record = EdgeRecord(scene.fracture.graph)
         self._output = SurfaceOutput(folder, scene.domain, scene.balance.stress.material.density, self._record)
-        self._output.write(state, [])
+        self._output.write_frame(state, [])
 
     def step(self, state: State, broken: int) -> None:
         """After each step (collective)."""
@@ -30,22 +30,22 @@ class WrittenSurface:
         if broken:
             self._record.note(state.t)
         if self._steps % 4 == 0:
-            self._output.write(state, [])
+            self._output.write_frame(state, [])
 
     def result(self, name: str) -> dict[str, npt.NDArray[Any]]:
         """The last frame, on rank 0 (collective)."""
         domain = self._scene.domain
         of_node = domain.gather_nodes(find_fragments(self._scene.fracture.graph).node_fragment[: domain.node_count])
         ours = domain.gather_cells(domain.node_input[domain.cell_nodes])
-        if self._output.made is None:
+        if self._output.surface_and_files is None:
             return {}
-        surface, _ = self._output.made
+        surface, _ = self._output.surface_and_files
         made, follow = surface.split, surface.split.parents
         assert domain.source is not None
         assert np.array_equal(ours, domain.source.cells)  # patterns are in the local order of the input cells
         arrays = {
             "elements": made.elements, "cell": made.cell, "edge": made.edge, "origin": made.origin,
             "points": made.points, "start": follow.start, "parents": follow.parents, "fill": made.fill,
-            "names": surface.names, "piece": made.node_fragment, "graph-piece": of_node,
+            "names": surface.fragment_names, "piece": made.node_fragment, "graph-piece": of_node,
         }  # fmt: skip
         return {f"surface-{name}-{key}": values for key, values in arrays.items()}

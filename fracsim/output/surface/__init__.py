@@ -1,10 +1,7 @@
-"""The split surface in time, as it is written.
+"""Split surface of a body in time.
 
-fragment_table    mass, centre, velocity and spin of the pieces, and names that stay with them
-body_surface      a surface at a time, ready to be written
-instance_surface  of copies of one mesh: built again for those that broke
-vtk_files         surface/*.vtu, pieces.csv
-vtu               VTU files
-collection        surface.pvd: which file is shown when
-surface_output    the part of a run that gathers, builds and writes
+body_surface      the surface at a time, ready to be written
+fragment_table    mass, centre, velocity and spin of the fragments, and names that stay with them
+surface_output    gathers values in a run, builds the surface and writes it
+vtk_files         surface.pvd, surface/*.vtu and pieces.csv
 """

@@ -1,4 +1,4 @@
-"""A body's surface at a time: built again where edges broke, otherwise only moved."""
+"""Split surface of a body at a time: built again if edges broke, otherwise only moved."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...mesh.split_surface.surface_motion import NodalRotations
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
 from ..fields_file import Field
-from .fragment_table import Fragments, PieceNames, fragments, sums, volumes
+from .fragment_table import FragmentNames, FragmentTable, enclosed_volumes, group_sums, tabulate_fragments
 
 if TYPE_CHECKING:
     from ...mesh.split_surface.surface_map import SurfaceMap
@@ -24,60 +24,76 @@ if TYPE_CHECKING:
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Arrays = dict[str, npt.NDArray[np.generic]]
-type Apart = Callable[[SurfaceMap, Ints, Values, float], SurfaceMap]  # of where points are, their elements, u and t
-FARTHEST = float(np.finfo(np.float32).max)  # viewers draw in single precision
+# Correction of drawn points, so that nothing is drawn inside an obstacle or another fragment: from the points, their
+# elements, the nodal displacement u and the time t.
+type PointCorrection = Callable[[SurfaceMap, Ints, Values, float], SurfaceMap]
+MAX_COORDINATE = float(np.finfo(np.float32).max)  # viewers use single precision
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What is written of a surface at time t (s).
+class SurfaceFrame:
+    """Split surface at a time, ready to be written.
 
     Attributes:
-        points: (n, d) where the points are now, m.
-        triangles: (k, 3) the closed surface in 3D; in 2D triangles that cover the body.
-        segments: (m, 2) the closed outlines in 2D, none in 3D.
-        at_points, at_elements: fields by name; elements are the triangles, then the segments.
-        origins: names of the numbers in at_elements["origin"].
-        pieces: figures of the pieces.
+        t: time, s.
+        points: present positions (n, d) of the points, m.
+        triangles: in 3D the closed surface (k, 3); in 2D triangles that cover the body.
+        segments: in 2D the closed outlines (m, 2); none in 3D.
+        point_fields: fields at the points, by name.
+        element_fields: fields of the elements, by name. Elements are the triangles, then the segments.
+        origins: names of the numbers in element_fields["origin"].
+        fragments: mass, volume and motion of the fragments.
     """
 
     t: float
     points: Values
     triangles: Ints
     segments: Ints
-    at_points: Arrays
-    at_elements: Arrays
+    point_fields: Arrays
+    element_fields: Arrays
     origins: list[str]
-    pieces: Fragments
+    fragments: FragmentTable
 
 
-class Surface:
-    """The split surface of a mesh, on the rank that has the mesh.
+class BodySurface:
+    """Split surface of a mesh, on the rank that has the mesh.
 
     Attributes:
         skeleton: edges, facets and boundary of the mesh.
-        split: the surface in the reference configuration.
-        names: (pieces,) numbers that stay with the pieces.    volume: (pieces,) m^3 (2D: m^2).
-        builds: how often it was built.
+        split: surface in the reference configuration.
+        mass: lumped masses (N,) of the nodes, kg.
+        fragment_names: names (fragments,), numbers that stay with a fragment.
+        volume: volumes (fragments,), m^3 (2D: m^2).
+        build_count: how often the surface was built.
     """
 
     split: SplitSurface
 
     def __init__(self, mesh: MeshData, density: Values | float, *, smooth: bool = False) -> None:
-        """`density`: kg/m^3, one number or (C,).    `smooth`: edges without a place of their cut get one that makes
-        cracks smooth."""
+        """Build the surface of the intact mesh.
+
+        Args:
+            mesh: input mesh.
+            density: mass density, kg/m^3; one number or (C,).
+            smooth: broken edges without a given cut are cut so that cracks are smooth.
+        """
         self._smooth = smooth
         self.skeleton = EntityNumbering(mesh)
         volume = signed_measures(mesh.points, mesh.cells)
         share = np.broadcast_to((density * volume / (mesh.dim + 1))[:, None], mesh.cells.shape)
-        self.mass = sums(mesh.cells.ravel(), share.ravel(), len(mesh.points))
-        self._names = PieceNames()
+        self.mass = group_sums(mesh.cells.ravel(), share.ravel(), len(mesh.points))
+        self._names = FragmentNames()
         self._pattern: npt.NDArray[np.integer] = np.zeros(len(mesh.cells), np.uint8)
-        self.builds = 0
+        self.build_count = 0
         self._build(None)
 
     def update(self, pattern: npt.NDArray[np.integer], cut: Values | None = None) -> bool:
-        """Build again where the patterns (C,) changed; returns whether they did. `cut`: (E,) see `split`."""
+        """Build the surface again if edges broke; returns True if it was built.
+
+        Args:
+            pattern: edge patterns (C,) of the cells.
+            cut: positions (E,) of the cuts of broken edges, see `build_split_surface`.
+        """
         if np.array_equal(pattern, self._pattern):
             return False
         self._pattern = pattern.copy()
@@ -85,32 +101,38 @@ class Surface:
         return True
 
     @property
-    def whole(self) -> npt.NDArray[np.bool_]:
-        """(C,) cells without a broken edge."""
+    def undamaged_cells(self) -> npt.NDArray[np.bool_]:
+        """Mask (C,) of the cells without a broken edge."""
         return self._pattern == 0
 
-    def replay(self, broken_at: Values, times: Iterable[float]) -> None:
-        """Name the pieces as frames at earlier times did, from the times (E,) at which edges broke (restart)."""
+    def replay_fragment_names(self, broken_at: Values, times: Iterable[float]) -> None:
+        """Restore the names of the fragments after a restart.
+
+        Args:
+            broken_at: times (E,) at which edges broke, s.
+            times: times of the earlier frames, s.
+        """
         for t in times:
-            count, piece = self.skeleton.pieces(broken_at <= t * (1 + 1e-12))
-            self._names.update(count, piece, self.mass)
+            count, fragment_of_node = self.skeleton.pieces(broken_at <= t * (1 + 1e-12))
+            self._names.update(count, fragment_of_node, self.mass)
 
     def _build(self, cut: Values | None) -> None:
         if self._smooth:
             from ...mesh.split_surface.smooth_cuts import smooth_cuts
 
             cut = smooth_cuts(self.skeleton, self.skeleton.broken_edges(self._pattern), cut)
-        made = build_split_surface(self.skeleton, self._pattern, cut)
-        self.split = made
-        self.names = self._names.update(made.fragment_count, made.node_fragment, self.mass)
-        piece = made.point_fragment
-        self.volume = volumes(made.points, made.elements, piece[made.elements[:, 0]], made.fragment_count)
-        self._rotations = NodalRotations(self.skeleton, self._pattern, made.parents.rotating_nodes)
-        self._piece = self.names[piece]
-        self._linear: SurfaceMap | None = None
-        self.builds += 1
+        self.split = built = build_split_surface(self.skeleton, self._pattern, cut)
+        self.fragment_names = self._names.update(built.fragment_count, built.node_fragment, self.mass)
+        fragment = built.point_fragment
+        self.volume = enclosed_volumes(
+            built.points, built.elements, fragment[built.elements[:, 0]], built.fragment_count
+        )
+        self._rotations = NodalRotations(self.skeleton, self._pattern, built.parents.rotating_nodes)
+        self._name_of_point = self.fragment_names[fragment]
+        self._uncorrected: SurfaceMap | None = None  # map from nodal displacement to points, before corrections
+        self.build_count += 1
 
-    def at(
+    def make_frame(
         self,
         t: float,
         u: Values,
@@ -118,84 +140,107 @@ class Surface:
         *,
         broken_at: Values | None = None,
         fields: Iterable[Field] = (),
-        apart: Sequence[Apart] = (),
-    ) -> Frame:
-        """The surface at time t (s) for nodal displacement u (N, d) in m and velocity v (N, d) in m/s.
+        corrections: Sequence[PointCorrection] = (),
+    ) -> SurfaceFrame:
+        """Surface at a time. The velocity of a point is the mean over its parent nodes, without their rotation.
 
-        Point velocity is the mean of the parents', without their turning. `fields` come along: nodal ones as the mean
-        of the parents, cell ones as in the cell behind the element. `broken_at`: (E,) s, for the age of the crack.
-        `apart`: what changes where points are, so that nothing is drawn inside something else.
-        NotConverged, naming piece and cell, where a node has gone astray.
+        Args:
+            t: time, s.
+            u: nodal displacement (N, d), m.
+            v: nodal velocity (N, d), m/s.
+            broken_at: times (E,) at which edges broke, s, for the age of the crack.
+            fields: further fields. Nodal ones are averaged over the parent nodes; an element has the value of the cell
+                behind it.
+            corrections: corrections of the drawn points.
+
+        Raises:
+            NotConverged: a displacement or velocity is not finite in single precision; with fragment and cell.
         """
-        self._check(t, u, v)
-        made, follow = self.split, self.split.parents
-        moved = self._moved(t, u, apart)
+        self._check_finite(t, u, v)
+        follow = self.split.parents
+        displacement = self._point_displacement(t, u, corrections)
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
-        at_points: Arrays = {"displacement": moved, "velocity": follow.mean(v), "piece": self._piece.astype(np.int32)}
-        at_points |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
-        triangles, segments, cell, at_elements = self._elements()
-        at_elements["age"] = self._ages(t, broken_at)
-        at_elements |= {field.name: field.values[cell] for field in fields if field.centre == "Cell"}
-        figures = fragments(self.names, made.node_fragment, self.mass, self.volume, self.skeleton.points + u, v)
-        points, origins = made.points + moved, self.skeleton.origins
-        return Frame(t, points, triangles, segments, at_points, at_elements, origins, figures)
+        point_fields: Arrays = {"displacement": displacement, "velocity": follow.mean(v)}
+        point_fields["piece"] = self._name_of_point.astype(np.int32)
+        point_fields |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
+        triangles, segments, cell, element_fields = self._elements()
+        element_fields["age"] = self._crack_age(t, broken_at)
+        element_fields |= {field.name: field.values[cell] for field in fields if field.centre == "Cell"}
+        table = tabulate_fragments(
+            self.fragment_names, self.split.node_fragment, self.mass, self.volume, self.skeleton.points + u, v
+        )
+        points, origins = self.split.points + displacement, self.skeleton.origins
+        return SurfaceFrame(t, points, triangles, segments, point_fields, element_fields, origins, table)
 
-    def placed(
-        self, t: float, points: Values, velocity: Values, pieces: Fragments, broken_at: Values | None = None
-    ) -> Frame:
-        """The surface at time t (s) with its points (n, d) at given places, m, moving at `velocity` (n, d), m/s; pieces
-        by the numbers of `split`."""
-        triangles, segments, _, at_elements = self._elements()
-        at_elements["age"] = self._ages(t, broken_at)
-        at_points: Arrays = {"displacement": points - self.split.points, "velocity": velocity}
-        at_points["piece"] = self._piece.astype(np.int32)
-        named = replace(pieces, name=self.names)
-        return Frame(t, points, triangles, segments, at_points, at_elements, self.skeleton.origins, named)
+    def make_rigid_frame(
+        self, t: float, points: Values, velocity: Values, fragments: FragmentTable, broken_at: Values | None = None
+    ) -> SurfaceFrame:
+        """Surface of rigid bodies at a time.
 
-    def _moved(self, t: float, u: Values, apart: Sequence[Apart]) -> Values:
-        """(n, d) displacements of the points, m."""
-        made = self.split
-        if not apart:
-            return made.parents.displacement(u, self._rotations(u))
-        if self._linear is None:
+        Args:
+            t: time, s.
+            points: present positions (n, d) of the points, m.
+            velocity: velocities (n, d) of the points, m/s.
+            fragments: motion of the fragments, in the order of `split`.
+            broken_at: times (E,) at which edges broke, s, for the age of the crack.
+        """
+        triangles, segments, _, element_fields = self._elements()
+        element_fields["age"] = self._crack_age(t, broken_at)
+        point_fields: Arrays = {"displacement": points - self.split.points, "velocity": velocity}
+        point_fields["piece"] = self._name_of_point.astype(np.int32)
+        table = replace(fragments, name=self.fragment_names)
+        origins = self.skeleton.origins
+        return SurfaceFrame(t, points, triangles, segments, point_fields, element_fields, origins, table)
+
+    def _point_displacement(self, t: float, u: Values, corrections: Sequence[PointCorrection]) -> Values:
+        """Displacements (n, d) of the points, m."""
+        built = self.split
+        if not corrections:
+            return built.parents.displacement(u, self._rotations(u))
+        if self._uncorrected is None:
             from ...mesh.split_surface.surface_map import whole
 
-            self._linear = whole(made, self.skeleton, self._pattern, made.points)
-        at = self._linear
-        for each in apart:
-            at = each(at, made.elements, u, t)
-        return at(u) - made.points
+            self._uncorrected = whole(built, self.skeleton, self._pattern, built.points)
+        point_map = self._uncorrected
+        for correct in corrections:
+            point_map = correct(point_map, built.elements, u, t)
+        return point_map(u) - built.points
 
     def _elements(self) -> tuple[Ints, Ints, Ints, Arrays]:
-        """Triangles, segments, the cell of each, and the fields that do not move."""
-        made, flat = self.split, self.skeleton.dim == 2
-        triangles, segments = (made.fill, made.elements) if flat else (made.elements, made.elements[:0, :2])
-        cell = np.concatenate([made.fill_cell, made.cell])
-        origin = np.concatenate([np.full(len(made.fill), BODY), made.origin])
-        piece = self._piece[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
-        alone = np.bincount(made.node_fragment)[made.point_fragment] == 1
-        dust = alone[np.concatenate([made.fill[:, 0], made.elements[:, 0]])]
-        fixed = {"piece": piece, "origin": origin, "cell": cell, "dust": dust}
+        """Triangles, segments, the cell behind each element, and the fields that do not depend on the motion."""
+        built, flat = self.split, self.skeleton.dim == 2
+        triangles, segments = (built.fill, built.elements) if flat else (built.elements, built.elements[:0, :2])
+        cell = np.concatenate([built.fill_cell, built.cell])
+        origin = np.concatenate([np.full(len(built.fill), BODY), built.origin])
+        first_point = np.concatenate([built.fill[:, 0], built.elements[:, 0]])
+        is_single_node = np.bincount(built.node_fragment)[built.point_fragment] == 1
+        fixed = {
+            "piece": self._name_of_point[first_point], "origin": origin, "cell": cell,
+            "dust": is_single_node[first_point],
+        }  # fmt: skip
         return triangles, segments, cell, {name: values.astype(np.int32) for name, values in fixed.items()}
 
-    def _ages(self, t: float, broken_at: Values | None) -> Values:
-        """s since the edge behind an element broke; 0 on the boundary and where it is not known: viewers draw what is
-        no number in a colour of its own."""
+    def _crack_age(self, t: float, broken_at: Values | None) -> Values:
+        """Time (elements,) since the edge behind each element broke, s; 0 on the boundary and if unknown.
+
+        Viewers would draw NaN in a colour of its own.
+        """
         edge = np.concatenate([np.full(len(self.split.fill), -1), self.split.edge])
         age = np.zeros(len(edge))
         if broken_at is not None:
             age[edge >= 0] = np.nan_to_num(t - broken_at[edge[edge >= 0]])
         return age
 
-    def _check(self, t: float, u: Values, v: Values) -> None:
-        for values, what in ((u, "displacement"), (v, "velocity")):
-            lost = np.flatnonzero(~np.all(np.abs(values) <= FARTHEST, axis=1))
+    def _check_finite(self, t: float, u: Values, v: Values) -> None:
+        """Raise NotConverged if a nodal displacement or velocity (N, d) exceeds `MAX_COORDINATE`."""
+        for values, quantity in ((u, "displacement"), (v, "velocity")):
+            lost = np.flatnonzero(~np.all(np.abs(values) <= MAX_COORDINATE, axis=1))
             if len(lost):
                 node = lost[0]
                 cell = int(np.argmax(np.any(self.skeleton.cells == node, axis=1)))
-                piece = self.names[self.split.node_fragment[node]]
+                name = self.fragment_names[self.split.node_fragment[node]]
                 raise NotConverged(
-                    f"the surface at t = {t:g} s was not written: node {node} of piece {piece} (cell {cell}) has the "
-                    f"{what} {values[node]}; {len(lost)} nodes are not numbers below {FARTHEST:.0e}; "
+                    f"the surface at t = {t:g} s was not written: node {node} of piece {name} (cell {cell}) has the "
+                    f"{quantity} {values[node]}; {len(lost)} nodes are not numbers below {MAX_COORDINATE:.0e}; "
                     "choose a smaller time.step"
                 )

@@ -1,4 +1,4 @@
-"""The pieces of a body: mass, volume, centre, velocity and spin, and names that stay with them."""
+"""Mass, volume, centre, velocity and spin of the fragments, and names that stay with them over time."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Fragments:
-    """Figures of p pieces.
+class FragmentTable:
+    """Figures of p fragments.
 
     Attributes:
-        name: (p,) number that stays with the piece over time.
-        nodes: (p,) how many.
-        mass: (p,) kg (2D: of the thickness that the density is given for), the sum of the lumped nodal masses.
-        volume: (p,) m^3 (2D: m^2) that the split surface encloses in the reference configuration.
-        centre, velocity: (p, d) of mass, m and m/s.
-        spin: (p, 3) rad/s; 2D: (p, 1). The least-squares solution of (tensor of inertia) spin = angular momentum, so 0
-            about axes that a piece of one node, or of nodes in line, has no inertia about.
-        turn: (p, 3) rotation vector since the start, rad, of rigid pieces; None of others.
+        name: numbers (p,) that stay with the fragments over time.
+        nodes: numbers (p,) of nodes.
+        mass: masses (p,), kg, the sums of the lumped nodal masses. In 2D for the thickness of the given density.
+        volume: volumes (p,), m^3 (2D: m^2), enclosed by the split surface in the reference configuration.
+        centre: centres of mass (p, d), m.
+        velocity: velocities (p, d) of the centres of mass, m/s.
+        spin: angular velocities (p, 3), rad/s; 2D: (p, 1). They are the least-squares solution of
+            (tensor of inertia) spin = angular momentum, and so 0 about axes without inertia, as of collinear nodes.
+        rotation: rotation vectors (p, 3) since the start, rad, of rigid fragments; None for deformable ones.
     """
 
     name: Ints
@@ -36,82 +37,118 @@ class Fragments:
     centre: Values
     velocity: Values
     spin: Values
-    turn: Values | None = None
+    rotation: Values | None = None
 
 
-def fragments(name: Ints, piece_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values) -> Fragments:
-    """Figures of the pieces from nodal masses (N,) in kg, current places x (N, d) and velocities v (N, d)."""
+def tabulate_fragments(
+    name: Ints, fragment_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values
+) -> FragmentTable:
+    """Figures of deformable fragments.
 
-    def total(values: Values) -> Values:
-        return sums(piece_of_node, values, len(name))
+    Args:
+        name: names (p,) of the fragments.
+        fragment_of_node: fragment (N,) of each node.
+        mass: lumped masses (N,) of the nodes, kg.
+        volume: volumes (p,), m^3 (2D: m^2).
+        x: present positions (N, d) of the nodes, m.
+        v: velocities (N, d) of the nodes, m/s.
+    """
 
-    weight = total(mass)
-    centre, velocity = (total(mass[:, None] * each) / weight[:, None] for each in (x, v))
-    spin = _spin(total, mass, x - centre[piece_of_node], v - velocity[piece_of_node])
-    nodes = np.bincount(piece_of_node, minlength=len(name))
-    return Fragments(name, nodes, weight, volume, centre, velocity, spin)
+    def sum_nodes(values: Values) -> Values:
+        return group_sums(fragment_of_node, values, len(name))
+
+    weight = sum_nodes(mass)
+    centre, velocity = (sum_nodes(mass[:, None] * values) / weight[:, None] for values in (x, v))
+    spin = _spin(sum_nodes, mass, x - centre[fragment_of_node], v - velocity[fragment_of_node])
+    nodes = np.bincount(fragment_of_node, minlength=len(name))
+    return FragmentTable(name, nodes, weight, volume, centre, velocity, spin)
 
 
-def _spin(total: Callable[[Values], Values], mass: Values, r: Values, w: Values) -> Values:
-    """Spin of each piece from arms r and velocities w (N, d) about its centre of mass; `total` sums over its nodes.
+def _spin(sum_nodes: Callable[[Values], Values], mass: Values, r: Values, w: Values) -> Values:
+    """Angular velocities (p, 3) or (p, 1), rad/s, with I spin = L.
 
     L = sum m r x w,   I = sum m (r.r 1 - r r^T)
+
+    Args:
+        sum_nodes: returns the sums of nodal values over each fragment.
+        mass: lumped masses (N,), kg.
+        r: positions (N, d) relative to the centre of mass, m.
+        w: velocities (N, d) relative to the centre of mass, m/s.
     """
     if r.shape[1] == 2:
-        momentum = total(mass * (r[:, 0] * w[:, 1] - r[:, 1] * w[:, 0]))
-        inertia = total(mass * np.einsum("ni,ni->n", r, r))
+        momentum = sum_nodes(mass * (r[:, 0] * w[:, 1] - r[:, 1] * w[:, 0]))
+        inertia = sum_nodes(mass * np.einsum("ni,ni->n", r, r))
         return np.divide(momentum, inertia, out=np.zeros_like(momentum), where=inertia > 0)[:, None]
-    momentum = total(mass[:, None] * np.cross(r, w))
-    second = total(mass[:, None] * np.einsum("ni,nj->nij", r, r).reshape(-1, 9)).reshape(-1, 3, 3)
+    momentum = sum_nodes(mass[:, None] * np.cross(r, w))
+    second = sum_nodes(mass[:, None] * np.einsum("ni,nj->nij", r, r).reshape(-1, 9)).reshape(-1, 3, 3)
     inertia = np.einsum("nii->n", second)[:, None, None] * np.eye(3) - second
-    # an axis with less than 1e-9 of the largest moment has none: what is left there is round-off of the sums
+    # moments below 1e-9 of the largest are round-off of the sums: no rotation about such an axis
     spin: Values = np.einsum("nij,nj->ni", np.linalg.pinv(inertia, rcond=1e-9, hermitian=True), momentum)
     return spin
 
 
-def volumes(points: Values, elements: Ints, piece: Ints, count: int) -> Values:
-    """(count,) m^3 (2D: m^2) enclosed by closed surfaces (outlines) of points (n, d): divergence theorem.
+def enclosed_volumes(points: Values, elements: Ints, fragment: Ints, count: int) -> Values:
+    """Volumes (count,), m^3 (2D: m^2), enclosed by closed surfaces, by the divergence theorem.
 
     V = 1/6 sum x_0 . (x_1 x x_2) over triangles; 2D: A = 1/2 sum x_0 x x_1 over segments.
+
+    Args:
+        points: positions (n, d), m.
+        elements: triangles (k, 3) or segments (k, 2), oriented outwards.
+        fragment: fragment (k,) of each element.
+        count: number of fragments.
     """
-    x = (points - points.mean(axis=0))[elements]  # near the origin: less cancels
-    return sums(piece, cones(x), count)
+    x = (points - points.mean(axis=0))[elements]  # near the origin there is less cancellation
+    return group_sums(fragment, cones(x), count)
 
 
-def sums(group: Ints, values: Values, count: int) -> Values:
-    """(count,) or (count, k) sums of the values (n,) or (n, k) of each group. (A sparse matrix would, too, but
-    to import SciPy takes 0.13 s of a start.)"""
-    columns = [np.bincount(group, each, minlength=count) for each in values.reshape(len(group), -1).T]
+def group_sums(group: Ints, values: Values, count: int) -> Values:
+    """Sums (count,) or (count, k) of values (n,) or (n, k) over each group.
+
+    Args:
+        group: group (n,) of each value.
+        values: the values.
+        count: number of groups.
+    """
+    # bincount and no sparse matrix: to import scipy.sparse takes 0.13 s
+    columns = [np.bincount(group, column, minlength=count) for column in values.reshape(len(group), -1).T]
     return np.asarray(columns, float).T.reshape(count, *values.shape[1:])
 
 
-class PieceNames:
-    """Numbers that stay with a piece over time.
+class FragmentNames:
+    """Numbers that stay with a fragment over time.
 
-    Damage does not heal, so a piece is part of one earlier piece. Of its parts the one with the largest mass keeps the
-    name, where masses are equal the one with the lowest node; others get new names in the order of their lowest node.
+    Damage does not heal, so each fragment is part of one earlier fragment. The heaviest part of a fragment keeps its
+    name; of equally heavy parts the one with the lowest node. The others get new names in the order of their lowest
+    node.
     """
 
     def __init__(self) -> None:
         self._of_node: Ints | None = None
         self._next = 0
 
-    def update(self, pieces: int, piece_of_node: Ints, mass: Values) -> Ints:
-        """(pieces,) names; the pieces are numbered by their lowest node."""
-        names: Ints = np.zeros(pieces, np.int64)
-        fresh: Ints = np.arange(pieces)
+    def update(self, count: int, fragment_of_node: Ints, mass: Values) -> Ints:
+        """Names (count,) of the present fragments.
+
+        Args:
+            count: number of fragments; they are numbered by their lowest node.
+            fragment_of_node: fragment (N,) of each node.
+            mass: masses (N,) of the nodes, kg.
+        """
+        names: Ints = np.zeros(count, np.int64)
+        unnamed: Ints = np.arange(count)
         if self._of_node is not None:
-            names[:] = self._of_node[np.unique(piece_of_node, return_index=True)[1]]
-            fresh = _not_heaviest(names, sums(piece_of_node, mass, pieces))
-        names[fresh] = self._next + np.arange(len(fresh))
-        self._next += len(fresh)
-        self._of_node = names[piece_of_node]
+            names[:] = self._of_node[np.unique(fragment_of_node, return_index=True)[1]]
+            unnamed = _lighter_parts(names, group_sums(fragment_of_node, mass, count))
+        names[unnamed] = self._next + np.arange(len(unnamed))
+        self._next += len(unnamed)
+        self._of_node = names[fragment_of_node]
         return names
 
 
-def _not_heaviest(names: Ints, mass: Values) -> Ints:
-    """Pieces that are not the heaviest of their name, ascending."""
-    rounded = np.round(mass / mass.sum(), 12)  # halves of a symmetric body are equal
+def _lighter_parts(names: Ints, mass: Values) -> Ints:
+    """Fragments, ascending, that are not the heaviest with their name."""
+    rounded = np.round(mass / mass.sum(), 12)  # halves of a symmetric body count as equally heavy
     order = np.lexsort((np.arange(len(names)), -rounded, names))
     first = np.unique(names[order], return_index=True)[1]
     return np.sort(np.delete(order, first))

@@ -1,4 +1,4 @@
-"""The split surface in a run: gathers, builds on rank 0, writes."""
+"""Output of the split surface in a run: values are gathered, and rank 0 builds and writes the surface."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ...mechanics.material_fields import PerCell
 from ...mechanics.term import Term
 from ...mesh.domain import Domain
 from ...timestepping.state import State
-from ..atomic_write import written
+from ..atomic_write import write_on_root
 from ..fields_file import Field
-from ..interpenetration_check import Passing
-from .body_surface import Apart, Surface
+from ..result_checks import InterpenetrationMonitor
+from .body_surface import BodySurface, PointCorrection
 from .vtk_files import SurfaceFiles
 
 Values = npt.NDArray[np.float64]
 
 
 class SurfaceOutput:
-    """Writes surface.pvd and pieces.csv of a run.
+    """Writer of surface.pvd and pieces.csv of a run with deformable bodies.
 
     Attributes:
-        record: when and where edges broke; None where the study has no fracture.
-        made: the surface and its files on rank 0, None elsewhere.
+        record: time and position of each break; None without fracture.
+        surface_and_files: surface and its files on rank 0, None on the other ranks.
     """
 
     def __init__(
@@ -39,61 +39,86 @@ class SurfaceOutput:
         density: PerCell,
         record: EdgeRecord | None,
         *,
-        apart: Sequence[Apart] = (),
+        apart: Sequence[PointCorrection] = (),
         beside: Sequence[Term] = (),
-        passing: Passing | None = None,
+        passing: InterpenetrationMonitor | None = None,
         smooth: bool = False,
         resume_at: float | None = None,
     ) -> None:
-        """Open the files (collective). The run notes breaks in the record; a restart reads it from the checkpoint.
+        """Open the files (collective).
 
-        `beside`: terms that are drawn with the body.    `passing`: where nothing keeps its pieces apart.
-        `smooth`: cracks are drawn so.
+        Args:
+            folder: output folder.
+            domain: distributed mesh.
+            density: mass density, kg/m^3 (2D: kg/m^2).
+            record: history of broken edges, in a study with fracture. On a restart it is that of the checkpoint.
+            apart: corrections of the drawn points.
+            beside: terms with obstacles to draw.
+            passing: monitor of interpenetration, in a study without contact between fragments.
+            smooth: draw cracks smooth.
+            resume_at: keep the frames up to this time, s; None: a new run.
+
+        Raises:
+            CannotWrite: a file cannot be written.
         """
-        self._domain, self.record, self._apart, self._beside, self._passing = domain, record, apart, beside, passing
-        everywhere = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
+        self._domain, self.record, self._corrections = domain, record, apart
+        self._obstacle_terms, self._interpenetration = beside, passing
+        cell_density = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         broken = self.record.gathered() if self.record is not None else None
 
-        def begin() -> tuple[Surface, SurfaceFiles]:
-            assert domain.source is not None
+        def open_files() -> tuple[BodySurface, SurfaceFiles]:
+            assert domain.source is not None and cell_density is not None
             files = SurfaceFiles(folder, domain.dim, resume_at)
-            surface = Surface(domain.source, everywhere, smooth=smooth)  # type: ignore[arg-type]
+            surface = BodySurface(domain.source, cell_density, smooth=smooth)
             if broken is not None and resume_at is not None:
-                surface.replay(surface.skeleton.of_edges(broken[0], broken[1][:, 0]), files.times)
+                edges, history = broken
+                surface.replay_fragment_names(surface.skeleton.of_edges(edges, history[:, 0]), files.times)
             return surface, files
 
         self._path = folder / "surface.pvd"
-        self.made = written(domain.comm, self._path, begin)
+        self.surface_and_files = write_on_root(domain.comm, self._path, open_files)
 
-    def write(self, state: State, fields: list[Field]) -> None:
-        """A frame at the time of the state, with the fields of fields.xdmf. Raises CannotWrite (collective)."""
+    def write_frame(self, state: State, fields: list[Field]) -> None:
+        """Write a frame at the time of the state, if there is none yet (collective).
+
+        Args:
+            state: present state.
+            fields: fields of fields.xdmf, which the surface has as well.
+
+        Raises:
+            CannotWrite: a file cannot be written.
+        """
         domain, d = self._domain, self._domain.dim
-        gathered: list[Any] = [domain.gather_nodes(each.reshape(-1, d)) for each in (state.u, state.v)]
+        gathered: list[Any] = [domain.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)]
         pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
         broken = self.record.gathered() if self.record is not None else None
 
-        def work() -> None:
-            assert self.made is not None
-            surface, files = self.made
+        def write() -> None:
+            assert self.surface_and_files is not None
+            surface, files = self.surface_and_files
             if state.t in files.times:
                 return
-            at_corners, nodal = self._of_points(gathered, fields)
-            at = cut = None
+            (u, v), nodal = self._corner_values(gathered, fields)
+            broken_at = cut = None
             if broken is not None and pattern is not None:
-                at, cut = (surface.skeleton.of_edges(broken[0], column) for column in broken[1].T)
+                edges, history = broken
+                broken_at, cut = (surface.skeleton.of_edges(edges, column) for column in history.T)
                 surface.update(pattern, cut)
-            beside = {name: drawn for term in self._beside for name, drawn in term.output_surfaces(state.t).items()}
-            files.write(surface.at(state.t, *at_corners, broken_at=at, fields=nodal, apart=self._apart), beside)
-            if self._passing is not None:
-                self._passing.look(state.t, surface, at_corners[0])
+            drawn = {
+                name: data for term in self._obstacle_terms for name, data in term.output_surfaces(state.t).items()
+            }
+            frame = surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=self._corrections)
+            files.write_frame(frame, drawn)
+            if self._interpenetration is not None:
+                self._interpenetration.record_frame(state.t, surface, u)
 
-        written(domain.comm, self._path, work)
+        write_on_root(domain.comm, self._path, write)
 
-    def _of_points(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
-        """Nodal values without those in the middles of edges: the surface is that of straight cells (rank 0)."""
+    def _corner_values(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
+        """Nodal values at the corners of quadratic cells only: the surface has straight cells (rank 0)."""
         source = self._domain.source
         if self._domain.midside_nodes is None or source is None:
             return gathered, fields
         count = len(source.points)
-        nodal = [replace(each, values=each.values[:count]) if each.centre == "Node" else each for each in fields]
-        return [each[:count] for each in gathered], nodal
+        nodal = [replace(field, values=field.values[:count]) if field.centre == "Node" else field for field in fields]
+        return [values[:count] for values in gathered], nodal

@@ -1,90 +1,131 @@
-"""surface.pvd with one VTU file a time in surface/, and pieces.csv: for ParaView, and valid after every frame."""
+"""Files of the split surface: surface.pvd, one VTU file per frame in surface/, and pieces.csv.
+
+ParaView can open them after every frame. VTU files are written by VTK. In surface.pvd part 0 of a time is the body, and
+the others are obstacles.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...mechanics.surface_data import SurfaceData
-from ..atomic_write import append, replace_text
-from ..file_ownership import FRAME
-from .body_surface import Frame
-from .collection import Entry, collection_text, read_entries
-from .fragment_table import Fragments
-from .vtu import grid_of, grid_of_elements, update_vtu, write_vtu
+from ...errors import InputError
+from ...meshes.plain_files import check_readable, create, replacing
+from ..atomic_write import append_bytes, replace_text
+from ..fields_file import EARLIER_TENSOR_COMPONENTS, TENSOR_COMPONENTS, pad_to_3d, reorder_earlier_tensor
+from ..file_ownership import FRAME_FILE_PATTERN
 
+if TYPE_CHECKING:
+    from ...mechanics.surface_data import SurfaceData
+    from .body_surface import SurfaceFrame
+    from .fragment_table import FragmentTable
+
+Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
+
+BODY_NAME = "body"
+SURFACE_FOLDER = "surface/"  # folder of the VTU files in the output folder
+_PVD_HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
+_PVD_TAIL = "  </Collection>\n</VTKFile>\n"
+_PVD_ENTRY = re.compile(r'timestep="([^"]+)"(?: part="(\d+)" name="([^"]+)")? file="([^"]+)"')
+_VTK_TRIANGLE, _VTK_LINE = 5, 3  # VTK's numbers of cell types
+_VTU_HEAD_BYTES = 1 << 16  # more than the XML before the data takes
 
 
 class SurfaceFiles:
-    """Appends frames to surface.pvd and pieces.csv.
+    """Writer of surface.pvd and pieces.csv.
 
     Attributes:
-        times: s of the frames that are there.
+        times: times of the frames, s.
+        frame_counts: number of frames in each file.
     """
 
     def __init__(self, folder: Path, dim: int, resume_at: float | None = None, *, turning: bool = False) -> None:
-        """`resume_at`: keep the frames up to this time (s); `turning`: pieces are rigid, and how they are turned is
-        told."""
+        """Open the files.
+
+        Args:
+            folder: output folder.
+            dim: dimension of the body.
+            resume_at: keep the frames up to this time, s; None: a new run.
+            turning: write the rotation of rigid fragments.
+
+        Raises:
+            OSError: the files cannot be written.
+        """
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
-        self._columns = columns(dim, turning=turning)
-        self._entries = self._kept(resume_at) if resume_at is not None and self._pvd.exists() else []
-        self._last: dict[str, tuple[SurfaceData, str]] = {}  # what was drawn beside the body, and its file
-        rows = self._kept_rows() if self._entries else []
+        self._columns = fragment_columns(dim, turning=turning)
+        self._entries = self._earlier_entries(resume_at) if resume_at is not None and self._pvd.exists() else []
+        self._last_obstacles: dict[str, tuple[SurfaceData, str]] = {}  # obstacle -> its last data, their file
+        rows = self._earlier_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
-        keep = {entry.file for entry in self._entries}
+        listed = {entry.file for entry in self._entries}
         for entry in self._entries:
-            update_vtu(folder / entry.file)
+            update_tensor_order(folder / entry.file)
         self._write_pvd()
         replace_text(self._csv, _csv_text([self._columns, *rows]))
-        self._with_rows = len({row[0] for row in rows})  # frames in pieces.csv
+        self._csv_frames = len({row[0] for row in rows})
         for path in (folder / "surface").glob("*.vtu"):
-            if FRAME.fullmatch(path.name) and f"surface/{path.name}" not in keep:
+            if FRAME_FILE_PATTERN.fullmatch(path.name) and f"surface/{path.name}" not in listed:
                 path.unlink()
 
     @property
     def times(self) -> list[float]:
+        """Times of the frames, s."""
         return [entry.t for entry in self._entries if not entry.part]
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Frames in each file."""
-        return {self._pvd.name: len(self.times), self._csv.name: self._with_rows}
+    def frame_counts(self) -> dict[str, int]:
+        """Number of frames in each file."""
+        return {self._pvd.name: len(self.times), self._csv.name: self._csv_frames}
 
-    def write(self, frame: Frame, beside: dict[str, SurfaceData] | None = None) -> Path:
-        """The VTUs first, then the files that name them; `beside`: by the names of obstacles."""
+    def write_frame(self, frame: SurfaceFrame, obstacles: dict[str, SurfaceData] | None = None) -> Path:
+        """Write a frame and return the path of its VTU file.
+
+        Args:
+            frame: surface of the body.
+            obstacles: data of the obstacles by name.
+
+        Raises:
+            OSError: the files cannot be written.
+        """
+        # VTU files come before the files that refer to them
         number = len(self.times)
-        body = Entry(frame.t, f"surface/surface_{number:06d}.vtu")
-        write_vtu(self._folder / body.file, grid_of(frame))
-        others = [(name, self._drawn(name, drawn, number)) for name, drawn in (beside or {}).items()]
-        append(self._csv, _csv_text(_rows(frame.t, frame.pieces)).encode())
-        self._with_rows += 1
-        self._entries += [body, *(Entry(frame.t, file, part, name) for part, (name, file) in enumerate(others, 1))]
+        body = PvdEntry(frame.t, f"surface/surface_{number:06d}.vtu")
+        write_vtu(self._folder / body.file, make_surface_grid(frame))
+        drawn = [(name, self._write_obstacle(name, data, number)) for name, data in (obstacles or {}).items()]
+        append_bytes(self._csv, _csv_text(_csv_rows(frame.t, frame.fragments)).encode())
+        self._csv_frames += 1
+        self._entries += [body, *(PvdEntry(frame.t, file, part, name) for part, (name, file) in enumerate(drawn, 1))]
         self._write_pvd()
         return self._folder / body.file
 
-    def _drawn(self, name: str, drawn: SurfaceData, number: int) -> str:
-        """The file of what stands beside the body: the last one for as long as it does not move."""
-        before, file = self._last.get(name, (None, ""))
-        if before is None or not np.array_equal(before.points, drawn.points):
+    def _write_obstacle(self, name: str, data: SurfaceData, number: int) -> str:
+        """File of an obstacle; the previous file if the obstacle has not moved."""
+        previous, file = self._last_obstacles.get(name, (None, ""))
+        if previous is None or not np.array_equal(previous.points, data.points):
             file = f"surface/obstacle_{name}_{number:06d}.vtu"
-            write_vtu(self._folder / file, grid_of_elements(drawn.points, drawn.triangles, drawn.segments))
-            self._last[name] = drawn, file
+            write_vtu(self._folder / file, make_grid(data.points, data.triangles, data.segments))
+            self._last_obstacles[name] = data, file
         return file
 
     def _write_pvd(self) -> None:
-        replace_text(self._pvd, collection_text(self._entries))
+        replace_text(self._pvd, pvd_text(self._entries))
 
-    def _kept(self, until: float) -> list[Entry]:
-        entries = read_entries(self._pvd)
-        return [each for each in entries if each.t <= until * (1 + 1e-9) and (self._folder / each.file).exists()]
+    def _earlier_entries(self, until: float) -> list[PvdEntry]:
+        """Entries of surface.pvd up to the time `until` in s whose files exist."""
+        entries = read_pvd(self._pvd)
+        return [entry for entry in entries if entry.t <= until * (1 + 1e-9) and (self._folder / entry.file).exists()]
 
-    def _kept_rows(self) -> list[list[str]]:
-        """Whole rows of the frames that are kept."""
+    def _earlier_rows(self) -> list[list[str]]:
+        """Complete rows of pieces.csv that belong to the earlier frames."""
         times = {f"{t:.12g}" for t in self.times}
         if not self._csv.exists():
             return []
@@ -93,34 +134,196 @@ class SurfaceFiles:
         return [row for row in rows if len(row) == len(self._columns) and row[0] in times]
 
 
+# --- pieces.csv -------------------------------------------------------------------------------------------------------
+
+
 def _csv_text(rows: list[list[str]]) -> str:
     text = io.StringIO()
     csv.writer(text).writerows(rows)
     return text.getvalue()
 
 
-def columns(dim: int, *, turning: bool = False) -> list[str]:
-    """Columns of pieces.csv; `turning`: with the orientation of rigid pieces."""
+def fragment_columns(dim: int, *, turning: bool = False) -> list[str]:
+    """Columns of pieces.csv.
+
+    Args:
+        dim: dimension of the body.
+        turning: with the rotation of rigid fragments.
+    """
     axes = "xyz"[:dim]
-    vectors = [f"{what}_{axis}" for what in ("centre", "velocity") for axis in axes]
+    vectors = [f"{quantity}_{axis}" for quantity in ("centre", "velocity") for axis in axes]
     spin = [f"spin_{axis}" for axis in ("xyz" if dim == 3 else "z")]
     turn = [*(f"turn_{axis}" for axis in "xyz"), *(f"quaternion_{part}" for part in "wxyz")] if turning else []
     return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn, "dust"]
 
 
-def _rows(t: float, pieces: Fragments) -> list[list[str]]:
-    turn = [] if pieces.turn is None else [pieces.turn, quaternions(pieces.turn)]
-    dust = pieces.nodes == 1
-    values = np.column_stack([pieces.mass, pieces.volume, pieces.centre, pieces.velocity, pieces.spin, *turn, dust])
+def _csv_rows(t: float, fragments: FragmentTable) -> list[list[str]]:
+    """Rows of pieces.csv at time t in s, in the order of the names of the fragments."""
+    rotation = [] if fragments.rotation is None else [fragments.rotation, rotation_quaternions(fragments.rotation)]
+    is_single_node = fragments.nodes == 1
+    values = np.column_stack([
+        fragments.mass, fragments.volume, fragments.centre, fragments.velocity, fragments.spin, *rotation,
+        is_single_node,
+    ])  # fmt: skip
     return [
-        [f"{t:.12g}", str(pieces.name[piece]), str(pieces.nodes[piece]), *(f"{value:.12g}" for value in values[piece])]
-        for piece in np.argsort(pieces.name)
+        [f"{t:.12g}", str(fragments.name[row]), str(fragments.nodes[row]), *(f"{value:.12g}" for value in values[row])]
+        for row in np.argsort(fragments.name)
     ]
 
 
-def quaternions(turn: Values) -> Values:
-    """(p, 4) unit quaternions w, x, y, z, w >= 0, of rotation vectors (p, 3), rad: (cos a/2, sin(a/2) n)."""
-    half = np.linalg.norm(turn, axis=1, keepdims=True) / 2
-    vector = turn / 2 * np.sinc(half / np.pi)
-    made = np.concatenate([np.cos(half), vector], axis=1)
-    return np.asarray(np.where(made[:, :1] < 0, -made, made))
+def rotation_quaternions(rotation: Values) -> Values:
+    """Unit quaternions (p, 4) w, x, y, z with w >= 0 of rotation vectors (p, 3) in rad: (cos a/2, sin(a/2) n)."""
+    half_angle = np.linalg.norm(rotation, axis=1, keepdims=True) / 2
+    vector = rotation / 2 * np.sinc(half_angle / np.pi)
+    quaternion = np.concatenate([np.cos(half_angle), vector], axis=1)
+    return np.asarray(np.where(quaternion[:, :1] < 0, -quaternion, quaternion))
+
+
+# --- surface.pvd ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PvdEntry:
+    """VTU file in surface.pvd.
+
+    Attributes:
+        t: time, s.
+        file: path relative to the output folder.
+        part: 0 for the body, others for obstacles.
+        name: name of the part.
+    """
+
+    t: float
+    file: str
+    part: int = 0
+    name: str = BODY_NAME
+
+
+def pvd_text(entries: Iterable[PvdEntry]) -> str:
+    """Text of surface.pvd. With obstacles the parts of a time become named blocks of one data set."""
+    entries = list(entries)
+    has_blocks = any(entry.part for entry in entries)
+    return _PVD_HEAD + "".join(_pvd_line(entry, has_blocks) for entry in entries) + _PVD_TAIL
+
+
+def _pvd_line(entry: PvdEntry, has_blocks: bool) -> str:
+    part = f'part="{entry.part}" name="{entry.name}" ' if has_blocks else ""
+    return f'    <DataSet timestep="{entry.t:.12g}" {part}file="{entry.file}"/>\n'
+
+
+def read_pvd(pvd: Path) -> list[PvdEntry]:
+    """Entries of a surface.pvd. Raises InputError if it refers to a file that no run writes."""
+    check_readable(pvd)
+    matches = _PVD_ENTRY.findall(pvd.read_text())
+    for *_, file in matches:
+        # VTK chooses its reader by the suffix, and would read any file
+        if not (file.startswith(SURFACE_FOLDER) and FRAME_FILE_PATTERN.fullmatch(file.removeprefix(SURFACE_FOLDER))):
+            raise InputError(f"{pvd} names the file {file}, which no run of fracsim writes")
+    return [PvdEntry(float(t), file, int(part or 0), name or BODY_NAME) for t, part, name, file in matches]
+
+
+def read_body_frames(pvd: Path) -> list[tuple[float, str]]:
+    """Pairs (time in s, file relative to the output folder) of all frames of the body."""
+    return [(entry.t, entry.file) for entry in read_pvd(pvd) if not entry.part]
+
+
+# --- VTU files --------------------------------------------------------------------------------------------------------
+
+
+def write_vtu(path: Path, grid: Any) -> None:
+    """Write an unstructured grid as a VTU file with appended and compressed data. Raises OSError."""
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    # through memory: on a full disk VTK prints a message of its own and gives no reason
+    writer.WriteToOutputStringOn()
+    writer.SetInputData(grid)
+    writer.SetDataModeToAppended()
+    # raw and LZ4 take a tenth of the time of base64 and zlib, and no more space
+    writer.EncodeAppendedDataOff()
+    writer.SetCompressorTypeToLZ4()
+    if not writer.Write():
+        raise OSError("VTK cannot write it")
+    data = writer.GetOutputString()  # bytes if the output is not valid text
+    with create(path) as file:
+        file.write(data if isinstance(data, bytes) else data.encode())
+
+
+def _vtk_array(values: npt.NDArray[np.generic], name: str = "") -> Any:
+    """VTK array of scalars (n,), vectors (n, d) or symmetric tensors (n, 6)."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    array = numpy_to_vtk(np.ascontiguousarray(pad_to_3d(values)), deep=True)
+    array.SetName(name)
+    # ParaView names six columns so by itself; other programs need the names
+    for column, axes in enumerate(TENSOR_COMPONENTS if array.GetNumberOfComponents() == len(TENSOR_COMPONENTS) else ()):
+        array.SetComponentName(column, axes.upper())
+    return array
+
+
+def make_grid(points: Values, triangles: Ints, segments: Ints) -> Any:
+    """VTK grid of triangles (k, 3), then segments (m, 2), with points (n, d) in m."""
+    from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+
+    grid, vtk_points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
+    vtk_points.SetData(_vtk_array(points))
+    grid.SetPoints(vtk_points)
+    sizes = np.repeat([3, 2], [len(triangles), len(segments)])
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    corners = np.concatenate([triangles.ravel(), segments.ravel()]).astype(np.int64)
+    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True))
+    grid.SetCells(_vtk_array(np.where(sizes == 3, _VTK_TRIANGLE, _VTK_LINE).astype(np.uint8)), cells)
+    return grid
+
+
+def make_surface_grid(frame: SurfaceFrame) -> Any:
+    """VTK grid of a surface with its fields."""
+    from vtkmodules.vtkCommonCore import vtkStringArray
+
+    grid = make_grid(frame.points, frame.triangles, frame.segments)
+    for name, values in frame.point_fields.items():
+        grid.GetPointData().AddArray(_vtk_array(values, name))
+    for name, values in frame.element_fields.items():
+        grid.GetCellData().AddArray(_vtk_array(values, name))
+    names = vtkStringArray()
+    names.SetName("origins")
+    for origin in frame.origins:
+        names.InsertNextValue(origin)
+    grid.GetFieldData().AddArray(names)
+    return grid
+
+
+def reorder_tensors(grid: Any) -> bool:
+    """Reorder tensors of an earlier version to `TENSOR_COMPONENTS`; returns True if there were any.
+
+    Their component names give the order in which an earlier version wrote them.
+    """
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    changed = False
+    for data in (grid.GetPointData(), grid.GetCellData()):
+        arrays = [data.GetArray(number) for number in range(data.GetNumberOfArrays())]
+        for array in arrays:
+            names = tuple(array.GetComponentName(number) for number in range(array.GetNumberOfComponents()))
+            if names == EARLIER_TENSOR_COMPONENTS:
+                reordered = reorder_earlier_tensor(vtk_to_numpy(array))
+                data.AddArray(_vtk_array(reordered, array.GetName()))  # replaces the array of that name
+                changed = True
+    return changed
+
+
+def update_tensor_order(path: Path) -> None:
+    """Rewrite a VTU file of an earlier version with tensors in the order of `TENSOR_COMPONENTS`. Raises OSError."""
+    with path.open("rb") as file:
+        if f'ComponentName1="{EARLIER_TENSOR_COMPONENTS[1]}"'.encode() not in file.read(_VTU_HEAD_BYTES):
+            return
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
+
+    reader = vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    if reorder_tensors(reader.GetOutput()):
+        with replacing(path) as temporary:
+            write_vtu(temporary, reader.GetOutput())

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .colour_maps import colours
+from .colour_maps import map_colours
 
 Pixels = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -25,7 +25,7 @@ PREFIXES = {1e3: "km", 1.0: "m", 1e-2: "cm", 1e-3: "mm", 1e-6: "µm"}
 
 
 @dataclass(frozen=True)
-class Legend:
+class ColourLegend:
     """The colours of a field.
 
     Attributes:
@@ -36,13 +36,13 @@ class Legend:
     limits: tuple[float, float]
 
 
-def lettered(
+def annotate(
     pixels: Pixels,
     *,
     title: str = "",
     time: str = "",
     pixel: float = 0.0,
-    legend: Legend | None = None,
+    legend: ColourLegend | None = None,
     keys: Sequence[tuple[str, str]] = (),
 ) -> Pixels:
     """With what is to be read; `pixel`: m that one is wide (0: no scale bar); `keys`: (colour, what has it)."""
@@ -60,10 +60,10 @@ def lettered(
     elif keys:
         _keys(pen, keys, image.width - edge, bottom)
     if pixel > 0:
-        length = nice(0.16 * image.width * pixel)
+        length = round_length(0.16 * image.width * pixel)
         x, y = edge, bottom
         pen.bar((x, y - max(2, unit // 6), x + round(length / pixel), y))
-        pen.write((x, y - 1.7 * unit), in_words(length))
+        pen.write((x, y - 1.7 * unit), format_length(length))
     return np.asarray(image)
 
 
@@ -102,24 +102,24 @@ def _on(ground: float) -> tuple[Colour, Colour]:
     return (INK, LIGHT) if ground >= EVEN else (LIGHT, INK)
 
 
-def nice(length: float) -> float:
+def round_length(length: float) -> float:
     """The greatest of 1, 2, 5 times a power of ten that is no longer."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(each * power for each in (1, 2, 5) if each * power <= length * (1 + 1e-9))
 
 
-def in_words(length: float) -> str:
+def format_length(length: float) -> str:
     """0.05 -> 5 cm."""
     unit = next((each for each in PREFIXES if length >= each * (1 - 1e-9)), 1e-6)
     return f"{length / unit:.4g} {PREFIXES[unit]}"
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """As short as it may be."""
     return f"{value:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e").replace("-", "\u2212")
 
 
-def in_seconds(t: float) -> str:
+def format_time(t: float) -> str:
     """1.2e-4 -> t = 120 µs."""
     for unit, name in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
         if abs(t) >= unit * (1 - 1e-9) or name == "µs":
@@ -127,7 +127,7 @@ def in_seconds(t: float) -> str:
     return f"t = {t / unit:.4g} {name}" if t else "t = 0 s"
 
 
-def _bar(pen: _Pen, legend: Legend) -> None:
+def _bar(pen: _Pen, legend: ColourLegend) -> None:
     """At the lower edge, in the middle."""
     from PIL import Image
 
@@ -135,14 +135,14 @@ def _bar(pen: _Pen, legend: Legend) -> None:
     width, height = round(0.4 * image.width), unit
     x, y = (image.width - width) // 2, round(image.height - 2.9 * unit)
     low, high = legend.limits
-    row = colours(np.linspace(low, high, width), (low, high), "#000000")
+    row = map_colours(np.linspace(low, high, width), (low, high), "#000000")
     image.paste(Image.fromarray(np.tile(row, (height, 1, 1))), (x, y))
     draw.rectangle((x - 1, y - 1, x + width, y + height), outline=PALE)
     pen.write((x + width / 2, y - 0.4 * unit), legend.title, anchor="mb")
     for share in np.linspace(0, 1, TICKS):
         at = x + share * (width - 1)
         draw.line((at, y + height, at, y + height + unit / 4), INK)
-        pen.write((at, y + height + 0.4 * unit), number(low + share * (high - low)), anchor="mt")
+        pen.write((at, y + height + 0.4 * unit), format_number(low + share * (high - low)), anchor="mt")
 
 
 def _keys(pen: _Pen, keys: Sequence[tuple[str, str]], right: float, bottom: float) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .frame_geometry import moved, without_dust
-from .frames import Shot, load, planes_of, study_of
+from .frame_geometry import displace, without_single_nodes
+from .frames import FrameSource, load_grid, plane_normals, read_study
 from .obstacle_meshes import corners_near
-from .picture_options import Look
+from .picture_options import PictureOptions
 
 Values = npt.NDArray[np.float64]
 WORTH = 0.005  # of the points: the least piece that the camera looks for
@@ -22,43 +22,45 @@ FILLED, LETTERED = (0.96, 0.96, 0.94, 0.94), (0.96, 0.96, 0.82, 0.78)
 
 
 @dataclass(frozen=True)
-class Scope:
+class ViewBounds:
     """What is to be seen of some frames.
 
     Attributes:
         bounds: (6,) of its box, m.
-        sides: (4,) how far it reaches to the right, left, top and bottom of the camera's axis, m, see `_sides`.
+        extents: (4,) how far it reaches to the right, left, top and bottom of the camera's axis, m, see `_sides`.
     """
 
     bounds: Values
-    sides: Values
+    extents: Values
 
     @property
-    def flat(self) -> bool:
+    def is_flat(self) -> bool:
         """A body in 2D."""
         return bool(self.bounds[4] == self.bounds[5])
 
 
-def scope_of(shot: Shot, look: Look) -> Scope:
+def view_bounds(shot: FrameSource, look: PictureOptions) -> ViewBounds:
     """Of the large pieces of a frame, and of obstacles near them; in 3D not of planes, which have no end."""
-    points = worth_seeing(drawn_of(shot, look))
-    near = corners_near(points, shot.beside)
+    points = large_fragment_points(prepare_grid(shot, look))
+    near = corners_near(points, shot.obstacle_files)
     flat = bool(np.ptp(points[:, 2]) == 0)
-    planes = planes_of(study_of(shot.folder)) if near and not flat else {}
-    bodies = [near[file] for file, name in zip(shot.beside, shot.names, strict=True) if name not in planes]
+    planes = plane_normals(read_study(shot.folder)) if near and not flat else {}
+    bodies = [
+        near[file] for file, name in zip(shot.obstacle_files, shot.obstacle_names, strict=True) if name not in planes
+    ]
     everything = np.concatenate([points, *near.values()])
     bounds = np.stack([everything.min(axis=0), everything.max(axis=0)], axis=1).reshape(-1)
-    return Scope(bounds, _sides(np.concatenate([points, *bodies]), look, flat))
+    return ViewBounds(bounds, _sides(np.concatenate([points, *bodies]), look, flat))
 
 
-def union(scopes: Sequence[Scope]) -> Scope:
+def merge_bounds(scopes: Sequence[ViewBounds]) -> ViewBounds:
     """All of them."""
     every = np.stack([scope.bounds for scope in scopes])
     bounds = np.where(np.arange(6) % 2 == 0, every.min(axis=0), every.max(axis=0))
-    return Scope(bounds, np.max([scope.sides for scope in scopes], axis=0))
+    return ViewBounds(bounds, np.max([scope.extents for scope in scopes], axis=0))
 
 
-def worth_seeing(grid: Any) -> Values:
+def large_fragment_points(grid: Any) -> Values:
     """(n, 3) points of the large pieces: those with half a hundredth or more of all points."""
     points = np.asarray(grid.points, float)
     if "piece" in grid.point_data:
@@ -67,13 +69,13 @@ def worth_seeing(grid: Any) -> Values:
     return points
 
 
-def drawn_of(shot: Shot, look: Look) -> Any:
+def prepare_grid(shot: FrameSource, look: PictureOptions) -> Any:
     """The grid of a frame as a look has it."""
-    grid = load(shot)
-    return moved(grid if look.dust else without_dust(grid), look.explode, look.magnify)
+    grid = load_grid(shot)
+    return displace(grid if look.dust else without_single_nodes(grid), look.explode, look.magnify)
 
 
-def aim(plotter: Any, scope: Scope, look: Look) -> None:
+def aim_camera(plotter: Any, scope: ViewBounds, look: PictureOptions) -> None:
     """From where all of a scope is seen, as large as it may be.
 
     A point x, y to the right and upwards, z towards the camera is in a picture of spreads t (half its sides at a
@@ -81,46 +83,46 @@ def aim(plotter: Any, scope: Scope, look: Look) -> None:
     max(x + t_x z) and max(-x + t_x z) over all points say the least D, and then the middle of the places x_c.
     Parallel rays: D is half of what is seen upwards, without z.
     """
-    axes, spreads = _axes(look, scope.flat), _spreads(look, scope.flat)
-    far = float((scope.sides.reshape(2, 2).sum(axis=1) / spreads.reshape(2, 2).sum(axis=1)).max())
-    room = spreads * far - scope.sides
+    axes, spreads = _axes(look, scope.is_flat), _spreads(look, scope.is_flat)
+    far = float((scope.extents.reshape(2, 2).sum(axis=1) / spreads.reshape(2, 2).sum(axis=1)).max())
+    room = spreads * far - scope.extents
     across = (room[1::2] - room[::2]) / 2
     depth = float(axes[2] @ scope.bounds.reshape(3, 2).mean(axis=1))
     focus = across @ axes[:2] + depth * axes[2]
     camera = plotter.camera
     camera.focal_point, camera.up = focus, axes[1]
-    camera.position = focus + (far if scope.flat else far - depth) * axes[2]
+    camera.position = focus + (far if scope.is_flat else far - depth) * axes[2]
     camera.view_angle = np.degrees(ANGLE)
-    camera.parallel_projection = scope.flat
+    camera.parallel_projection = scope.is_flat
     camera.parallel_scale = far
     camera.zoom(look.zoom)
     plotter.reset_camera_clipping_range()
 
 
-def _sides(points: Values, look: Look, flat: bool) -> Values:
+def _sides(points: Values, look: PictureOptions, flat: bool) -> Values:
     """(4,) max of x + t z, -x + t z, y + t z, -y + t z, each with its own spread t, m."""
     x, y, z = _axes(look, flat) @ points.T
     lean = np.zeros(4) if flat else _spreads(look, flat)
     return np.array([(each + t * z).max() for each, t in zip((x, -x, y, -y), lean, strict=True)])
 
 
-def _axes(look: Look, flat: bool) -> Values:
+def _axes(look: PictureOptions, flat: bool) -> Values:
     """(3, 3) to the right, upwards and towards the camera."""
-    back = np.array([0.0, 0, 1]) if flat else np.asarray(look.direction(), float)
+    back = np.array([0.0, 0, 1]) if flat else np.asarray(look.view_direction(), float)
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 1, 0] if flat or abs(back[2]) == 1 else [0.0, 0, 1], back)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(back, right), back])
 
 
-def _spreads(look: Look, flat: bool) -> Values:
+def _spreads(look: PictureOptions, flat: bool) -> Values:
     """(4,) to the right, left, top and bottom: half of a picture's side that may be filled, at a distance of 1."""
     shares = np.array(FILLED if look.bare else LETTERED)
     shares[:2] *= look.size[0] / look.size[1]
     return shares * (1.0 if flat else np.tan(ANGLE / 2))
 
 
-def pixel(plotter: Any, height: int) -> float:
+def pixel_width(plotter: Any, height: int) -> float:
     """m that a pixel is wide in the middle of the body, in a picture of `height` pixels."""
     camera = plotter.camera
     if camera.parallel_projection:

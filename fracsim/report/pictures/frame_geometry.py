@@ -15,36 +15,36 @@ SHARP = 35.0  # degrees between facets that light does not run over
 
 
 @dataclass(frozen=True)
-class Body:
+class FrameParts:
     """Parts of a frame.
 
     Attributes:
-        skin, inside: surfaces of what was the boundary, and of cracks; None where there is none of it.
+        boundary, crack: surfaces of what was the boundary, and of cracks; None where there is none of it.
         outline: lines around a body in 2D, None in 3D or of a mesh.
     """
 
-    skin: Any
-    inside: Any
+    boundary: Any
+    crack: Any
     outline: Any
 
     @property
     def surfaces(self) -> list[Any]:
         """The parts that are there."""
-        return [each for each in (self.skin, self.inside) if each is not None]
+        return [each for each in (self.boundary, self.crack) if each is not None]
 
 
-def body_of(grid: Any) -> Body:
+def frame_parts(grid: Any) -> FrameParts:
     """The surface as it is; of a mesh, the surface of the cells that hold together, which opens the crack."""
     if "origin" not in grid.cell_data:
         if "damage" in grid.cell_data:
             kept = np.flatnonzero(grid.cell_data["damage"] < 0.5)
             grid = grid.extract_cells(kept) if len(kept) else grid
-        return Body(grid.extract_surface(), None, None)
+        return FrameParts(grid.extract_surface(), None, None)
     line = np.asarray(grid.celltypes) == LINE
     crack = is_crack(grid)
     if line.any():
-        return Body(_part(grid, ~line), None, grid.extract_cells(np.flatnonzero(line)))
-    return Body(_part(grid, ~crack), _part(grid, crack), None)
+        return FrameParts(_part(grid, ~line), None, grid.extract_cells(np.flatnonzero(line)))
+    return FrameParts(_part(grid, ~crack), _part(grid, crack), None)
 
 
 def is_crack(grid: Any) -> Flags:
@@ -70,7 +70,7 @@ def _part(grid: Any, which: Flags) -> Any:
     return made
 
 
-def shaded(surface: Any) -> Any:
+def with_normals(surface: Any) -> Any:
     """With a normal at each point, and edges sharper than SHARP kept."""
     made = surface.compute_normals(
         cell_normals=False,
@@ -82,7 +82,7 @@ def shaded(surface: Any) -> Any:
     return made if made.n_points else surface
 
 
-def without_dust(grid: Any) -> Any:
+def without_single_nodes(grid: Any) -> Any:
     """The elements of pieces that have more than a node."""
     if "dust" not in grid.cell_data or not np.any(grid.cell_data["dust"]):
         return grid
@@ -91,7 +91,7 @@ def without_dust(grid: Any) -> Any:
     return made
 
 
-def moved(grid: Any, explode: float, magnify: float) -> Any:
+def displace(grid: Any, explode: float, magnify: float) -> Any:
     """The grid with displacements `magnify` times as large and pieces apart by the share `explode`; "rest" of its
     points is where they were before all, m."""
     if "displacement" in grid.point_data:
@@ -99,11 +99,11 @@ def moved(grid: Any, explode: float, magnify: float) -> Any:
     if magnify != 1.0 and "displacement" in grid.point_data:
         grid.points = np.asarray(grid.points, float) + (magnify - 1) * np.asarray(grid.point_data["displacement"])
     if explode and "piece" in grid.point_data:
-        grid.points = exploded(np.asarray(grid.points, float), grid.point_data["piece"], explode)
+        grid.points = explode_fragments(np.asarray(grid.points, float), grid.point_data["piece"], explode)
     return grid
 
 
-def exploded(points: Values, piece: npt.NDArray[np.integer], share: float) -> Values:
+def explode_fragments(points: Values, piece: npt.NDArray[np.integer], share: float) -> Values:
     """(n, 3) points with each piece moved away from the middle by `share` of its distance from it."""
     numbers, of_point = np.unique(piece, return_inverse=True)
     counts = np.bincount(of_point)[:, None]

@@ -15,9 +15,8 @@ import numpy.typing as npt
 
 from ...errors import InputError
 from ...meshes.plain_files import check_readable, data_elsewhere
-from ...output.fields_file import read_values
-from ...output.surface.collection import Entry, read_entries
-from ...output.surface.vtu import reorder_tensors
+from ...output.fields_file import read_field
+from ...output.surface.vtk_files import PvdEntry, read_pvd, reorder_tensors
 from .frame_geometry import is_crack
 
 KINDS = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # of cells, by their nodes
@@ -28,14 +27,14 @@ CLOSE = 1e-6  # of the time between two pictures: by so much they may be off
 
 
 @dataclass(frozen=True)
-class Shot:
+class FrameSource:
     """A frame to draw: where its data are."""
 
     t: float
     file: Path
     index: int  # of the frame in fields.h5, -1: a VTU of the surface
-    beside: tuple[Path, ...] = ()  # VTUs of the obstacles
-    names: tuple[str, ...] = ()  # of the obstacles
+    obstacle_files: tuple[Path, ...] = ()  # VTUs of the obstacles
+    obstacle_names: tuple[str, ...] = ()  # of the obstacles
 
     @property
     def folder(self) -> Path:
@@ -43,13 +42,13 @@ class Shot:
         return self.file.parent if self.index >= 0 else self.file.parent.parent
 
 
-def find_frames(folder: Path) -> list[Shot]:
+def find_frames(folder: Path) -> list[FrameSource]:
     """Frames of surface.pvd, or else of fields.h5. InputError where there are none."""
     pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
     check_readable(pvd)
     check_readable(h5)
     if pvd.exists():
-        shots = _of_surface(folder, read_entries(pvd))
+        shots = _of_surface(folder, read_pvd(pvd))
         if shots:
             return shots
     if not h5.exists():
@@ -60,7 +59,7 @@ def find_frames(folder: Path) -> list[Shot]:
         times = [float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])]
     if not times:
         raise InputError(f"{h5} has no frame yet")
-    return [Shot(t, h5, index) for index, t in enumerate(times)]
+    return [FrameSource(t, h5, index) for index, t in enumerate(times)]
 
 
 def film_interval(times: Sequence[float]) -> float:
@@ -71,7 +70,7 @@ def film_interval(times: Sequence[float]) -> float:
     return max(float(np.median(np.diff(times))), (times[-1] - times[0]) / (LONGER * len(times)))
 
 
-def times_shown(times: Sequence[float]) -> npt.NDArray[np.int64]:
+def film_repetitions(times: Sequence[float]) -> npt.NDArray[np.int64]:
     """(frames,) how many pictures of a film show each frame: pictures are evenly spaced in simulated time, and show the
     frame that is nearest."""
     at, interval = np.asarray(times, float), film_interval(times)
@@ -79,8 +78,8 @@ def times_shown(times: Sequence[float]) -> npt.NDArray[np.int64]:
     return np.bincount(np.searchsorted((at[1:] + at[:-1]) / 2, pictures - CLOSE * interval), minlength=len(at))
 
 
-def _of_surface(folder: Path, entries: list[Entry]) -> list[Shot]:
-    beside: dict[float, list[Entry]] = {}
+def _of_surface(folder: Path, entries: list[PvdEntry]) -> list[FrameSource]:
+    beside: dict[float, list[PvdEntry]] = {}
     for entry in entries:
         if entry.part:
             beside.setdefault(entry.t, []).append(entry)
@@ -89,15 +88,15 @@ def _of_surface(folder: Path, entries: list[Entry]) -> list[Shot]:
     for each in bodies:
         others = beside.get(each.t, [])
         files, names = tuple(folder / other.file for other in others), tuple(other.name for other in others)
-        shots.append(Shot(each.t, folder / each.file, -1, files, names))
+        shots.append(FrameSource(each.t, folder / each.file, -1, files, names))
     return shots
 
 
-def load(shot: Shot) -> Any:
+def load_grid(shot: FrameSource) -> Any:
     """The frame as a grid of displaced points with its fields."""
     import pyvista
 
-    for path in (shot.file, *shot.beside):
+    for path in (shot.file, *shot.obstacle_files):
         check_readable(path)
     if shot.index < 0:
         grid = pyvista.read(shot.file)
@@ -112,11 +111,11 @@ def load(shot: Shot) -> Any:
         kind = pyvista.CellType[KINDS[cells.shape[1]]]
         grid = pyvista.UnstructuredGrid({kind: cells}, file["points"][()] + frame["displacement"][()])
         for name, data in frame.items():
-            (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = read_values(data)
+            (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = read_field(data)
     return grid
 
 
-def study_of(folder: Path) -> dict[str, Any]:
+def read_study(folder: Path) -> dict[str, Any]:
     """What study.toml says, as it stands there; nothing where there is none."""
     try:
         check_readable(folder / "study.toml")
@@ -125,7 +124,7 @@ def study_of(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def planes_of(study: dict[str, Any]) -> dict[str, Any]:
+def plane_normals(study: dict[str, Any]) -> dict[str, Any]:
     """Names of obstacles that are planes -> their normals."""
     found = [each for each in study.get("obstacle", []) if each.get("shape") == "plane"]
     return {each["name"]: np.array(each["normal"], float) for each in found if "normal" in each and "name" in each}

@@ -20,11 +20,11 @@ import numpy.typing as npt
 
 from ...errors import InputError
 from ...meshes.plain_files import check_replaceable, replacing_all
-from .camera import scope_of, union
-from .colour_maps import merged
-from .frames import Shot, find_frames, study_of, times_shown
-from .picture_options import Look
-from .renderer import Stage, range_of
+from .camera import merge_bounds, view_bounds
+from .colour_maps import merge_ranges
+from .frames import FrameSource, film_repetitions, find_frames, read_study
+from .picture_options import PictureOptions
+from .renderer import Renderer, field_range
 
 Pixels = npt.NDArray[np.uint8]
 FILMS = (".gif", ".mp4")
@@ -34,7 +34,7 @@ GAP = 8  # pixels between pictures of a sheet
 
 
 @contextmanager
-def display() -> Iterator[None]:
+def virtual_display() -> Iterator[None]:
     """The screen there is, or a virtual one that ends with the picture."""
     xvfb = shutil.which("Xvfb")
     if os.environ.get("DISPLAY") or xvfb is None:
@@ -59,7 +59,7 @@ def display() -> Iterator[None]:
 def render(
     folder: Path | Sequence[Path],
     target: Path | None = None,
-    look: Look | None = None,
+    look: PictureOptions | None = None,
     *,
     frame: int = -1,
     sheet: str = "",
@@ -71,38 +71,38 @@ def render(
     Several folders: that frame of each, side by side.    `sheet`: so many frames of one folder, or which: "0,18,-1".
     """
     folders = [folder] if isinstance(folder, Path) else list(folder)
-    target, look = target or folders[0] / "last.png", look or Look()
-    look.direction()
+    target, look = target or folders[0] / "last.png", look or PictureOptions()
+    look.view_direction()
     if target.suffix not in ("", ".png", *FILMS):
         raise InputError(f"-o {target}: pictures are .png, films .gif or .mp4, and a name without a suffix is a folder")
     if target.suffix:
         check_replaceable(target)  # before anything is drawn
     every = [find_frames(each) for each in folders]
     if target.suffix == ".png":
-        shots = chosen_of(every, folders, frame, sheet)
+        shots = select_frames(every, folders, frame, sheet)
     elif sheet or len(folders) > 1:
         raise InputError(f"-o {target}: a sheet, or pictures of several runs, is a .png")
     else:
         shots = every[0]
     film = target.suffix in FILMS
-    counts = times_shown([shot.t for shot in shots]) if film else np.ones(len(shots), int)
+    counts = film_repetitions([shot.t for shot in shots]) if film else np.ones(len(shots), int)
     shots, counts = [shot for shot, count in zip(shots, counts, strict=True) if count], counts[counts > 0]
     single = target.suffix == ".png"
     if len(shots) > 1:
         look = replace(look, fine=look.fine and single)
     if single and len(shots) > 1:
         look = replace(look, size=(round(TILE * look.size[0]), round(TILE * look.size[1])))
-    with display():
+    with virtual_display():
         pictures = _shoot(shots, look, titled=len(folders) > 1)
         target.parent.mkdir(parents=True, exist_ok=True)
         if single:
-            _save(target, tiled(list(pictures)))
+            _save(target, tile_pictures(list(pictures)))
         else:
             _film(target, (each for each, n in zip(pictures, counts, strict=True) for _ in range(n)), fps)
     return target
 
 
-def chosen_of(every: list[list[Shot]], folders: list[Path], frame: int, sheet: str) -> list[Shot]:
+def select_frames(every: list[list[FrameSource]], folders: list[Path], frame: int, sheet: str) -> list[FrameSource]:
     """The frames of a picture: one a folder, or those of a sheet."""
     for frames, folder in zip(every, folders, strict=True):
         if not -len(frames) <= frame < len(frames):
@@ -126,18 +126,18 @@ def chosen_of(every: list[list[Shot]], folders: list[Path], frame: int, sheet: s
     return [frames[each] for each in which]
 
 
-def _shoot(shots: Sequence[Shot], look: Look, *, titled: bool) -> Iterator[Pixels]:
+def _shoot(shots: Sequence[FrameSource], look: PictureOptions, *, titled: bool) -> Iterator[Pixels]:
     """All from one place, in one range of colours. `titled`: each by the name of its run."""
-    scope = union([scope_of(shot, look) for shot in shots])
-    limits = look.limits or merged([range_of(shot, look.colour) for shot in shots])
-    if look.floor and scope.flat:
+    scope = merge_bounds([view_bounds(shot, look) for shot in shots])
+    limits = look.limits or merge_ranges([field_range(shot, look.colour) for shot in shots])
+    if look.floor and scope.is_flat:
         raise InputError("--floor: a body in 2D has none")
-    with Stage(look, scope, limits, study_of(shots[0].folder)) as stage:
+    with Renderer(look, scope, limits, read_study(shots[0].folder)) as stage:
         for shot in shots:
-            yield stage.shoot(shot, shot.folder.name if titled else None)
+            yield stage.render_frame(shot, shot.folder.name if titled else None)
 
 
-def tiled(pictures: Sequence[Pixels]) -> Pixels:
+def tile_pictures(pictures: Sequence[Pixels]) -> Pixels:
     """Up to three in a row, more of them in rows as long as there are."""
     columns = len(pictures) if len(pictures) <= 3 else math.ceil(math.sqrt(len(pictures)))
     height, width, _ = pictures[0].shape

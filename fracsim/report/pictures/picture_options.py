@@ -20,7 +20,7 @@ LARGEST = 8192  # pixels a side: what drivers give
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureOptions:
     """How to draw.
 
     Attributes:
@@ -28,7 +28,7 @@ class Look:
         explode: how far pieces are moved apart, as a share of their distance from the middle.
         view: a name of VIEWS, or a direction to look from.
         zoom: above 1 is nearer.
-        skin: "" (as the study says), a name of SKINS, or two colours "#rrggbb,#rrggbb".
+        material: "" (as the study says), a name of MATERIAL_LOOKS, or two colours "#rrggbb,#rrggbb".
         size: of the picture, pixels.
         limits: least and greatest of the colours; None: of what is shown.
         magnify: displacements are drawn so many times as large.
@@ -43,7 +43,7 @@ class Look:
     explode: float = 0.0
     view: str = "iso"
     zoom: float = 1.0
-    skin: str = ""
+    material: str = ""
     size: tuple[int, int] = SIZE
     limits: tuple[float, float] | None = None
     magnify: float = 1.0
@@ -53,7 +53,7 @@ class Look:
     dust: bool = True
     fine: bool = True
 
-    def direction(self) -> tuple[float, ...]:
+    def view_direction(self) -> tuple[float, ...]:
         """Where the camera stands, seen from the body."""
         if self.view in VIEWS:
             return VIEWS[self.view]
@@ -67,7 +67,7 @@ class Look:
         return x, y, z
 
 
-def size_of(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """1400x900 -> (1400, 900)."""
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and all(16 <= int(n) <= LARGEST for n in (width, height))):
@@ -75,7 +75,7 @@ def size_of(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def limits_of(text: str) -> tuple[float, float]:
+def parse_limits(text: str) -> tuple[float, float]:
     """0,2e5 -> (0.0, 2e5)."""
     try:
         low, high = (float(part) for part in text.split(","))

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, Section, Table, again
+from ..section import Claim, ReportTable, Section, again
 from ..trial import Trial
 from .akantu import ABSENT, Akantu, interpreter, problem_of
 
@@ -127,7 +127,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     )
     columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
     rows = tuple(row for figures in done for row in _rows(figures))
-    return [Section(TITLE, text, _claims(done), (Table("peers-linear-step", TITLE, columns, rows),))]
+    return [Section(TITLE, text, _claims(done), (ReportTable("peers-linear-step", TITLE, columns, rows),))]
 
 
 def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:

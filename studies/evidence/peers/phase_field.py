@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..section import Cell, Section, Table
+from ..section import ReportTable, Section, TableCell
 from ..trial import Trial
 from .interpreters import able
 
@@ -123,7 +123,7 @@ def _ours(n: int, pull: Pull) -> dict[str, float]:
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(build_scene(MPI.COMM_WORLD, validate(study(n, pull), "notched plate")), Path(folder, "ours"))
-        column, began = run.scene.probes.names.index(f"reaction_grip_{'xy'[pull.axis]}"), time.process_time()
+        column, began = run.scene.probes.columns.index(f"reaction_grip_{'xy'[pull.axis]}"), time.process_time()
         load, solves = [], 0
         for _ in range(pull.steps):
             solves += run.step().solve.newton_iterations
@@ -208,10 +208,10 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     if not done:
         return [Section(TITLE, found[0]["message"] if found else ABSENT)]
     rows = tuple(row for figures in done for row in _rows(figures))
-    return [Section(TITLE, TEXT, tables=(Table("peers-notched-plate", TITLE, COLUMNS, rows),))]
+    return [Section(TITLE, TEXT, tables=(ReportTable("peers-notched-plate", TITLE, COLUMNS, rows),))]
 
 
-def _rows(figures: dict[str, Any]) -> list[tuple[Cell, ...]]:
+def _rows(figures: dict[str, Any]) -> list[tuple[TableCell, ...]]:
     programs = {"PhaseFieldX": figures["theirs"], "fracsim": figures["ours"]}
     return [
         (figures["pull"], figures["cells"], name, *(each[key] for key in ("peak", "at", "turn", "seconds", "solves")))

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, Section, Table, again
+from ..section import Claim, ReportTable, Section, again
 from ..trial import Trial
 from .akantu import ABSENT, WORKER, interpreter, problem_of
 from .linear_step import STEP, study
@@ -118,7 +118,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     worst = max(figures[way] for way in WAYS)
     shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())
     claim = Claim(f"A small job takes at most {LIMIT:g} s of processor time", shown, worst <= LIMIT)
-    table = Table("peers-start-up", "Start-up", ("job", "processor seconds"), tuple(figures.items()))
+    table = ReportTable("peers-start-up", "Start-up", ("job", "processor seconds"), tuple(figures.items()))
     return [Section("Start-up", text, (claim,), (table,))]
 
 

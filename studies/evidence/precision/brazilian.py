@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ....output.fields_file import TENSOR
+from ....output.fields_file import TENSOR_COMPONENTS
 from ..references import brazilian_peak, disk_stress, hondros
 from ..results import Values, history, last_frame
 from ..trial import Trial
@@ -111,7 +111,7 @@ def centre(frame: dict[str, Any]) -> dict[str, float]:
     """The same of a frame: points, cells, displacement, and the stress of linear cells."""
     corners = frame["points"][frame["cells"]][:, :3, :2]  # of 3 or 6 nodes
     if frame["cells"].shape[1] == 3:
-        stress = frame["stress"][:, None, [TENSOR.index(name) for name in ("xx", "yy", "xy")]]
+        stress = frame["stress"][:, None, [TENSOR_COMPONENTS.index(name) for name in ("xx", "yy", "xy")]]
     else:
         stress = plane_stress(frame, GRANITE["young"], GRANITE["poisson"], MIDDLES)  # type: ignore[arg-type]
     fourth, half = (_within(corners, stress, RADIUS * share) for share in (1 / 4, 1 / 2))

@@ -7,7 +7,19 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from ..section import Cell, Claim, Plot, Point, Section, Series, Table, again, fitted_order, pareto_front, recommended
+from ..section import (
+    Claim,
+    Plot,
+    Point,
+    ReportTable,
+    Section,
+    Series,
+    TableCell,
+    again,
+    fitted_order,
+    pareto_front,
+    recommended,
+)
 from ..trial import Setting
 
 Records = list[dict[str, Any]]
@@ -280,16 +292,16 @@ def _default_claim(case: Case, advice: Advice) -> Claim:
 # --- table and plots ---
 
 
-def _table(case: Case, rows: list[Row], marked: list[int]) -> Table:
+def _table(case: Case, rows: list[Row], marked: list[int]) -> ReportTable:
     front = _front(case, rows)
     columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors),
                "wall s", "core-seconds", "front", "outcome")  # fmt: skip
     caption = f"{case.title}: relative errors and times. Marked: recommended for 5 % and 1 %; *: on the front."
     cells = tuple(_cells(case, row, number in front) for number, row in enumerate(rows))
-    return Table(f"precision-{case.name}", caption, columns, cells, marked=tuple(marked))
+    return ReportTable(f"precision-{case.name}", caption, columns, cells, marked=tuple(marked))
 
 
-def _cells(case: Case, row: Row, best: bool) -> tuple[Cell, ...]:
+def _cells(case: Case, row: Row, best: bool) -> tuple[TableCell, ...]:
     record = row.record
     settings = (record["settings"].get(key) for key in case.columns)
     errors = (row.errors.get(name) for name in case.errors)
@@ -297,9 +309,9 @@ def _cells(case: Case, row: Row, best: bool) -> tuple[Cell, ...]:
             record["outcome"])  # fmt: skip
 
 
-def _outcomes(case: Case, records: Records) -> Table:
+def _outcomes(case: Case, records: Records) -> ReportTable:
     rows = tuple((record["name"], record["outcome"], record["message"]) for record in records)
-    return Table(f"precision-{case.name}", case.title, ("trial", "outcome", "message"), rows)
+    return ReportTable(f"precision-{case.name}", case.title, ("trial", "outcome", "message"), rows)
 
 
 def _front(case: Case, rows: list[Row]) -> set[int]:

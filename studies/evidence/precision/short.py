@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..peers.akantu import ABSENT, interpreter
-from ..section import Cell, Plot, Section, Series, Table, pareto_front
+from ..section import Plot, ReportTable, Section, Series, TableCell, pareto_front
 from .page import LIMITS, Case, Records, Row, cheapest, counts, rows_of, setting
 
 FINEST = 1e-4  # of errors that are told apart in the plot
@@ -20,7 +20,7 @@ def summary(cases: list[Case], records: Records) -> list[Section]:
     peers = sorted({peer for _, rows in found for row in rows if (peer := peer_of(row.record))})
     seconds = [f"{peer}: s for {limit:.0%}" for peer in peers for limit in LIMITS]
     own = [words for limit in LIMITS for words in (f"cheapest setting for {limit:.0%}", f"s for {limit:.0%}")]
-    table = Table(
+    table = ReportTable(
         "precision-short", "Core-seconds in the steps that an error takes. Empty: no setting that ran is that good.",
         ("case", "error of", *own, *seconds), tuple(_line(case, rows, peers) for case, rows in found),
     )  # fmt: skip
@@ -42,9 +42,9 @@ def peer_of(record: dict[str, Any]) -> str | None:
     return None if elements is None else PEERS.get(str(elements), str(elements))
 
 
-def _line(case: Case, rows: list[Row], peers: list[str]) -> tuple[Cell, ...]:
+def _line(case: Case, rows: list[Row], peers: list[str]) -> tuple[TableCell, ...]:
     ours = [row for row in rows if counts(case, row)]
-    cells: list[Cell] = [case.title, case.errors[0]]
+    cells: list[TableCell] = [case.title, case.errors[0]]
     for limit in LIMITS:
         row = cheapest(case, ours, limit)
         cells += [None, None] if row is None else [_name(row), row.core_seconds]

@@ -1,0 +1,305 @@
+"""Monitors of a run: energy gain, inverted cells, interpenetrating fragments, and the drop of a load.
+
+Each monitor records steps or frames, continues after a restart, and writes its part of summary.json. At the end it
+gives a sentence if the result is doubtful.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..mechanics.stress import Stress
+from ..mesh.parallel import sum_over_ranks
+from ..meshes.text import format_point
+from ..timestepping.state import State
+from ..timestepping.stepper import StepReport
+
+if TYPE_CHECKING:
+    from ..fracture.fracture_pass import Breaking
+    from .surface.body_surface import BodySurface
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CheckTolerances:
+    """Thresholds of the monitors.
+
+    Attributes:
+        negligible_strain: energies below Y V strain^2 are round-off, as in a body at rest.
+        relative_energy_gain: share of the largest energy or work that a run may gain. Time steps that are long compared
+            with elastic waves gain a little.
+        single_step_share: a single step is named if it gained at least this share of the total gain.
+        min_jacobian: a cell with det F below this counts as inverted.
+    """
+
+    negligible_strain: float = 3e-8
+    relative_energy_gain: float = 0.05
+    single_step_share: float = 0.5
+    min_jacobian: float = 1e-6
+
+
+CHECK_TOLERANCES = CheckTolerances()
+
+# Schemes proposed instead of each scheme. Newmark's conserves the energy of linear bodies only, if steps are long.
+_ALTERNATIVE_SCHEMES = {
+    "backward-euler": "",
+    "quasi-static": "",
+    "newmark": 'time.scheme = "generalized-alpha" or "backward-euler", or ',
+}
+
+
+class EnergyGainMonitor:
+    """Largest rise of the energy balance elastic + kinetic + dissipated - work above its least earlier value.
+
+    A scheme may lose energy. A gain drives motion that no load causes. Projected strains at large strains gain energy,
+    and so do second-order schemes if the tangent is not positive, or if many edges break at once.
+
+    Attributes:
+        rise: largest gain, J.
+        scale: largest energy or absolute work so far, J.
+        floor: gains below this are not reported, J.
+        All three are per metre of thickness in 2D.
+    """
+
+    def __init__(self, *, at_rest: bool, floor: float = 0.0, thickness: float = 1.0) -> None:
+        """Start without any step.
+
+        Args:
+            at_rest: the body starts without energy; otherwise the end of the first step is the reference.
+            floor: gains below this are not reported, J.
+            thickness: thickness of a 2D body, m; 1 in 3D.
+        """
+        self._thickness = thickness
+        self._min_balance = 0.0 if at_rest else float("inf")
+        self.rise, self.scale, self.floor = 0.0, 0.0, floor
+        self._balance = self._min_balance
+        self._max_step_gain, self._max_gain_time = 0.0, 0.0
+
+    def record_step(self, report: StepReport, state: State) -> None:
+        """Record a finished step."""
+        energy = report.kinetic + report.elastic
+        balance = energy + state.dissipated - state.work
+        if balance - self._balance > self._max_step_gain:
+            self._max_step_gain, self._max_gain_time = balance - self._balance, state.t
+        self._balance, self._min_balance = balance, min(self._min_balance, balance)
+        self.rise = max(self.rise, balance - self._min_balance)
+        self.scale = max(self.scale, energy, abs(state.work))
+
+    def to_checkpoint(self) -> dict[str, float]:
+        """Values for `from_checkpoint`."""
+        return {
+            "energy_rise": self.rise, "energy_scale": self.scale, "energy_least": self._min_balance,
+            "energy_balance": self._balance, "energy_most": self._max_step_gain, "energy_time": self._max_gain_time,
+        }  # fmt: skip
+
+    def from_checkpoint(self, monitors: dict[str, float]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.rise, self.scale, self._min_balance = (monitors[f"energy_{name}"] for name in ("rise", "scale", "least"))
+        # checkpoints of earlier versions lack these three
+        self._balance = monitors.get("energy_balance", float("inf"))
+        self._max_step_gain = monitors.get("energy_most", 0.0)
+        self._max_gain_time = monitors.get("energy_time", 0.0)
+
+    def note(self, scheme: str) -> str:
+        """Sentence about a gain above the tolerance, otherwise empty; `scheme` is the key time.scheme."""
+        if self.rise <= max(CHECK_TOLERANCES.relative_energy_gain * self.scale, self.floor):
+            return ""
+        one_step = ""
+        if self._max_step_gain >= CHECK_TOLERANCES.single_step_share * self.rise:
+            share = min(self._max_step_gain / self.rise, 1.0)
+            one_step = f" ({share:.0%} of it in the step to t = {self._max_gain_time:g} s)"
+        alternative = _ALTERNATIVE_SCHEMES.get(scheme, 'time.scheme = "backward-euler", or ')
+        return (
+            f"the body gained {self.rise * self._thickness:.3g} J of energy from nowhere{one_step}, "
+            f"{self.rise / self.scale:.0%} of all that was at play: its motion is not to be trusted; "
+            f"try {alternative}a shorter time.step"
+        )
+
+
+def negligible_energy(stress: Stress) -> float:
+    """Energy Y V strain^2 of the body at the negligible strain, J, with Young's modulus Y and volume V (collective)."""
+    domain = stress.domain
+    stiffness = float(sum_over_ranks(domain.comm, np.sum(stress.material.young * domain.volumes))[0])
+    return stiffness * CHECK_TOLERANCES.negligible_strain**2
+
+
+class InvertedCellMonitor:
+    """Least Jacobian J = det F of the undamaged cells over the frames of a run.
+
+    No body turns inside out. Some energies (stvk, corotated) admit J <= 0, and a prescribed motion can force it. The
+    result then balances all forces but has no physical meaning. Cells with broken edges may invert, and the linear
+    energy does not depend on J: neither is checked.
+
+    Attributes:
+        min_jacobian: least J so far, 1 at rest.
+        inverted_count: largest number of inverted cells in a frame.
+        first_time: time of the first frame with an inverted cell, s.
+    """
+
+    def __init__(self, stress: Stress, fracture: Breaking | None = None) -> None:
+        """Start at rest; `fracture` has the damaged cells."""
+        self._stress, self._domain = stress, stress.domain
+        self._graph = fracture.graph if fracture is not None else None
+        self.min_jacobian, self.inverted_count, self.first_time = 1.0, 0, 0.0
+
+    def record_frame(self, t: float) -> None:
+        """Record the present deformation at time t in s (collective)."""
+        if self._stress.material.energy.linear:
+            return
+        domain = self._domain
+        cells = np.arange(domain.cell_count) if self._graph is None else np.flatnonzero(~self._graph.damaged)
+        reference = domain.nodes[domain.cell_nodes[cells]]
+        J = _edge_determinants(self._stress.cell_corners(cells)) / _edge_determinants(reference)
+        self.min_jacobian = min(self.min_jacobian, domain.comm.allreduce(float(J.min(initial=np.inf)), op=MPI.MIN))
+        inverted = int(sum_over_ranks(domain.comm, np.count_nonzero(CHECK_TOLERANCES.min_jacobian >= J))[0])
+        if inverted and not self.inverted_count:
+            self.first_time = t
+        self.inverted_count = max(self.inverted_count, inverted)
+
+    def to_checkpoint(self) -> dict[str, float]:
+        """Values for `from_checkpoint`."""
+        return {
+            "smallest_J": self.min_jacobian, "inverted_cells": self.inverted_count, "inverted_since": self.first_time,
+        }  # fmt: skip
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.min_jacobian, self.inverted_count = monitors["smallest_J"], monitors["inverted_cells"]
+        self.first_time = monitors["inverted_since"]
+
+    def note(self, energy: str) -> str:
+        """Sentence about inverted cells, empty if there were none; `energy` is the key material.energy."""
+        if not self.inverted_count:
+            return ""
+        remedy = "no body can follow that motion" if energy == "neo-hookean" else 'energy = "neo-hookean" resists that'
+        cells = "cell is" if self.inverted_count == 1 else "cells are"
+        return (
+            f"{self.inverted_count} unbroken {cells} crushed flat or turned inside out (first seen at "
+            f"t = {self.first_time:g} s, smallest J = {self.min_jacobian:.2g}): the result is not to be trusted from "
+            f"there on; {remedy}"
+        )
+
+
+def _edge_determinants(corners: Values) -> Values:
+    """Determinants (n,) of the edge vectors from the first of the corners (n, d + 1, d), m^d."""
+    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+
+
+class InterpenetrationMonitor:
+    """First frame in which fragments interpenetrate, in a study without contact between them (rank 0).
+
+    Later frames are not checked, nor is a body of one fragment.
+
+    Attributes:
+        first_overlap: time in s, place in m, and names of the two fragments; empty if there was no overlap.
+    """
+
+    def __init__(self) -> None:
+        self.first_overlap: dict[str, Any] = {}
+
+    def record_frame(self, t: float, surface: BodySurface, u: Values) -> None:
+        """Record a frame at time t in s (rank 0).
+
+        Args:
+            t: time, s.
+            surface: surface of the body, with its fragments.
+            u: nodal displacement (N, d), m.
+        """
+        fragment_of_node = surface.split.node_fragment
+        if self.first_overlap or surface.split.fragment_count == 1:
+            return
+        from ..mesh.interpenetration import find_interpenetration
+
+        x = surface.skeleton.points + u
+        cells = surface.skeleton.cells[surface.undamaged_cells]
+        first = find_interpenetration(x, cells, fragment_of_node)
+        if first is not None:
+            node, cell = first
+            pair = (node, cells[cell, 0])
+            names = sorted(int(surface.fragment_names[fragment_of_node[corner]]) for corner in pair)
+            self.first_overlap = {"time": t, "place": x[node].tolist(), "pieces": names}
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"passed_through": self.first_overlap}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.first_overlap = monitors.get("passed_through", {})
+
+    def summary(self) -> dict[str, Any]:
+        """Part of summary.json; empty if there was no overlap."""
+        return self.to_checkpoint() if self.first_overlap else {}
+
+    def notes(self, *, implicit: bool) -> list[str]:
+        """Sentence about an overlap, if there was one (rank 0); `implicit`: the time scheme is implicit."""
+        if not self.first_overlap:
+            return []
+        first, second = self.first_overlap["pieces"]
+        remedy = "a [contact] table" if implicit else "[contact] with an implicit scheme"
+        return [
+            f"pieces {first} and {second} pass through each other, first seen at t = {self.first_overlap['time']:g} s "
+            f"near {format_point(self.first_overlap['place'])}; {remedy} keeps them apart"
+        ]
+
+
+class LoadDropMonitor:
+    """Drop of the force on a probed group or an obstacle from its peak: the end of a test on a testing machine.
+
+    Attributes:
+        name: name of the probe or obstacle.
+        drop_fraction: relative drop from the peak that ends the run.
+        min_peak: lower peaks do not count, N.
+        peak: largest force so far, N.
+        peak_time: time of the peak, s.
+        last_load: force in the last step, N.
+        has_dropped: True if the force has dropped far enough.
+    """
+
+    def __init__(self, name: str, drop: float, above: float, *, breaks: bool) -> None:
+        """Start without any step.
+
+        Args:
+            name: name of the probe or obstacle.
+            drop: relative drop from the peak that ends the run.
+            above: lower peaks do not count, N.
+            breaks: the study has fracture; a drop before the first broken edge does not count.
+        """
+        self.name, self.drop_fraction, self.min_peak, self._breaks = name, drop, above, breaks
+        self.peak, self.last_load, self.peak_time, self.has_dropped = 0.0, 0.0, 0.0, False
+
+    def record_step(self, t: float, figures: dict[str, float], broken: int) -> None:
+        """Record a finished step.
+
+        Args:
+            t: time, s.
+            figures: columns of history.csv by name.
+            broken: number of broken edges so far.
+        """
+        prefixes = tuple(f"{kind}_{self.name}_" for kind in ("reaction", "contact"))
+        self.last_load = float(np.linalg.norm([value for name, value in figures.items() if name.startswith(prefixes)]))
+        if self.last_load > self.peak:
+            self.peak, self.peak_time = self.last_load, t
+        fallen = self.last_load <= (1 - self.drop_fraction) * self.peak and self.peak > self.min_peak
+        self.has_dropped = fallen and (broken > 0 or not self._breaks)
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"load_peak": [self.peak, self.peak_time], "load_fallen": self.has_dropped}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.peak, self.peak_time = monitors.get("load_peak", (0.0, 0.0))
+        self.has_dropped = monitors.get("load_fallen", False)
+
+    def summary(self) -> dict[str, Any]:
+        """Part of summary.json: peak of the load in N, its time in s, and whether the drop ended the run."""
+        return {
+            "load": {"of": self.name, "peak": self.peak, "peak_time": self.peak_time, "ended_the_run": self.has_dropped}
+        }
