@@ -125,10 +125,10 @@ def energies(scheme: str, energy: str, **more: Any) -> tuple[Values, list[bool]]
         v[:, 1] = -10.0 * (scene.domain.nodes[: len(v), 1] / 0.125 - 1)
         state.v = v.reshape(-1)
         state.settle()
-    start, found, touched = scene.balance.kinetic_energy(state.v), [], []
+    start, found, touched = scene.balance.energies.kinetic_energy(state.v), [], []
     for report in each_step(scene, state):
         found.append((report.kinetic + report.elastic) / start)
-        struck = scene.balance.contact_forces()
+        struck = scene.balance.contact.forces()
         touched.append(struck is not None and bool(np.abs(struck).max() > 0))
     return np.array([1.0, *found]), [False, *touched]
 

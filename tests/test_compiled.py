@@ -224,16 +224,16 @@ def test_arrays_are_checked(folder: Path, tmp_path: Path) -> None:
     values, weights = np.arange(4.0), np.full(4, 2.0)
     values.flags.writeable = False
     given = ctypes.byref(_Weights(c_library.struct_pointer(weights)))
-    assert function(given, c_int64(4), c_library.at(values), c_library.at(done)) == 12.0
+    assert function(given, c_int64(4), c_library.array_pointer(values), c_library.array_pointer(done)) == 12.0
     assert done[0]
-    assert function(given, 0, c_library.at(np.empty(0)), c_library.at(done)) == 0.0
+    assert function(given, 0, c_library.array_pointer(np.empty(0)), c_library.array_pointer(done)) == 0.0
     for wrong in (np.arange(8.0)[::2], np.zeros((4, 4)).T[1:], np.zeros(4, complex), np.arange(4.0).astype(">f8")):
-        for hand_over in (c_library.at, c_library.struct_pointer):
+        for hand_over in (c_library.array_pointer, c_library.struct_pointer):
             with pytest.raises(ValueError, match="cannot be handed to C"):
                 hand_over(wrong)
     for wrong in (np.arange(4), np.zeros(4, np.float32)):
         with pytest.raises(ctypes.ArgumentError, match="argument 3"):
-            function(given, c_int64(4), c_library.at(wrong), c_library.at(done))
+            function(given, c_int64(4), c_library.array_pointer(wrong), c_library.array_pointer(done))
         with pytest.raises(TypeError):
             _Weights(c_library.struct_pointer(wrong))
 
@@ -244,10 +244,10 @@ def test_prepared_arguments_are_checked_once(folder: Path, tmp_path: Path) -> No
     source.write_text(SUM)
     code, done, weights = c_library.load_library(source), np.zeros(1, bool), np.full(4, 2.0)
     given = ctypes.byref(_Weights(c_library.struct_pointer(weights))), c_int64(4)
-    prepared = c_library.unchecked_function(code, "sum", *given, c_library.at(weights))
-    assert prepared(*given, c_library.at(weights), c_library.at(done)) == 16.0
+    prepared = c_library.unchecked_function(code, "sum", *given, c_library.array_pointer(weights))
+    assert prepared(*given, c_library.array_pointer(weights), c_library.array_pointer(done)) == 16.0
     with pytest.raises(TypeError):
-        c_library.unchecked_function(code, "sum", *given, c_library.at(np.arange(4)))
+        c_library.unchecked_function(code, "sum", *given, c_library.array_pointer(np.arange(4)))
 
 
 def test_every_function_in_c_is_declared() -> None:

@@ -11,9 +11,9 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from cases import BAR, study
+from fracsim.mechanics.block_matrix import TieMatrix
 from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.mechanics.tangent import Tangent
-from fracsim.mechanics.tie_matrix import TieMatrix
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers import preconditioner
 from fracsim.solvers.multigrid import block_operator
@@ -194,7 +194,7 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
         random, tied = np.random.default_rng(1), np.array([17, 3, 5])
         ties = csr_matrix(random.normal(size=(3, 3)))
         free = random.uniform(size=(3, d)) > 0.3
-        products = scene.balance.tangent._assembly.blocks
+        products = scene.balance.tangent._assembler.blocks
         assert products is not None
         products.ties = [TieMatrix(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
     x, y = scene.balance.work_vector.duplicate(), scene.balance.work_vector.duplicate()

@@ -54,7 +54,7 @@ def damaged(case: str, dim: int, **tables: Any) -> tuple[Scene, State]:
 def forces(scene: Scene) -> list[Values]:
     """Residual, forces of the stress, damping and reactions, copies."""
     balance = scene.balance
-    drag = balance.damping_forces()
+    drag = balance.energies.damping_forces()
     parts = [balance.update_forces().copy(), balance.stress.assemble_forces(), *([] if drag is None else [drag])]
     balance.update_reactions()
     return [*parts, balance.reactions.copy()]

@@ -175,7 +175,7 @@ def test_dead_loads_are_the_integrals() -> None:
     }
     scene, state = make_scene(mesh=mesh, **tables)
     scene.balance.begin_step(0.1, 0.1, state.u, state.v, state.a)
-    X, force = positions(scene), scene.balance.applied_forces().reshape(-1, 2)
+    X, force = positions(scene), scene.balance.energies.applied_forces().reshape(-1, 2)
     weight = scene.balance.mass.lumped.reshape(-1, 2) * [0.5, -9.0]
     right = np.isclose(X[:, 0], 1.0)
     np.testing.assert_allclose(force[~right], weight[~right], atol=100 * EPS)
@@ -222,7 +222,7 @@ def test_tractions_on_two_groups() -> None:
         time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
     )
     march(scene, state)
-    assert scene.balance.applied_forces().sum() == pytest.approx(0, abs=10 * EPS * t)
+    assert scene.balance.energies.applied_forces().sum() == pytest.approx(0, abs=10 * EPS * t)
     expected = positions(scene) * [t / YOUNG, 0.0]
     np.testing.assert_allclose(state.u.reshape(-1, 2), expected, atol=1e-9 * t / YOUNG)
 

@@ -161,7 +161,7 @@ def test_a_collision_ends_as_with_exact_solves(
 
     u, its, tangents = thrown()
     assert tangents < 0.8 * its
-    monkeypatch.setattr(tangent_module, "MAX_MOVE_FOR_REUSE", -1.0)
+    monkeypatch.setattr(tangent_module, "REUSE", tangent_module.ReusePolicy(max_move=-1.0))
     exact, exact_its, exact_tangents = thrown(ksp_rtol=1e-10)
     assert exact_tangents == exact_its
     np.testing.assert_allclose(u, exact, atol=1e-7 * np.abs(exact).max())

@@ -242,7 +242,7 @@ def test_the_condensed_tangent_is_the_derivative_of_the_force(scheme: str, width
     sides = []
     for sign in (1, -1):
         balance.set_displacement(u + sign * h * change)
-        sides.append((balance.update_forces().copy(), balance.incremental_potential()[0]))
+        sides.append((balance.update_forces().copy(), balance.energies.incremental_potential()[0]))
     slope = (sides[0][0] - sides[1][0]) / (2 * h)
     np.testing.assert_allclose(found, slope, atol=1e-5 * np.abs(slope).max())
     assert np.abs(U @ (C @ (U.T @ change))).max() > 0.01 * np.abs(slope).max()

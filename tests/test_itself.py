@@ -182,9 +182,9 @@ def test_friction_between_bodies_is_in_the_books(tmp_path: Path) -> None:
         v[X[:, 0] < 1.01] = [1.0, 0.5]
         state.v = v.reshape(-1)
         state.settle()
-        start = scene.balance.kinetic_energy(state.v)
+        start = scene.balance.energies.kinetic_energy(state.v)
         march(scene, state)
-        end = scene.balance.kinetic_energy(state.v) + state.elastic
+        end = scene.balance.energies.kinetic_energy(state.v) + state.elastic
         lost.append(state.dissipated)
         assert end + state.dissipated < start * 1.001
     assert lost[0] == 0 and 0.004 * start < lost[1] < 0.5 * start

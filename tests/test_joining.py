@@ -315,7 +315,7 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert apart
     for corner in apart:
         assert once[2 * node, 2 * corner] == added.getValue(2 * node, 2 * corner) != 0.0
-    monkeypatch.setattr(type(balance.tangent), "_serves", lambda self, small: True)
+    monkeypatch.setattr(type(balance.tangent), "_is_reusable", lambda self, tolerance: True)
     balance.tangent.assemble()
     np.testing.assert_array_equal(K.convert("dense").getDenseArray(), once)
 

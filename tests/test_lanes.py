@@ -198,7 +198,7 @@ def test_what_lanes_cannot_do(line: str) -> None:
 def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Kernels of FFCx may be there from before: nobody else misses it. What nobody expects is not kept quiet."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
-    monkeypatch.setattr(compiling, "_told", [])
+    monkeypatch.setattr(compiling, "_unavailable", [])
     monkeypatch.setenv("CC", "no-such-compiler")
     assert compile_simd_form(balance._work) is compile_simd_form(balance.tangent.form) is None
     told = capsys.readouterr().err.splitlines()

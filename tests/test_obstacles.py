@@ -108,8 +108,8 @@ def test_an_obstacle_that_touches_nothing_changes_nothing() -> None:
             time={"scheme": "backward-euler", "step": 0.02, "end": 0.2},
             **({"obstacle": obstacle} if obstacle else {}),
         )  # fmt: skip
-        potential, calls = scene.balance.incremental_potential, []
-        scene.balance.incremental_potential = lambda p=potential, c=calls: (c.append(1), p())[1]
+        potential, calls = scene.balance.energies.incremental_potential, []
+        scene.balance.energies.incremental_potential = lambda p=potential, c=calls: (c.append(1), p())[1]
         march(scene, state)
         ends.append(state.u.copy())
         asked.append(len(calls))

@@ -24,7 +24,7 @@ FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
 def tangents_of(scene: Scene) -> list[int]:
     """A list that grows whenever a tangent is assembled."""
     made: list[int] = []
-    assemble = scene.balance.tangent._assembly
+    assemble = scene.balance.tangent._assembler
 
     class Counted:
         def __call__(self, *arguments: Any) -> None:
@@ -34,7 +34,7 @@ def tangents_of(scene: Scene) -> list[int]:
         def __getattr__(self, name: str) -> Any:
             return getattr(assemble, name)
 
-    scene.balance.tangent._assembly = Counted()  # type: ignore[assignment]
+    scene.balance.tangent._assembler = Counted()  # type: ignore[assignment]
     return made
 
 

@@ -69,7 +69,7 @@ def test_round_faces_are_round() -> None:
 def test_a_force_on_a_round_face_is_the_force_given() -> None:
     scene, state = disk(boundary=[{"on": "top", "force": [0.0, 3.0]}])
     march(scene, state)
-    assert scene.balance.applied_forces().reshape(-1, 2).sum(axis=0) == pytest.approx([0.0, 3.0], abs=1e-12)
+    assert scene.balance.energies.applied_forces().reshape(-1, 2).sum(axis=0) == pytest.approx([0.0, 3.0], abs=1e-12)
 
 
 def test_a_body_that_breaks_has_straight_sides() -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.errors import InputError
-from fracsim.mechanics.surface_data import SurfaceData
+from fracsim.mechanics.term_protocols import SurfaceData
 from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles

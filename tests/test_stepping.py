@@ -172,7 +172,7 @@ def test_work_is_energy_plus_dissipation(case: dict[str, Any]) -> None:
     d(1/2 v M v) = du . M (a0 + a1) / 2, d(elastic) = du . (f0 + f1) / 2, and M a + f + drag = load at both ends.
     """
     scene, state = make_scene(mesh=MESH, material=MATERIAL, time={"scheme": "newmark", "step": 0.1, "end": 4.0}, **case)
-    start = scene.balance.kinetic_energy(state.v)
+    start = scene.balance.energies.kinetic_energy(state.v)
     for report in each_step(scene, state):
         balance = start + state.work - report.kinetic - report.elastic - state.dissipated
         assert balance == pytest.approx(0, abs=SOLVED)
@@ -259,7 +259,7 @@ def test_damping_does_not_hold_a_rigid_spin_back() -> None:
             damping={"stiffness": 1e-4},
             time={"scheme": "newmark", "step": 1.0 / steps, "end": 1.0},
         )
-        kinetic = scene.balance.kinetic_energy(state.v)
+        kinetic = scene.balance.energies.kinetic_energy(state.v)
         march(scene, state)
         losses.append(abs(state.dissipated) / kinetic)
     assert slopes(losses)[-1] == pytest.approx(2, abs=0.2)

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix, random_array
 
-from fracsim.mechanics.low_rank_springs import DIRECTIONS, DOFS, StiffCoupling, stiff_directions
+from fracsim.mechanics.extra_couplings import LIMITS, StiffCoupling, stiff_directions
 from fracsim.solvers.low_rank import WoodburyPreconditioner
 
 RANDOM = np.random.default_rng(5)
@@ -33,12 +33,12 @@ def test_springs_between_two_points_are_a_direction_each() -> None:
 
 
 def test_many_are_left_in_the_tangent() -> None:
-    n = 4 * DOFS
+    n = 4 * LIMITS.group_dofs
     chain = np.eye(n) + np.diag(np.full(n - 1, 0.1), 1) + np.diag(np.full(n - 1, 0.1), -1)
     assert stiff_directions(csr_matrix(chain), 0.1) is None  # too many in one group
-    assert stiff_directions(springs(n, DIRECTIONS + 1, 1.0), 0.1) is None
-    found = stiff_directions(springs(n, DIRECTIONS, 1.0), 0.1)
-    assert found is not None and len(found[1]) == DIRECTIONS
+    assert stiff_directions(springs(n, LIMITS.directions + 1, 1.0), 0.1) is None
+    found = stiff_directions(springs(n, LIMITS.directions, 1.0), 0.1)
+    assert found is not None and len(found[1]) == LIMITS.directions
 
 
 def matrix_of(dense: np.ndarray) -> PETSc.Mat:

@@ -37,7 +37,7 @@ def test_a_toy_term_moves_the_body(springs: None) -> None:
         initial={"velocity": [1.0, 0.5]},
         time={"scheme": "newmark", "step": 0.02 / w, "end": 2 * np.pi / w},
     )
-    start = scene.balance.kinetic_energy(state.v)
+    start = scene.balance.energies.kinetic_energy(state.v)
     for report in each_step(scene, state):
         mean = state.u.reshape(-1, 2).mean(axis=0)
         np.testing.assert_allclose(mean, np.array([1.0, 0.5]) * exact(w, state.t, (0.0, 1.0)), atol=2e-4)
@@ -90,7 +90,7 @@ def test_a_term_couples_what_no_cell_does(monkeypatch: pytest.MonkeyPatch, solve
     b[i], b[j] = 1.0, -1.0
     K = K + 0.7 * np.outer(b, b)
     expected = np.zeros(X.size)
-    expected[free] = np.linalg.solve(K[np.ix_(free, free)], scene.balance.applied_forces()[free])
+    expected[free] = np.linalg.solve(K[np.ix_(free, free)], scene.balance.energies.applied_forces()[free])
     np.testing.assert_allclose(state.u, expected, atol=1e-9)
     assert made[0].steps > 5 and report.solve.newton_iterations > 5
     assert state.work == pytest.approx(report.elastic, rel=1e-6)

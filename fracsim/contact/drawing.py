@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ..mechanics.surface_data import SurfaceData
+from ..mechanics.term_protocols import SurfaceData
 from .obstacle import RigidObstacle
 from .pose import PosedShape
 from .shape_base import Shape, frame_about, unit_vector

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, kron
 
 from ..errors import InputError
-from ..mechanics.low_rank_springs import stiff_directions
+from ..mechanics.extra_couplings import stiff_directions
 from ..mesh.split_surface.closed_surface import build_split_surface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments

@@ -22,9 +22,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.low_rank_springs import StiffCoupling
-from ..mechanics.surface_data import SurfaceData
+from ..mechanics.extra_couplings import StiffCoupling
 from ..mechanics.term import TimeLevel
+from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import SurfaceMap
@@ -139,7 +139,6 @@ class MeshObstacleTerm(SelfContact):
     """
 
     name = "solids"
-    has_output_surfaces = True
     _surface: MeshContactSurface | None
     _friction: MeshFriction | None  # type: ignore[assignment]
 

@@ -18,8 +18,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.extra_couplings import CouplingBuilder
-from ..mechanics.surface_data import SurfaceData
 from ..mechanics.term import Term
+from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.text import AXES
@@ -45,8 +45,6 @@ class ObstacleTerm(ContactState, Term):
     """Obstacles that the body cannot pass through."""
 
     name = "obstacles"
-    separates_surface = True
-    has_output_surfaces = True
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw) -> None:
         """InputError where the body at rest lies in an obstacle (collective)."""

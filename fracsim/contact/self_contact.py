@@ -17,9 +17,9 @@ from dolfinx import fem
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.extra_couplings import CouplingBuilder
-from ..mechanics.low_rank_springs import StiffCoupling
-from ..mechanics.term import Cuts, Term, TimeLevel
+from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling
+from ..mechanics.term import Term, TimeLevel
+from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.parallel import Gather, from_root, on_root, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
@@ -41,10 +41,10 @@ class SelfContact(Term):
     """A body that cannot pass through itself."""
 
     name = "contact"
-    separates_surface = leaves_tangent_incomplete = True
+    leaves_tangent_incomplete = True
     exact_near_solution: ClassVar[bool] = True  # tangents where Newton's method is at its end
     _attempts = 0  # of the step
-    _cuts: Cuts | None = None
+    _cuts: CutPositions | None = None
 
     def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw) -> None:
         """InputError where the surface at rest cuts itself (collective)."""
@@ -110,7 +110,7 @@ class SelfContact(Term):
             return self._surface.place_faces(at)
         return own.with_arm_share(np.minimum(own.share, at.share))
 
-    def set_cuts(self, cuts: Cuts) -> None:
+    def set_cuts(self, cuts: CutPositions) -> None:
         """Walls between pieces are where edges are cut."""
         if self.law.fragments_only:
             self._cuts = cuts

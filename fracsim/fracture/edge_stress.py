@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.c_library import Float64, Int32, Uint8, at, load_library, struct_pointer
+from ..mesh.c_library import Float64, Int32, Uint8, load_library, struct_pointer
 from ..mesh.simplices import local_edges
 
 Values = npt.NDArray[np.float64]
@@ -54,7 +54,7 @@ def greatest_pull(components: Values, dim: int) -> Values:
     A convex function of s that grows in proportion to it: that of an average is at most the average of it.
     """
     found = np.empty(len(components))
-    _code().pull(c_int64(dim), c_int64(len(components)), at(np.ascontiguousarray(components)), at(found))
+    _code().pull(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), found)
     return found
 
 
@@ -108,7 +108,7 @@ class Simplices:
         """(n, k) normal stress n . s . n along the edges of cells (n,) under s (n, 3 or 6), in its unit; n is the unit
         vector of an edge."""
         found = np.empty(components.shape)
-        given = at(np.ascontiguousarray(cells)), self._all, at(np.ascontiguousarray(components)), at(found)
+        given = np.ascontiguousarray(cells), self._all, np.ascontiguousarray(components), found
         _code().normal(c_int64(self.dim), c_int64(len(cells)), *given)
         return found
 
@@ -116,7 +116,7 @@ class Simplices:
         """(cells, 3 or 6) the part of s (cells, 3 or 6) that the intact edges of cells carry; zero in those that have
         come apart and in flat ones."""
         found = np.empty(components.shape)
-        _code().carried(c_int64(self.dim), self._all, _damage(damage), *_rows(components), at(found))
+        _code().carried(c_int64(self.dim), self._all, _damage(damage), *_rows(components), found)
         return found
 
     def lower(self, chi: Values, components: Values, damage: Damage) -> tuple[Ints, Values]:
@@ -126,7 +126,7 @@ class Simplices:
         Returns (n,) cells that lost anything, and how much.
         """
         cells, lost = np.empty(self._count, np.int64), np.empty(self._count)
-        given = *_rows(components), at(chi), at(cells), at(lost)
+        given = *_rows(components), chi, cells, lost
         many = _code().lower(c_int64(self.dim), self._all, _damage(damage), *given)
         return cells[:many], lost[:many]
 
@@ -135,7 +135,7 @@ def _rows(values: Values) -> tuple[c_int64, Any]:
     """How far rows are apart that may be the first columns of a table, and where they begin."""
     if values.strides[1] != values.itemsize:
         values = np.ascontiguousarray(values)
-    return c_int64(values.strides[0] // values.itemsize), at(values[0] if len(values) else values)
+    return c_int64(values.strides[0] // values.itemsize), values[0] if len(values) else values
 
 
 def _damage(of: Damage) -> Any:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.c_library import Float64, Int32, at, load_library, struct_pointer
+from ..mesh.c_library import Float64, Int32, load_library, struct_pointer
 from ..mesh.domain import Domain
 from ..mesh.halo import RankHalo
 from ..mesh.parallel import max_over_ranks
@@ -124,22 +124,22 @@ class _Rows:
         averages (m, k) of values (near, k); `weight`: (n,) sums of weights."""
         width, count = values.shape[1], len(self.cells)
         found, averages = np.empty(count, np.int64), np.empty((count, width))
-        given = at(self.cells), at(may), at(np.ascontiguousarray(pull)), at(weight), c_double(bound)
-        told = c_int64(width), at(np.ascontiguousarray(values)), at(found), at(averages)
+        given = self.cells, may, np.ascontiguousarray(pull), weight, c_double(bound)
+        told = c_int64(width), np.ascontiguousarray(values), found, averages
         many = _code().reaching(byref(self._given), c_int64(count), *given, *told)
         return found[:many], averages[:many]
 
     def mark(self, places: Flags, marks: Flags) -> None:
         """Mark those near (near,) the own cells that are among some `places` (near,)."""
-        sizes = c_int64(len(self.cells)), at(self.cells)
-        _code().mark(byref(self._given), *sizes, at(places), at(marks))
+        sizes = c_int64(len(self.cells)), self.cells
+        _code().mark(byref(self._given), *sizes, places, marks)
 
     def times(self, values: Values, some: Ints | None = None) -> Values:
         """(n, k) sums over the weights of near values (near, k), of all rows or of some of them."""
         some = self._all if some is None else some
         found, values = np.empty((len(some), values.shape[1])), np.ascontiguousarray(values)
-        sizes = c_int64(len(some)), at(some), c_int64(values.shape[1])
-        _code().times(byref(self._given), *sizes, at(values), at(found))
+        sizes = c_int64(len(some)), some, c_int64(values.shape[1])
+        _code().times(byref(self._given), *sizes, values, found)
         return found
 
 

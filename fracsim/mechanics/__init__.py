@@ -1,21 +1,27 @@
-"""The balance of forces, a sum of terms, and what the terms are made of.
+"""Balance of forces as a sum of terms, and its assembly.
 
-term                        what a term is, and what it is told at the begin of a step
-balance                     the sum: residual, tangent, reactions
-stress                      the stress of a body as damage and flow leave it: a term
-inertia, damping            M a and its mass matrix; drag and viscosity: terms
-surface_data                what is drawn beside the body
-extra_couplings             stiffness between nodes that share no cell
-loads                       dead loads and following pressure: terms
-prescribed_motion           dofs whose displacement is a function of time; whether a quasi-static study holds every
-                            body
-time_functions              constants and tables as functions of time
-material_fields             Young's modulus, density, ... on the mesh
-plasticity                  what cells remember of plastic flow; what flow takes off the stress while a step is solved
-return_mapping              flow at the end of a step
-rotation, tensor_functions  polar rotation of every cell; eigenvalues and powers of many tensors
+term                        term of the balance; time level of a step
+term_protocols              abilities of terms: step limits, history, output; contact and histories of a balance
+contact_time_weights        weights of contact forces in a step
+balance                     sum of the terms: residual, reactions, energies
+tangent                     derivative of the residual
+stress                      stress of a body with damage and plastic flow
+inertia, damping            mass matrix and inertia; drag and viscosity
+loads                       dead loads and pressures
+node_ties                   ties of nodes without an unsplit cell
+prescribed_motion           prescribed displacements; check of supports
+time_functions              tables as functions of time
+material_fields             material parameters on the mesh
+plasticity, return_mapping  history of plastic flow; flow at the end of a step
+tensor_functions            eigenvalues and powers of many tensors
+cell_energy                 energy, forces and stiffness of single cells
+psd_projection              positive semi-definite moduli
+stability_limit             stable step from frequencies of single cells
 jit                         compiled forms and expressions
-matrix_assembly             assembling
-tie_matrix                  stiffness between few nodes, beside blocks
-simd_kernels, bcsr_matvec   forms several cells at a time; products with blocks of the tangent: in C (compiled)
+matrix_assembly             assembly of vectors and of the tangent
+cell_subset_assembly        linear forms over some of their cells
+simd_kernels                forms of several cells at a time (C)
+block_matrix                tangent in blocks of a node's dofs (C)
+extra_couplings             stiffness between nodes that share no cell
+rotation                    polar rotation of each cell
 """

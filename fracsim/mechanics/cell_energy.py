@@ -1,4 +1,4 @@
-"""Energy, forces and stiffness of single cells, of any energy.
+"""Energy, nodal forces and stiffness of single cells, of any energy with linear displacement.
 
 f_a = V P g_a,   K_ab = V g_a . A . g_b      P = d(chi psi)/dF,  A = dP/dF,  g_a = grad of corner a's shape function
 """
@@ -19,10 +19,12 @@ Values = npt.NDArray[np.float64]
 
 
 class CellEnergyDerivatives(NamedTuple):
-    """What k cells of c corners say at the current u.
+    """Energy of k cells with c corners, and its derivatives by the displacement of the corners.
 
     Attributes:
-        energy: (k,) J.    forces: (k, c, d) N.    stiffness: (k, c, c, d, d) N/m.
+        energy: (k,) J.
+        forces: (k, c, d) first derivative, N.
+        stiffness: (k, c, c, d, d) second derivative, N/m.
     """
 
     energy: Values
@@ -31,16 +33,16 @@ class CellEnergyDerivatives(NamedTuple):
 
 
 class CellEnergy:
-    """That of a `Stress` with linear displacement."""
+    """Energy of single cells of a `Stress`, with derivatives."""
 
     def __init__(self, stress: Stress) -> None:
-        """Compiles (collective)."""
+        """Compile the energy and its derivatives by F (collective)."""
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
         psi = stress.energy_factor * stress.energy.psi(F, stress.rotation_field)
         P = ufl.diff(psi, F)
-        A, each = ufl.diff(P, F), [(i, j) for i in range(d) for j in range(d)]
-        parts = [psi, *(P[i] for i in each), *(A[i + j] for i in each for j in each)]
+        A, components = ufl.diff(P, F), [(i, j) for i in range(d) for j in range(d)]
+        parts = [psi, *(P[ij] for ij in components), *(A[ij + kl] for ij in components for kl in components)]
         self._parts = point_expression(domain, ufl.as_vector(parts))
         self._volumes, self._d = domain.volumes, d
         corners = domain.nodes[domain.cell_nodes]
@@ -48,7 +50,7 @@ class CellEnergy:
         self._gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
 
     def __call__(self, cells: npt.NDArray[np.int32]) -> CellEnergyDerivatives:
-        """Of owned cells at the current u (not collective)."""
+        """Energy and derivatives of owned cells (k,) at the current u (not collective)."""
         d, g = self._d, self._gradients[cells]
         values = self._parts.evaluate_at_points(cells) * self._volumes[cells, None]
         P, A = values[:, 1 : 1 + d * d].reshape(-1, d, d), values[:, 1 + d * d :].reshape((-1, d, d, d, d))
@@ -56,8 +58,8 @@ class CellEnergy:
 
 
 def _stiffness(g: Values, A: Values) -> Values:
-    """(k, c, c, d, d) g_a . A . g_b, a product of two matrices for each cell: einsum takes two and a half times as
-    long."""
+    """(k, c, c, d, d) stiffness g_a . A . g_b from gradients g (k, c, d) and moduli A (k, d, d, d, d)."""
+    # one matrix product a cell takes 0.4 of the time of einsum
     k, c, d = g.shape
     pairs = (g[:, :, None, :, None] * g[:, None, :, None, :]).reshape(k, c * c, d * d)
     return np.asarray((pairs @ A.transpose(0, 2, 4, 1, 3).reshape(k, d * d, d * d)).reshape(k, c, c, d, d))

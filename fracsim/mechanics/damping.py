@@ -1,4 +1,4 @@
-"""Rayleigh damping a M v + b K v: drag in proportion to mass, viscosity in proportion to stiffness.
+"""Rayleigh damping a M v + b K v: mass-proportional drag and stiffness-proportional viscosity.
 
 Equations: docs/theory.md#elastic-energies.
 """
@@ -22,7 +22,11 @@ Values = npt.NDArray[np.float64]
 
 
 class Drag(Term):
-    """a M v, a in 1/s."""
+    """Mass-proportional damping a M v, with the velocity v = c_v (u - u_v) of the time level.
+
+    Attributes:
+        a: coefficient, 1/s.
+    """
 
     name = "drag"
     linear = True
@@ -33,25 +37,25 @@ class Drag(Term):
         self._level: TimeLevel | None = None
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Take up the scheme's velocity v = c_v (u - u_v) of the level."""
+        """Take the velocity of the time level."""
         self._level = level
 
     @property
     def mass_factor(self) -> float:
-        """a c_v, 1/s^2: M is multiplied with it in the tangent."""
+        """a c_v, 1/s^2."""
         assert self._level is not None
         return self.a * self._level.c_v
 
     def acceleration(self) -> Values:
-        """(owned dofs,) a c_v (u - u_v), m/s^2: M is multiplied with it in the residual."""
+        """(owned dofs,) a c_v (u - u_v), m/s^2."""
         assert self._level is not None
         u_v = self._level.u_v
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_v)] - u_v))
 
     def potential(self) -> float:
         """a c_v (u - u_v) . M (u - u_v) / 2, J."""
-        rate = self.acceleration()
-        return float(rate @ self._mass.multiply(rate)) / (2 * self.mass_factor) if self.mass_factor else 0.0
+        a = self.acceleration()
+        return float(a @ self._mass.multiply(a)) / (2 * self.mass_factor) if self.mass_factor else 0.0
 
     def damping_forces(self) -> Values:
         """(owned dofs,) a M v, N."""
@@ -61,7 +65,11 @@ class Drag(Term):
 
 
 class Viscosity(Term):
-    """int chi b (C : Edot) : sym(F_n^T grad w) dX, b in s (forms.balance.viscous_work)."""
+    """Stiffness-proportional damping int chi b (C : Edot) : sym(F_n^T grad w) dX (forms.balance.viscous_work).
+
+    Attributes:
+        b: coefficient, s.
+    """
 
     name = "viscosity"
 
@@ -74,7 +82,7 @@ class Viscosity(Term):
         self._form = CellForm(self.virtual_work(ufl.TestFunction(domain.space), cell_measure(domain)))
 
     def begin_step(self, level: TimeLevel) -> None:
-        """The start of the step and its velocity: coefficients of the form."""
+        """Take the displacement at the start of the step and the velocity of the time level."""
         for field, values in ((self._u_n, level.u_n), (self._u_v, level.u_v)):
             field.x.array[: len(values)] = values
             field.x.scatter_forward()
@@ -91,7 +99,7 @@ class Viscosity(Term):
         return ufl.derivative(self.virtual_work(w, dx), self._u, v)
 
     def damping_forces(self) -> Values:
-        """(owned dofs,) forces of the viscosity, N (collective)."""
+        """(owned dofs,) viscous forces, N (collective)."""
         return self._assembler(self._form)
 
     def damage_changed(self) -> None:

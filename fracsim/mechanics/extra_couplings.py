@@ -1,26 +1,42 @@
-"""Stiffness between nodes that share no cell, as a matrix over the dofs of all ranks: what `Term.coupling` gives."""
+"""Stiffness between nodes that share no cell: matrices over the dofs of all ranks, and their stiff directions.
+
+Two points in contact move as one along their normal. Smoothers and aggregates of multigrid do not represent such a
+motion: with 15 pairs in contact CG takes 75 iterations where the body alone takes 12. The few stiff directions are
+found here and eliminated exactly (solvers.low_rank), with the preconditioner of the body.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
-from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
 Ints = npt.NDArray[np.int64]
+Values = npt.NDArray[np.float64]
 
 
 class CouplingBuilder:
-    """Makes the matrix of a term; the last one is kept, and gone once there is another."""
+    """Builder of the coupling matrix of a term (`Term.coupling_matrix`), which owns the last one."""
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
         self._last: PETSc.Mat | None = None
 
     def __call__(self, part: csr_matrix, nodes: Ints) -> PETSc.Mat:
-        """The sum over ranks of their parts (n d, n d), N/m, over nodes (n,) by their global numbers (collective)."""
+        """Sum over ranks of their parts, as a matrix over all dofs (collective).
+
+        Args:
+            part: (n d, n d) stiffness, N/m.
+            nodes: (n,) global numbers of its nodes.
+        """
         self.destroy()
         d, owned = self._domain.dim, self._domain.node_count * self._domain.dim
         matrix = self._last = PETSc.Mat().create(self._domain.comm)
@@ -34,7 +50,63 @@ class CouplingBuilder:
         return matrix
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's matrix back."""
+        """Free PETSc's matrix."""
         if self._last is not None:
             self._last.destroy()
             self._last = None
+
+
+@dataclass(frozen=True)
+class StiffCoupling:
+    """Coupling C + U diag(k) U^T, of which the second part is stiff and stays beside the tangent.
+
+    Attributes:
+        matrix: C over the dofs of all ranks, N/m.
+        directions: (owned dofs, m) U.
+        stiffness: (m,) k > 0, N/m.
+    """
+
+    matrix: PETSc.Mat
+    directions: Values
+    stiffness: Values
+
+
+@dataclass(frozen=True)
+class StiffDirectionLimits:
+    """Bounds above which stiff directions are not eliminated: it would cost more than the iterations that it saves.
+
+    With groups of 450 dofs four plates at rest on one another (688 nodes) took 43 s instead of 9 s.
+
+    Attributes:
+        group_dofs: most dofs of a group of coupled points.
+        directions: most stiff directions of all groups.
+    """
+
+    group_dofs: int = 240
+    directions: int = 64
+
+
+LIMITS = StiffDirectionLimits()
+
+
+def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] | None:
+    """Eigenvectors (n, m) and eigenvalues (m,), N/m, of a symmetric H (n, n) above `least`; None beyond LIMITS."""
+    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
+    from scipy.sparse.csgraph import connected_components
+
+    rows = np.flatnonzero(np.diff(H.indptr))
+    coupled = H[rows][:, rows]
+    _, group = connected_components(coupled, directed=False)
+    sizes = np.bincount(group)
+    if sizes.max(initial=0) > LIMITS.group_dofs:
+        return None
+    columns, values = [csr_matrix((H.shape[0], 0))], list[Values]()
+    for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]):
+        eigenvalues, vectors = np.linalg.eigh(coupled[part][:, part].toarray())
+        stiff = eigenvalues > least
+        count = int(stiff.sum())
+        entries = np.repeat(rows[part], count), np.tile(np.arange(count), len(part))
+        columns.append(csr_matrix((vectors[:, stiff].reshape(-1), entries), shape=(H.shape[0], count)))
+        values.append(eigenvalues[stiff])
+    stiffness: Values = np.concatenate(values) if values else np.empty(0)
+    return None if len(stiffness) > LIMITS.directions else (csr_matrix(hstack(columns)), stiffness)

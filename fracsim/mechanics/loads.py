@@ -1,4 +1,4 @@
-"""What acts on the body from outside as functions of time: dead loads and following pressure."""
+"""External loads as functions of time: dead loads and pressures that follow the surface."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from .term import Term, TimeLevel
 from .time_functions import TimeFunction
 
 Values = npt.NDArray[np.float64]
-OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and what acts on them
+OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and the load on them
 
 
 class _TimeDependentConstants:
-    """UFL constants that follow functions of time."""
+    """UFL constants whose values are functions of time."""
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
         self._constants: list[tuple[fem.Constant, TimeFunction]] = []
 
     def constant(self, function: TimeFunction, size: int) -> fem.Constant:
-        """A constant of `size` components that moves with a function."""
+        """Constant of `size` components with the values of a function."""
         value = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.float64(np.nan))
         self._constants.append((value, function))
         return value
 
     def set_time(self, t: float) -> bool:
-        """Move all to time t; whether any of them changed."""
+        """Evaluate all functions at time t (s); returns whether any value changed."""
         changed = False
         for constant, function in self._constants:
             value = function(t).reshape(constant.value.shape)
@@ -48,9 +48,10 @@ class _TimeDependentConstants:
 
 
 class DeadLoads(Term):
-    """-(int t . w dA + int f . w dX), t in Pa of the reference area and f in N/m^3 of the reference volume.
+    """Tractions and body forces -(int t . w dA + int f . w dX), assembled when a load has changed.
 
-    Assembled only where a load has changed.
+    Attributes:
+        nodal_forces: (owned dofs,) forces of all loads at the time level, N.
     """
 
     name = "dead loads"
@@ -65,89 +66,105 @@ class DeadLoads(Term):
         gravity: tuple[Expr, TimeFunction] | None = None,
         body_force: TimeFunction | None = None,
     ) -> None:
-        """`gravity`: density as a UFL coefficient in kg/m^3, and the acceleration in m/s^2; `body_force`: N/m^3."""
+        """Compile the linear form of the loads (collective).
+
+        Args:
+            assembler: of vectors over the dofs.
+            u: displacement.
+            tractions: facets, and tractions in Pa of the reference area.
+            gravity: density as a UFL coefficient in kg/m^3, and acceleration in m/s^2.
+            body_force: N/m^3 of the reference volume.
+        """
         domain, d = assembler.domain, assembler.domain.dim
-        self._assembler, self._u, self._moving = assembler, u, _TimeDependentConstants(domain)
+        self._assembler, self._u, self._constants = assembler, u, _TimeDependentConstants(domain)
         w, dx = ufl.TestFunction(domain.space), ufl.dx(domain=domain.mesh)
-        facets, of_volume = [each for each, _ in tractions], []
+        facets, densities = [part for part, _ in tractions], []
         if gravity is not None:
-            of_volume.append(gravity[0] * self._moving.constant(gravity[1], d))
+            densities.append(gravity[0] * self._constants.constant(gravity[1], d))
         if body_force is not None:
-            of_volume.append(self._moving.constant(body_force, d))
-        parts = [
-            traction_work(self._moving.constant(traction, d), w, ds)
+            densities.append(self._constants.constant(body_force, d))
+        works = [
+            traction_work(self._constants.constant(traction, d), w, ds)
             for (_, traction), ds in zip(tractions, surface_measures(domain, facets), strict=True)
         ]
-        if of_volume:
-            parts.append(ufl.inner(sum(of_volume[1:], of_volume[0]), w) * dx)
-        self._form = compile_form(sum(parts[1:], parts[0]))
+        if densities:
+            works.append(ufl.inner(sum(densities[1:], densities[0]), w) * dx)
+        self._form = compile_form(sum(works[1:], works[0]))
         self.nodal_forces: Values = np.zeros(assembler.owned_dof_count)
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Take the loads of the time at which forces balance."""
-        if self._moving.set_time(level.t):
+        """Evaluate the loads at the time level."""
+        if self._constants.set_time(level.t):
             self.nodal_forces = self._assembler(self._form)
 
-    def add_nodal_forces(self, rows: Values) -> None:
-        """r -= f, the nodal forces (owned dofs,) of all loads at the level, N."""
-        rows -= self.nodal_forces
+    def add_nodal_forces(self, forces: Values) -> None:
+        """Subtract the loads from r (owned dofs,), N."""
+        forces -= self.nodal_forces
 
     def potential(self) -> float:
         """-f . u, J."""
         return -float(self.nodal_forces @ self._u.x.array[: len(self.nodal_forces)])
 
     def applied_forces(self) -> Values:
-        """(owned dofs,) f, N."""
+        """(owned dofs,) forces of all loads, N."""
         return self.nodal_forces
 
     def reference_forces(self) -> Values:
-        """(owned dofs,) f, N: what the residual is the balance of."""
+        """(owned dofs,) forces of all loads, N."""
         return self.nodal_forces
 
 
 class Pressure(Term):
-    """int p J F^-T N . w dA: pressures in Pa that follow the surface; on the reference surface of a linear body."""
+    """Pressures int p J F^-T N . w dA that follow the surface; on the reference surface of a linear body."""
 
     name = "pressure"
 
     def __init__(self, assembler: VectorAssembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
+        """Compile the form of the pressures (collective).
+
+        Args:
+            assembler: of vectors over the dofs.
+            u: displacement.
+            parts: facets, and pressures in Pa.
+            linear: whether pressures act on the reference surface.
+        """
         domain = assembler.domain
         self._assembler, self._u, self.symmetric, self.linear = assembler, u, linear, linear
-        self._moving = _TimeDependentConstants(domain)
-        works = [
-            (self._moving.constant(function, 1), ds)
-            for (_, function), ds in zip(parts, surface_measures(domain, [each for each, _ in parts]), strict=True)
+        self._constants = _TimeDependentConstants(domain)
+        measures = surface_measures(domain, [facets for facets, _ in parts])
+        self._pressures = [
+            (self._constants.constant(function, 1), ds) for (_, function), ds in zip(parts, measures, strict=True)
         ]
-        self._works, self._normal = works, ufl.FacetNormal(domain.mesh)
+        self._normal = ufl.FacetNormal(domain.mesh)
         self._form = compile_form(self._work(ufl.TestFunction(domain.space)))
 
     def _work(self, w: Expr) -> ufl.Form:
         linear = self.symmetric
-        return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._works)
+        return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._pressures)
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Take the pressures of the time at which forces balance."""
-        self._moving.set_time(level.t)
+        """Evaluate the pressures at the time level."""
+        self._constants.set_time(level.t)
 
     def virtual_work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the pressures, N m; their facets do not depend on the cells of `dx`."""
         return self._work(w)
 
     def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
-        """Derivative of the virtual work in the direction v; 0 where the pressure does not follow the surface."""
+        """Derivative of the virtual work in the direction v; 0 on the reference surface."""
         return ufl.derivative(self._work(w), self._u, v)
 
     def applied_forces(self) -> Values:
-        """(owned dofs,) force of the pressures on the current shape, N (collective)."""
+        """(owned dofs,) forces of the pressures on the current surface, N (collective)."""
         return -self._assembler(self._form)
 
 
 def surface_area(domain: Domain, facets: Ints) -> float:
-    """Of local exterior facets in the body at rest, on all ranks, m^2; in 2D their length, m (collective)."""
+    """Area of local exterior facets of the body at rest on all ranks, m^2; in 2D their length, m (collective)."""
     if domain.has_curved_cells:
         (ds,) = surface_measures(domain, [facets])
-        along_x: Any = fem.Constant(domain.mesh, np.eye(domain.dim)[0])
-        shares = fem.assemble_vector(compile_form(traction_work(along_x, ufl.TestFunction(domain.space), ds)))
+        unit: Any = fem.Constant(domain.mesh, np.eye(domain.dim)[0])
+        shares = fem.assemble_vector(compile_form(traction_work(unit, ufl.TestFunction(domain.space), ds)))
         return float(sum_over_ranks(domain.comm, np.sum(shares.array))[0])
     cell, opposite = exterior_facets(domain.mesh, facets).reshape(-1, 2).T
     nodes = domain.cell_nodes[cell]
@@ -155,12 +172,13 @@ def surface_area(domain: Domain, facets: Ints) -> float:
     x = domain.nodes[corners]
     sides = x[:, 1:] - x[:, :1]
     gram = np.einsum("nik,njk->nij", sides, sides)
-    own = np.sqrt(np.linalg.det(gram)) / (domain.dim - 1)  # of a segment its length, of a triangle half the product
-    return float(sum_over_ranks(domain.comm, np.sum(own))[0])
+    # of a segment its length, of a triangle half the length of the cross product
+    areas = np.sqrt(np.linalg.det(gram)) / (domain.dim - 1)
+    return float(sum_over_ranks(domain.comm, np.sum(areas))[0])
 
 
 def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:
-    """A surface measure for each set of local exterior facets; they may overlap."""
+    """Surface measure of each set of local exterior facets; sets may overlap."""
     entities = [(number, exterior_facets(domain.mesh, facets)) for number, facets in enumerate(parts)]
     ds = ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
     return [ds(number) for number in range(len(parts))]

@@ -1,4 +1,4 @@
-"""Material parameters on the mesh: numbers where the body is uniform, DG0 fields where regions differ."""
+"""Material parameters on the mesh: numbers for a uniform body, DG0 fields where regions differ."""
 
 from __future__ import annotations
 
@@ -13,26 +13,42 @@ from dolfinx import fem
 from ..forms.energies import ENERGIES, Energy, lame, plane_stress_lambda
 from ..mesh.domain import Domain
 
-PerCell = npt.NDArray[np.float64] | float
+PerCell = npt.NDArray[np.float64] | float  # a number, or (cells,)
 
 
 @dataclass(frozen=True)
 class MaterialFields:
-    """The energy with its coefficients, and density (kg/m^3) and moduli (Pa) per cell or as one number."""
+    """Undamaged material on a mesh.
+
+    Attributes:
+        energy: stored energy with its coefficients.
+        density: kg/m^3.
+        young: Young's modulus, Pa.
+        mu, lmbda: Lame's parameters, Pa.
+        plastic: history of plastic flow (mechanics.plasticity), None for an elastic body.
+    """
 
     energy: Energy
     density: PerCell
     young: PerCell
     mu: PerCell
     lmbda: PerCell
-    plastic: Any = None  # mechanics.plasticity.Plasticity of a body that flows
+    plastic: Any = None
 
 
 def material_fields(
     domain: Domain, energy: str, *, young: PerCell, poisson: PerCell, density: PerCell, plane_stress: bool = False
 ) -> MaterialFields:
-    """A material by the name of its energy (forms.energies.ENERGIES), Young's modulus in Pa, Poisson's ratio and
-    density in kg/m^3, each a number or (cells,). `plane_stress`: of a 2D mesh, in place of plane strain."""
+    """Elastic material on a mesh.
+
+    Args:
+        domain: the mesh.
+        energy: name of the stored energy (forms.energies.ENERGIES).
+        young: Young's modulus, Pa.
+        poisson: Poisson's ratio.
+        density: kg/m^3.
+        plane_stress: plane stress instead of plane strain, for a 2D mesh.
+    """
     mu, lmbda = lame(young, poisson)  # type: ignore[arg-type]
     options = {}
     if domain.dim == 2 and plane_stress:
@@ -43,7 +59,7 @@ def material_fields(
 
 
 def parameter_by_region(domain: Domain, base: float, region_values: Mapping[str, float]) -> PerCell:
-    """A parameter as one number, or as (cells,) where regions, by name, have another value."""
+    """Parameter as one number, or as (cells,) if regions, by name, have values of their own."""
     if not region_values:
         return base
     values = np.full(domain.cell_count, base)
@@ -53,7 +69,7 @@ def parameter_by_region(domain: Domain, base: float, region_values: Mapping[str,
 
 
 def coefficient(domain: Domain, value: PerCell) -> Any:
-    """A parameter as a UFL coefficient: a constant, or a field that is constant in each cell."""
+    """Parameter as a UFL coefficient: a constant, or a field that is constant in each cell."""
     if np.ndim(value) == 0:
         return fem.Constant(domain.mesh, np.float64(value))
     field = fem.Function(domain.cell_scalar)

@@ -4,7 +4,7 @@ PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell,
 DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values. Larger
 bodies have several cells assembled at a time (simd_kernels).
 
-It can be summed in blocks of the d dofs of a node instead. Products are made with those where they are (bcsr_matvec);
+It can be summed in blocks of the d dofs of a node instead. Products are made with those where they are (block_matrix);
 PETSc's matrix of single entries, which multigrid is set up from, follows where it is asked for.
 
 Where a body falls apart, the entries of its dead cells are zeros that every product with the matrix still reads. They
@@ -31,7 +31,7 @@ from .jit import CellForm, SimdKernelCache
 if TYPE_CHECKING:
     from ctypes import CDLL
 
-    from .bcsr_matvec import BlockMatrix
+    from .block_matrix import BlockMatrix
     from .cell_subset_assembly import CellSubsetAssembler
     from .inertia import MassBlocks
     from .simd_kernels import SimdBilinearForm, SimdLinearForm
@@ -63,7 +63,7 @@ class TangentAssembler:
         """Assemble into blocks from here on; products with them, None where there is no compiler. `dead_too`: with room
         for cells that the form has left out (collective)."""
         if self.blocks is None:
-            from .bcsr_matvec import compile_block_product
+            from .block_matrix import compile_block_product
 
             size = self.matrix.getBlockSize()
             if (code := compile_block_product(self.form.mesh.comm, size)) is None:
@@ -90,7 +90,7 @@ class TangentAssembler:
         self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
         self._by_blocks = by_blocks
         if by_blocks is not None:
-            from .bcsr_matvec import BlockMatrix
+            from .block_matrix import BlockMatrix
 
             self.blocks = BlockMatrix(self._sum, by_blocks)
             rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))

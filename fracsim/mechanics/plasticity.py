@@ -1,16 +1,14 @@
-"""What cells remember of plastic flow: F_p with det F_p = 1, and the accumulated plastic strain (M22 section 3.7).
+"""History of plastic flow: F_p with det F_p = 1, and the accumulated plastic strain (M22 section 3.7).
 
-With quadratic displacement each point where stress is integrated remembers its own; those of a cell come one after the
-other.
+With quadratic displacement each point where stress is integrated has its own; those of a cell come one after the other.
+The key `update` of a study selects how flow enters the stress while a step is solved:
 
-What flow takes off the stress while a step is solved, by the study's `update`.
+    extrapolated    F_p changes at the rate of the last step, at the cost of an elastic step (after IMPL-EX: Oliver,
+                    Huespe and Cante 2008, who extrapolate the plastic multiplier)
+    implicit        the flow of the step itself (forms.plasticity): exact in steps of any size under monotonic loading
+    staggered       no flow (M22)
 
-    extrapolated    F_p goes on as it did in the step before: an elastic step's cost (after IMPL-EX: Oliver, Huespe and
-                    Cante 2008, who extrapolate the multiplier of the flow)
-    implicit        the flow of the step itself (forms.plasticity): exact in steps of any size where loading goes on
-    staggered       nothing (M22): no prediction at all
-
-Without any the stress of a yielding bar is too high by 3 mu times the strain of a step.
+Without any flow the stress of a yielding bar is too high by 3 mu times the strain of a step.
 
 Equations: docs/theory.md#plasticity.
 """
@@ -34,76 +32,93 @@ from .tensor_functions import multiply_unimodular
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
-WEIGHTS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # of squares in the norm of xx, yy, zz, xy, xz, yz
-MOST = 0.9  # norm of dt D: with less than 1 no stretch turns over
-UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]  # I
-WEAKEST = 0.01  # share of the yield stress that softening leaves
+
+# weights of xx, yy, zz, xy, xz, yz in the squared norm of a symmetric tensor, and the unit tensor
+NORM_WEIGHTS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+IDENTITY = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
+
+
+@dataclass(frozen=True)
+class PlasticityLimits:
+    """Bounds on plastic flow.
+
+    Attributes:
+        extrapolation: largest norm of dt D in an extrapolated step; below 1 no stretch changes its sign.
+        softened_share: least share of the initial yield stress that softening leaves.
+    """
+
+    extrapolation: float = 0.9
+    softened_share: float = 0.01
+
+
+LIMITS = PlasticityLimits()
 
 
 class FlowPrediction(Protocol):
-    """What is done about the flow of a step before it is known."""
+    """Prediction of the flow of a step while the step is solved."""
 
     @property
     def form(self) -> ImplicitFlow | None:
-        """Virtual work and tangent; None where the energy of F_e says it all."""
+        """Virtual work and tangent with flow; None if the energy of F_e is sufficient."""
 
     def begin_step(self, dt: float, fraction: float) -> None:
-        """A step of dt is to be solved whose flow makes `fraction` of the return; zeros: it is done."""
+        """Begin a step of dt (s) whose flow makes `fraction` of the return to the yield surface; zeros: end it."""
 
     def record_flow(self, points: Points, power: Values, dt: float) -> None:
-        """`points` flowed by (6, n) exp(-beta e) in a step of dt, all others did not."""
+        """Record the flow of a step of dt (s): (6, n) exp(-beta e) of `points`; no other points flowed."""
 
 
 class ImplicitPlasticFlow:
-    """beta follows from the unknown displacement."""
+    """Flow that follows from the unknown displacement of the step."""
 
     def __init__(self, domain: Domain, energy: Plastic, frobenius: bool) -> None:
-        self._resistance, self._softness = (point_field(domain, (), name) for name in ("resistance", "softness"))
-        self._share = fem.Constant(domain.mesh, np.float64(0.0))
-        self.form = ImplicitFlow(energy, self._resistance, self._softness, self._share, frobenius)
+        self._flow_stress, self._compliance = (point_field(domain, (), name) for name in ("resistance", "softness"))
+        self._fraction = fem.Constant(domain.mesh, np.float64(0.0))
+        self.form = ImplicitFlow(energy, self._flow_stress, self._compliance, self._fraction, frobenius)
 
     def begin_step(self, dt: float, fraction: float) -> None:
-        """The share of the return is all that changes with the step."""
-        self._share.value = fraction
+        """Set the fraction of the return to the yield surface."""
+        self._fraction.value = fraction
 
-    def update_flow_stress(self, resistance: Values, softness: Values) -> None:
-        """Yield stress Y (Pa) and 1 / (1 + K / (3 mu)) of the points as they are now."""
-        self._resistance.x.array[: len(resistance)] = resistance
-        self._softness.x.array[: len(softness)] = softness
+    def update_flow_stress(self, flow_stress: Values, compliance: Values) -> None:
+        """Set Y (points,), Pa, and 1 / (1 + K / (3 mu)) (points,)."""
+        self._flow_stress.x.array[: len(flow_stress)] = flow_stress
+        self._compliance.x.array[: len(compliance)] = compliance
 
     def record_flow(self, points: Points, power: Values, dt: float) -> None:
-        """Nothing to remember."""
+        """Nothing: the next step does not depend on the flow of this one."""
 
 
 class ExtrapolatedPlasticFlow:
-    """F_p^-1 (I + dt D) stands in for F_p^-1 while a step is solved, D = (exp(-beta e) - I) / dt of the last step.
+    """Flow at the rate D = (exp(-beta e) - I) / dt of the last step: F_p^-1 (I + dt D) replaces F_p^-1 in a solve.
 
-    The tangent is that of an elastic body. Steps of another size go on at the same rate.
+    The tangent is that of an elastic body. Steps of another size have the same rate.
     """
 
     form = None
 
     def __init__(self, inverse: Values) -> None:
-        """`inverse`: (points, 9) F_p^-1, which this changes for the time of a solve."""
+        """`inverse`: (points, 9) F_p^-1, which is replaced for the duration of a solve."""
         self._inverse = inverse
         self._points: Points = np.empty(0, np.int32)
         self._rate: Values = np.empty((6, 0))
-        self._held: Values | None = None  # (9, n) F_p^-1 of the points, while another stands in for it
+        self._replaced: Values | None = None  # (9, n) F_p^-1 of the points during a solve
 
     def begin_step(self, dt: float, fraction: float) -> None:
-        """Put the stand-in in its place, or F_p^-1 itself back."""
-        if self._held is not None and not dt:
-            self._inverse[self._points], self._held = self._held.T, None
+        """Replace F_p^-1 by its extrapolation over dt (s); with 0 put it back."""
+        if self._replaced is not None and not dt:
+            self._inverse[self._points], self._replaced = self._replaced.T, None
         if not dt or not len(self._points):
             return
-        if self._held is None:
-            self._held = np.ascontiguousarray(self._inverse[self._points].T)
-        longest = MOST / np.maximum(np.sqrt(WEIGHTS @ self._rate**2), MOST / dt)
-        self._inverse[self._points] = multiply_unimodular(self._held, UNIT + longest * self._rate).T
+        if self._replaced is None:
+            self._replaced = np.ascontiguousarray(self._inverse[self._points].T)
+        longest = LIMITS.extrapolation
+        duration = longest / np.maximum(np.sqrt(NORM_WEIGHTS @ self._rate**2), longest / dt)
+        self._inverse[self._points] = multiply_unimodular(self._replaced, IDENTITY + duration * self._rate).T
 
     def record_flow(self, points: Points, power: Values, dt: float) -> None:
-        """Remember D of the step, by which the next one is predicted to flow."""
-        self._points, self._rate = points, (power - UNIT) / dt
+        """Record D of the step."""
+        self._points, self._rate = points, (power - IDENTITY) / dt
 
     @property
     def rates(self) -> Values:
@@ -120,13 +135,14 @@ class ExtrapolatedPlasticFlow:
 
 @dataclass(frozen=True)
 class YieldLaw:
-    """When cells flow, and how fast.
+    """Yield criterion and flow rule.
 
     Attributes:
         yield_stress: Pa, of the Cauchy stress, a number or (cells,).
-        frobenius: compared with it is the norm of the whole stress; else von Mises'.
-        flow_rate: nu, 1/s; inf: independent of the rate.    hardening: K, Pa; < 0 softens.
-        update: what a step is solved with (mechanics.plasticity).
+        frobenius: whether the norm of the whole stress is compared with it; else that of von Mises.
+        flow_rate: nu, 1/s; inf: independent of the rate.
+        hardening: K, Pa; negative: softening.
+        update: how flow enters the stress while a step is solved (head of this module).
     """
 
     yield_stress: PerCell
@@ -137,40 +153,48 @@ class YieldLaw:
 
 
 class PlasticHistory:
-    """What the cells remember of their flow.
+    """History variables of plastic flow at all points where stress is integrated.
 
     Attributes:
-        inverse: F_p^-1, 3 x 3, at each point; while a step is solved, what `prediction` puts in its place.
-        points: of a cell.    volumes: (points,) of this rank, m^d.
-        rows: (points, 9) values of `inverse`.
-        strain: (points,) accumulated plastic strain alpha.
-        prediction: what flow takes off the stress while a step is solved; None where flow only follows it.
-        fraction: 1 - exp(-nu dt), the part of the return to the yield surface that a step makes; 0 between steps.
+        energy: stored energy of the elastic part of F.
+        inverse: field of F_p^-1 (3 x 3); replaced by `prediction` while a step is solved.
+        points_per_cell: number of points of a cell.
+        volumes: (points,) volumes of the points of this rank, m^d.
+        inverse_rows: (points, 9) values of `inverse`.
+        accumulated_strain: (points,) accumulated plastic strain alpha.
+        prediction: flow while a step is solved; None for staggered steps.
+        dt: size of the step that is solved, s; 0 between steps.
+        fraction: 1 - exp(-nu dt), the part of the return to the yield surface in a step; 0 between steps.
+        rate: nu, 1/s.    hardening: K, Pa.    frobenius: as for YieldLaw.
     """
 
     def __init__(self, domain: Domain, law: YieldLaw, material: MaterialFields, *, implicit: bool = True) -> None:
-        """`implicit`: whether u is what a step is solved for; explicit schemes know it beforehand."""
+        """Body that has not flowed yet.
+
+        Args:
+            domain: the mesh.
+            law: yield criterion and flow rule.
+            material: elastic material.
+            implicit: whether steps are solved for u; explicit schemes know u before the stress.
+        """
         self.rate, self.hardening, self.frobenius = law.flow_rate, law.hardening, law.frobenius
         self.dt, self.fraction = 0.0, 0.0
-        self.points_per_cell = points_per_cell(domain)
-        self._yield, self._modulus = self._of_points(law.yield_stress), self._of_points(3 * material.mu)
-        self.volumes = (
-            np.repeat(domain.volumes / self.points_per_cell, self.points_per_cell)
-            if self.points_per_cell > 1
-            else domain.volumes
-        )
-        self.accumulated_strain = np.zeros(self.points_per_cell * domain.cell_count)
+        count = self.points_per_cell = points_per_cell(domain)
+        self._yield, self._modulus = self._at_points(law.yield_stress), self._at_points(3 * material.mu)
+        self.volumes = np.repeat(domain.volumes / count, count) if count > 1 else domain.volumes
+        self.accumulated_strain = np.zeros(count * domain.cell_count)
         self.inverse = point_field(domain, (3, 3), "inverse plastic part")
         self.inverse_rows: Values = self.inverse.x.array.reshape(-1, 9)[: len(self.accumulated_strain)]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
         self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
-        # where u is known before the stress is asked for nothing need be extrapolated
-        known = law.update == "extrapolated" and not implicit
-        self.prediction = self._prediction(domain, "implicit" if known else law.update)
+        # with u known before the stress nothing needs to be extrapolated
+        u_known = law.update == "extrapolated" and not implicit
+        self.prediction = self._prediction(domain, "implicit" if u_known else law.update)
         self.update_flow_stress()
-        self._memory: Values | None = None
+        self._snapshot: Values | None = None
 
-    def _of_points(self, value: PerCell) -> PerCell:
+    def _at_points(self, value: PerCell) -> PerCell:
+        """Parameter of cells at their points."""
         return np.repeat(value, self.points_per_cell) if isinstance(value, np.ndarray) else value
 
     def cell_means(self, values: Values) -> Values:
@@ -183,45 +207,46 @@ class PlasticHistory:
         return ExtrapolatedPlasticFlow(self.inverse_rows) if update == "extrapolated" else None
 
     def flow_stress(self, strain: Values, points: Points | slice = slice(None)) -> Values:
-        """Y = yield_stress + K alpha of points with the given alpha, Pa; never below a small share of yield_stress."""
+        """Y = yield_stress + K alpha, Pa, of points with strain alpha; never below a share of yield_stress."""
         start = self._yield[points] if isinstance(self._yield, np.ndarray) else self._yield
-        return np.maximum(start + self.hardening * strain, WEAKEST * start)
+        return np.maximum(start + self.hardening * strain, LIMITS.softened_share * start)
 
     def update_flow_stress(self) -> None:
-        """What flow within a step has to know of `strain`."""
+        """Give the prediction the flow stress of the current strain."""
         if not isinstance(self.prediction, ImplicitPlasticFlow):
             return
         Y = self.flow_stress(self.accumulated_strain)
-        soft = (self.hardening < 0) & (WEAKEST * self._yield >= Y)  # as soft as it gets
-        self.prediction.update_flow_stress(Y, 1 / (1 + np.where(soft, 0.0, self.hardening / self._modulus)))
+        fully_softened = (self.hardening < 0) & (LIMITS.softened_share * self._yield >= Y)
+        compliance = 1 / (1 + np.where(fully_softened, 0.0, self.hardening / self._modulus))
+        self.prediction.update_flow_stress(Y, compliance)
 
     def discard_snapshot(self) -> None:
-        """Cells flowed: what `memory` gave is of the past."""
-        self._memory = None
+        """Discard the last snapshot, since cells flowed."""
+        self._snapshot = None
 
     def snapshot(self) -> Values:
-        """(points, 10) F_p^-1 and alpha; with six of the last flow between them where it matters."""
-        if self._memory is None:
-            self.begin_step(0.0)  # a step that failed may have left another in its place
-            last = [self.prediction.rates] if isinstance(self.prediction, ExtrapolatedPlasticFlow) else []
-            self._memory = np.column_stack([self.inverse_rows, *last, self.accumulated_strain])
-        return self._memory
+        """(points, 10) F_p^-1 and alpha, or (points, 16) with the rate D between them if flow is extrapolated."""
+        if self._snapshot is None:
+            self.begin_step(0.0)  # a failed step may have left its extrapolation in place
+            rates = [self.prediction.rates] if isinstance(self.prediction, ExtrapolatedPlasticFlow) else []
+            self._snapshot = np.column_stack([self.inverse_rows, *rates, self.accumulated_strain])
+        return self._snapshot
 
-    def restore(self, memory: Values) -> bool:
-        """Be as `memory` says, whichever the update was; whether that is anything else than now."""
+    def restore(self, snapshot: Values) -> bool:
+        """Restore a snapshot of any `update`; returns whether anything changed."""
         self.begin_step(0.0)
-        if memory is self._memory:
+        if snapshot is self._snapshot:
             return False
-        self.inverse_rows[:] = memory[:, :9]
-        self.accumulated_strain[:] = memory[:, -1]
-        if isinstance(self.prediction, ExtrapolatedPlasticFlow) and memory.shape[1] > 10:
-            self.prediction.rates = memory[:, 9:-1]
+        self.inverse_rows[:] = snapshot[:, :9]
+        self.accumulated_strain[:] = snapshot[:, -1]
+        if isinstance(self.prediction, ExtrapolatedPlasticFlow) and snapshot.shape[1] > 10:
+            self.prediction.rates = snapshot[:, 9:-1]
         self.update_flow_stress()
-        self._memory = memory
+        self._snapshot = snapshot
         return True
 
     def begin_step(self, dt: float) -> None:
-        """A step of dt is to be solved; with 0: it is done."""
+        """Begin to solve a step of dt (s); with 0 end it."""
         self.dt, self.fraction = dt, -math.expm1(-self.rate * dt) if dt else 0.0
         if self.prediction is not None:
             self.prediction.begin_step(dt, self.fraction)
@@ -237,7 +262,6 @@ def _block(inverse: fem.Function, dim: int) -> ufl.core.expr.Expr:
 def plastic_material(
     domain: Domain, law: YieldLaw, material: MaterialFields, *, implicit: bool = True
 ) -> MaterialFields:
-    """The material with an energy of the elastic part of F, and with what its cells remember; `implicit`: of the
-    scheme."""
+    """Material with the energy of the elastic part of F and a PlasticHistory; `implicit`: whether the scheme is."""
     plastic = PlasticHistory(domain, law, material, implicit=implicit)
     return replace(material, energy=plastic.energy, plastic=plastic)

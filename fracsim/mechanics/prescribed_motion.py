@@ -1,6 +1,6 @@
-"""Prescribed motion: dofs whose displacement is a function of time.
+"""Prescribed displacements as functions of time, and the check that they support every body.
 
-Whether a quasi-static study holds every body: without inertia a free rigid motion has no answer.
+Without inertia a body with a free rigid motion has no unique displacement.
 """
 
 from __future__ import annotations
@@ -22,23 +22,25 @@ from .time_functions import TimeFunction
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-Entry = tuple[Ints, Flags, TimeFunction]
+Entry = tuple[Ints, Flags, TimeFunction]  # local nodes, (d,) prescribed components, displacement (d,) in m
 
 
 class PrescribedMotion:
-    """Prescribed displacement of components of nodes. Where two entries name one component, the later one counts.
+    """Prescribed displacement of components of nodes. Of two entries for one component the later one is used.
 
     Attributes:
         dofs: sorted unrolled local dofs (node * d + component), ghosts included.
-        owned: those that this rank owns; they come first.    free: (owned dofs,) all others, flags.
-        bcs: the Dirichlet condition, at the values of `set`; empty where no rank has one.
+        owned_dofs: those of `dofs` that this rank owns; they come first.
+        free_dofs: (owned dofs,) flags of all others.
+        bcs: Dirichlet condition with the values of `set_values`; empty if no dof of any rank is prescribed.
     """
 
     def __init__(self, domain: Domain, entries: Sequence[Entry]) -> None:
-        """`entries`: local nodes, (d,) which of their components move as told, and d displacements in m."""
+        """`entries`: local nodes, (d,) flags of their prescribed components, and displacement (d,) in m."""
         size = domain.dim
         self._domain, self._functions = domain, [function for _, _, function in entries]
-        row = np.full((len(domain.nodes), size), -1, np.int64)  # of the value table, for each component
+        # row of the table of all functions' values, for each component of each node
+        row = np.full((len(domain.nodes), size), -1, np.int64)
         for index, (nodes, components, _) in enumerate(entries):
             for component in np.flatnonzero(components):
                 row[nodes, component] = index * size + component
@@ -53,55 +55,59 @@ class PrescribedMotion:
         self.bcs = [self._condition()] if domain.comm.allreduce(len(self.dofs)) else []
 
     def _condition(self) -> fem.DirichletBC:
-        # A condition on single components of a blocked space: dofs of the sub-space's parent, values from the space.
+        # a condition on single components of a blocked space: dofs of the sub-space's parent, values from the space
         pair: list[Ints] = [self.dofs, self.dofs]
         return fem.dirichletbc(self._values, pair, self._domain.space.sub(0))  # type: ignore[arg-type]
 
     def displacements_at(self, t: float) -> Values:
-        """(dofs,) displacement of each of `dofs` at time t (s), m."""
+        """(dofs,) displacements of `dofs` at time t (s), m."""
         if not self._functions:
             return np.empty(0)
         return np.concatenate([function(t) for function in self._functions])[self._row]
 
     def set_values(self, values: Values) -> None:
-        """Prescribe (dofs,) displacements, m: what `bcs` and `values` have from here on."""
+        """Set the prescribed displacements (dofs,), m, of `bcs` and `values`."""
         self._values.x.array[self.dofs] = values
 
     @property
     def prescribed_nodes(self) -> Flags:
-        """(nodes,) which have a component whose motion is prescribed, ghosts included."""
-        held = np.zeros(len(self._domain.nodes), bool)
-        held[self.dofs // self._domain.dim] = True
-        return held
+        """(nodes,) flags of nodes with a prescribed component, ghosts included."""
+        prescribed = np.zeros(len(self._domain.nodes), bool)
+        prescribed[self.dofs // self._domain.dim] = True
+        return prescribed
 
     @property
     def values(self) -> Values:
-        """(owned,) what each of `owned` shall be at, m."""
+        """(owned_dofs,) prescribed displacements of `owned_dofs`, m."""
         result: Values = self._values.x.array[self.owned_dofs]
         return result
 
     def max_deviation(self, u: Values) -> float:
-        """Farthest that one of `owned` in u (owned dofs,) is from its value, in mean edge lengths (collective)."""
+        """Largest deviation of u (owned dofs,), m, from a prescribed value, in mean edge lengths (collective)."""
         if not self.bcs:
             return 0.0
-        gap = np.max(np.abs(u[self.owned_dofs] - self.values), initial=0.0)
-        return float(self._domain.comm.allreduce(gap, op=MPI.MAX)) / self._domain.mean_edge_length
+        deviation = np.max(np.abs(u[self.owned_dofs] - self.values), initial=0.0)
+        return float(self._domain.comm.allreduce(deviation, op=MPI.MAX)) / self._domain.mean_edge_length
 
 
 def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
-    """InputError where a body of the mesh keeps a rigid motion that no prescribed component stops (collective)."""
-    held = np.zeros(domain.node_count * domain.dim, bool)
-    held[motion.owned_dofs] = True
-    flags = domain.gather_nodes(held.reshape(-1, domain.dim))
+    """Check that no body of the mesh has a free rigid motion (collective).
+
+    Raises:
+        InputError: if prescribed components leave one.
+    """
+    prescribed = np.zeros(domain.node_count * domain.dim, bool)
+    prescribed[motion.owned_dofs] = True
+    flags = domain.gather_nodes(prescribed.reshape(-1, domain.dim))
     on_root(domain.comm, lambda: _check(domain.source, flags))
 
 
-def _check(mesh: MeshData | None, held: npt.NDArray[np.bool_] | None) -> None:
-    assert mesh is not None and held is not None
+def _check(mesh: MeshData | None, prescribed: npt.NDArray[np.bool_] | None) -> None:
+    assert mesh is not None and prescribed is not None
     bodies, body = bodies_of(mesh)
     for number in range(bodies):
         nodes = body == number
-        free = free_motion(mesh.points[nodes], held[: len(body)][nodes])
+        free = free_motion(mesh.points[nodes], prescribed[: len(body)][nodes])
         if free:
             where = f"the body around {middle_of(mesh.points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"

@@ -22,7 +22,7 @@ from dolfinx import fem, la
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
-from ..mesh.c_library import Float64, Int32, at, compile_on_all_ranks, struct_pointer
+from ..mesh.c_library import Float64, Int32, compile_on_all_ranks, struct_pointer
 from ..mesh.dolfinx_compat import (
     FormField,
     cells_of,
@@ -100,7 +100,7 @@ class SimdKernel:
         cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
         form = _Form(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.place)
-        return int(function(byref(form), *map(at, given)) or 0)
+        return int(function(byref(form), *given) or 0)
 
 
 class SimdFunctional(SimdKernel):
@@ -134,9 +134,7 @@ class SimdBilinearForm(SimdKernel):
         apart = 1 if matrix.block_size[0] > 1 else self._bs
         lengths = np.diff(starts)[::apart]  # of rows
         self._strides = (np.full_like(lengths, self._bs) if apart == 1 else lengths).astype(np.int32)
-        code.find(
-            c_int64(len(self._nodes)), at(self._nodes), c_int64(apart), at(starts), at(matrix.indices), at(self._places)
-        )
+        code.find(c_int64(len(self._nodes)), self._nodes, c_int64(apart), starts, matrix.indices, self._places)
 
     def add_to(self, matrix: la.MatrixCSR, bcs: list[fem.DirichletBC]) -> None:
         """Add this rank's part as DOLFINx does: rows and columns of prescribed dofs become the identity's."""
@@ -181,7 +179,7 @@ class SimdExpression:
             struct_pointer(c),
             self._fields.place,
         )
-        self._code.fill(byref(form), at(values))
+        self._code.fill(byref(form), values)
 
 
 # --- compiling ------------------------------------------------------------------------------------------------------

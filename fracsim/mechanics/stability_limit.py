@@ -1,6 +1,7 @@
-"""The stable step of explicit time integration, from bounds on how fast single cells vibrate. No DOLFINx here.
+"""Stable step of explicit time integration, from bounds on the frequencies of single cells. Without DOLFINx.
 
-No assembled body is faster than its fastest cell on its own (Irons and Treharne 1971).
+No assembled body has a higher frequency than its fastest cell on its own (Irons and Treharne 1971, A bound theorem in
+eigenvalues and its practical applications).
 
 Equations: docs/theory.md#stable-time-step.
 """
@@ -22,15 +23,18 @@ SAFETY = 0.9  # of the stable step: the bound is that of linear elasticity on th
 def frequency_bounds(
     corners: Values, mu: float | Values, lmbda: float | Values, density: float | Values, factor: float
 ) -> Values:
-    """(cells,) upper bounds of omega^2 of simplices with corners (cells, d + 1, d) on their own, 1/s^2.
+    """(cells,) upper bounds of omega^2 of simplices on their own, 1/s^2; 0 for a cell without volume.
 
     A P1 simplex has lumped mass rho V / (d + 1) a node and energy V (mu |sym H|^2 + lambda/2 (tr H)^2), H = grad u.
-    With L = sum_i g_i x g_i a nodal motion with gradient H has sum |u_i|^2 >= H : H L^-1 >= (tr H)^2 / tr L,
-    hence omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L). `factor`: d + 1, or what takes its place with quadratic
-    displacement. A cell without volume has no bound: 0.
+    With L = sum_i g_i x g_i a nodal motion with gradient H has sum |u_i|^2 >= H : H L^-1 >= (tr H)^2 / tr L, hence
+    omega^2 <= (d + 1) / rho (2 mu lmax(L) + lambda tr L).
 
     Args:
-        mu, lmbda: Lame's parameters, Pa.    density: kg/m^3; numbers, or (cells,).
+        corners: (cells, d + 1, d) positions, m.
+        mu: first Lame parameter (shear modulus), Pa; a number or (cells,).
+        lmbda: second Lame parameter, Pa; a number or (cells,).
+        density: kg/m^3; a number or (cells,).
+        factor: d + 1, or its counterpart for quadratic displacement.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         gradients = barycentric_gradients(corners)
@@ -41,9 +45,15 @@ def frequency_bounds(
 
 
 def stable_step(highest: float, a: float, b: float) -> float:
-    """2/omega (sqrt(1 + xi^2) - xi) in s of the highest omega in 1/s, xi = (a/omega + b omega)/2 of Rayleigh damping
-    taken half a step late; as 2/omega / (sqrt(1 + xi^2) + xi), which does not cancel."""
+    """Stable step 2/omega (sqrt(1 + xi^2) - xi), s, with Rayleigh damping that lags by half a step.
+
+    Args:
+        highest: highest angular frequency omega, 1/s.
+        a: mass-proportional damping, 1/s.
+        b: stiffness-proportional damping, s; xi = (a/omega + b omega)/2.
+    """
     if highest == 0:
         return float("inf")
     xi = (a / highest + b * highest) / 2
+    # 2/omega / (sqrt(1 + xi^2) + xi) is the same without cancellation
     return 2 / highest / (math.hypot(1, xi) + xi)

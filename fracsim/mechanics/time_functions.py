@@ -1,4 +1,4 @@
-"""Functions of time: constants and tables, and their integrals. No DOLFINx here."""
+"""Functions of time from tables, and their integrals. Without DOLFINx, since the study room uses them."""
 
 from __future__ import annotations
 
@@ -14,17 +14,22 @@ TimeFunction = Callable[[float], Values]
 
 @dataclass(frozen=True)
 class TabulatedFunction:
-    """Values (n, k) at times (n,) in s that increase: linear in between, constant outside."""
+    """Piecewise linear function of time, constant outside its table.
+
+    Attributes:
+        times: (n,) times, increasing, s.
+        rows: (n, k) values at these times.
+    """
 
     times: Values
     rows: Values
 
     def __call__(self, t: float) -> Values:
-        """(k,) the value at t."""
+        """(k,) values at time t (s)."""
         return np.array([np.interp(t, self.times, column) for column in self.rows.T])
 
     def integral(self, t: float) -> Values:
-        """(k,) the integral from 0 to t: exact, by trapezia between the corners of the table."""
+        """(k,) integrals from 0 to t (s): exact, by trapezoids between the times of the table."""
         if len(self.times) == 1:
             return t * self.rows[0]
         inner = self.times[(self.times > 0) & (self.times < t)]
@@ -34,5 +39,5 @@ class TabulatedFunction:
 
 
 def constant_function(values: Sequence[float] | Values) -> TabulatedFunction:
-    """The same k values at all times."""
+    """Function with the same k values at all times."""
     return TabulatedFunction(np.zeros(1), np.array([values], float))

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from dolfinx import la
 from mpi4py import MPI
 
-from .c_library import Int32, Int64, Uint8, at, load_library, struct_pointer
+from .c_library import Int32, Int64, Uint8, load_library, struct_pointer
 from .domain import Domain
 from .edge_graph import EdgeGraph
 from .fragments import Fragments, find_fragments, midside_parents
@@ -114,9 +114,9 @@ class IncrementalFragments:
             byref(self._given),
             byref(room),
             c_int64(len(edges)),
-            at(edges),
+            edges,
             c_int64(FAR),
-            at(self.pieces.node_fragment),
+            self.pieces.node_fragment,
         )
         count = self._code(*given, byref(parts), byref(settled))
         of_parts = room.open[: parts.value], room.of_parts[: parts.value]

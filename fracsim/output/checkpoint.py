@@ -73,7 +73,7 @@ def write_checkpoint(
         NotConverged: the state is not finite; the old file stays.
     """
     d, stress, comm = domain.dim, balance.stress, domain.comm
-    terms = balance.to_checkpoint()
+    terms = balance.histories.to_checkpoint()
     nodal = {name: getattr(state, name) for name in (*_NODAL, *_OPTIONAL_NODAL)}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
     clock |= {"elastic": float(sum_over_ranks(comm, state.elastic)[0]), "dt_before": 0.0}
@@ -149,7 +149,7 @@ def read_checkpoint(
         InputError: there is no checkpoint, or it does not fit the study.
     """
     comm, stress = domain.comm, balance.stress
-    plastic, terms = stress.material.plastic, balance.to_checkpoint()
+    plastic, terms = stress.material.plastic, balance.histories.to_checkpoint()
     shapes = {f"{_TERM_PREFIX}{name}": np.shape(values)[1:] for name, values in terms.items()}
     nodes = int(domain.space.dofmap.index_map.size_global)
     cell_count = int(domain.mesh.topology.index_map(domain.dim).size_global)

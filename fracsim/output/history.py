@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
+from ..mechanics.term_protocols import HistoryColumns
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
 from ..mesh.parallel import sum_over_ranks
@@ -81,7 +82,7 @@ class ProbeReader:
         term_readings: dict[str, VectorReading] = {}
         works: dict[str, ScalarReading] = {}
         minima: dict[str, ScalarReading] = {}
-        for term in balance.terms:
+        for term in (term for term in balance.terms if isinstance(term, HistoryColumns)):
             term_readings |= term.summed_columns()
             works |= term.work_columns()
             minima |= term.minimum_columns()

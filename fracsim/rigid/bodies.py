@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from ..mesh.c_library import at, load_library
+from ..mesh.c_library import load_library
 from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments
 
 Ints = npt.NDArray[np.int64]
@@ -149,7 +149,7 @@ def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Valu
     given = [np.ascontiguousarray(each) for each in (turn, inverse, momentum, dt)]
     after: Values = np.empty(turn.shape)
     how = c_int64(ROUNDS), c_double(SAME), c_double(PART), c_double(LIMIT)
-    if load_library(SOURCE).tumbled(c_int64(len(turn)), *map(at, given), *how, at(after)):
+    if load_library(SOURCE).tumbled(c_int64(len(turn)), *given, *how, after):
         raise NotConverged(
             f"A body turns by more than {LIMIT:g} rad in a step: speeds and spins are too high for time.step"
         )
@@ -160,7 +160,7 @@ def rotated(turn: Values, tensor: Values, vector: Values) -> Values:
     """(n, 3) R T R^T v of tensors in the axes of bodies (n, 3, 3), inertia or its inverse, and vectors in space (n, 3):
     spins, or angular momenta."""
     given, result = [np.ascontiguousarray(each) for each in (turn, tensor, vector)], np.empty(vector.shape)
-    load_library(SOURCE).rotations(c_int64(len(turn)), *map(at, given), at(result))
+    load_library(SOURCE).rotations(c_int64(len(turn)), *given, result)
     return result
 
 
@@ -173,12 +173,12 @@ def driven(
     by more than `most`, rad/s."""
     arrays = (turn, inertia, inverse, mass, *motion, force, gravity)
     given, after = [np.ascontiguousarray(each, float) for each in arrays], np.empty((len(mass), 6))
-    load_library(SOURCE).driven(c_int64(len(mass)), *map(at, given), c_double(dt), c_double(most), at(after))
+    load_library(SOURCE).driven(c_int64(len(mass)), *given, c_double(dt), c_double(most), after)
     return np.ascontiguousarray(after[:, :3]), np.ascontiguousarray(after[:, 3:])
 
 
 def orientation(turn: Values) -> Values:
     """(n, 4) of rotations (n, 3, 3) quaternions, the scalar first."""
     turn, quat = np.ascontiguousarray(turn), np.empty((len(turn), 4))
-    load_library(SOURCE).orientations(c_int64(len(turn)), at(turn), at(quat))
+    load_library(SOURCE).orientations(c_int64(len(turn)), turn, quat)
     return quat

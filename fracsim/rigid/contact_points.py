@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.c_library import at, load_library
+from ..mesh.c_library import load_library
 from .contact_records import Touches
 
 SOURCE = Path(__file__).with_suffix(".c")
@@ -63,7 +63,7 @@ class Contacts:
         """A function of contact_points.c has written into `speed`."""
         arrays = [self.things, self.axes, self.arms, velocity, spin]
         given = [np.ascontiguousarray(each) for each in arrays]
-        getattr(load_library(SOURCE), name)(c_int64(len(self)), *map(at, given), at(speed))
+        getattr(load_library(SOURCE), name)(c_int64(len(self)), *given, speed)
         return speed
 
     def of_both(self, flags: Flags) -> Flags:

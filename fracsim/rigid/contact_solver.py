@@ -49,7 +49,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from ..mesh.c_library import Float64, Int64, at, load_library, struct_pointer
+from ..mesh.c_library import Float64, Int64, load_library, struct_pointer
 from .bodies import Bodies, orientation
 from .contact_law import later
 from .contact_points import Contacts
@@ -250,7 +250,7 @@ class Crowd:
         off by; `most`: of iterations; `start`: (k, 3) N s from where to go on; `helper`: a second thread, with which
         all comes out the same to the last digit."""
         p, loops = np.array(start, order="C"), _loops()
-        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), at(p)))
+        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), p))
         if not now:
             raise MemoryError(f"no room for {len(p)} contacts")
         if helper is not None and len(p) >= FEW:
@@ -263,13 +263,13 @@ class Crowd:
     def gained(self, impulses: Values) -> Values:
         """(n, 6) velocities and spins that impulses (k, 3) give."""
         level: Values = np.empty((len(self.mass) + 1, 6))
-        load_library(SOURCE).gained(self._given, at(np.ascontiguousarray(impulses)), at(level))
+        load_library(SOURCE).gained(self._given, np.ascontiguousarray(impulses), level)
         return level[:-1]
 
     def bound(self) -> Values:
         """(k,) D."""
         d: Values = np.empty(len(self.contacts))
-        if load_library(SOURCE).bound(self._given, at(d)):
+        if load_library(SOURCE).bound(self._given, d):
             raise MemoryError(f"no room for {len(d)} contacts")
         return d
 
@@ -288,7 +288,7 @@ def _loops() -> ctypes.CDLL:
 def projected(p: Values, mu: Values) -> Values:
     """(k, 3) the nearest of each cone |p_t| <= mu p_n."""
     near = np.array(p, order="C")
-    load_library(SOURCE).projected(c_int64(len(mu)), at(near), at(mu))
+    load_library(SOURCE).projected(c_int64(len(mu)), near, mu)
     return near
 
 

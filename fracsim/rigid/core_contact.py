@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.c_library import at, load_library
+from ..mesh.c_library import load_library
 from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..meshes.topology import facets_of
@@ -162,9 +162,7 @@ class Cores:
         grid = [self._boxes, self._first, self._of, self._faces, self._crack, self._ends]
         how = c_double(self._side), c_double(least), c_double(REACH * self._edge), c_int64(MOST)
         kept, out = [stands.last, stands.near, stands.where], [found, node, depth, normal]
-        load_library(SOURCE).within(
-            c_int64(count), at(chosen), at(stands.pairs), *map(at, mine), *map(at, grid), *how, *map(at, kept + out)
-        )
+        load_library(SOURCE).within(c_int64(count), chosen, stands.pairs, *mine, *grid, *how, *(kept + out))
         row, rank = np.nonzero(np.arange(MOST) < found[:, None])
         things = both[row]
         out_of = np.einsum("kij,kj->ki", turn[things[:, 0]], normal[row, rank])

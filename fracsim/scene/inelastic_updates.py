@@ -58,7 +58,7 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
         joining = _joining(study, balance, graph, criterion.strength)
         breaking = Breaking(balance.stress, graph, criterion, max_passes=passes, opened=opened, joining=joining)
     if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
-        balance.set_cuts(lambda: graph.gather_broken(cut[:, None]))
+        balance.contact.set_cuts(lambda: graph.gather_broken(cut[:, None]))
     if opened is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()

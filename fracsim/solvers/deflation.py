@@ -25,6 +25,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import splu
 
 from ..mechanics.balance import Balance
+from ..mechanics.term_protocols import TieTerm
 from ..mesh.domain import Domain
 from ..mesh.facet_components import node_components
 from ..mesh.parallel import allgather, sum_over_ranks
@@ -116,7 +117,9 @@ def create_deflation(balance: Balance, base_pc: PETSc.PC) -> DeflatedPreconditio
 def _join_tied(balance: Balance, part: Ints) -> None:
     """Nodes without a whole cell go with that which they are tied to: the part (owned nodes,) of which is the smallest
     one around its corners (collective)."""
-    for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
+    for tied in filter(
+        None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms if isinstance(term, TieTerm))
+    ):
         known = np.zeros(tied.K.shape[0], np.int64)
         known[tied.indices] = part[tied.nodes] + 1
         known = sum_over_ranks(balance.domain.comm, known)

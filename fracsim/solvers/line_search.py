@@ -83,7 +83,7 @@ class MeritFunction:
             self._set_out_from(x)
             return 0.0
         if self._by_norm:
-            if not self._balance.is_in_contact() and self._norm_at(x) < self._norm:
+            if not self._balance.contact.is_active() and self._norm_at(x) < self._norm:
                 return DOWN
             self._ask_for_the_start(x)
         potential, size = self._potential()
@@ -94,7 +94,7 @@ class MeritFunction:
 
     def _set_out_from(self, x: PETSc.Vec) -> None:
         self._sets_out, self._whole = False, None
-        self._by_norm = not self._rested and not self._balance.is_in_contact()
+        self._by_norm = not self._rested and not self._balance.contact.is_active()
         if self._by_norm:
             x.copy(self._from)
             self._norm = self._snes.getFunctionNorm()
@@ -104,7 +104,10 @@ class MeritFunction:
     def _potential(self) -> tuple[float, float]:
         """Potential and its size where the body is, J; mostly asked for where the line search has just been."""
         if self._known_at != self._balance.displacement_version:
-            self._known, self._known_at = self._balance.incremental_potential(), self._balance.displacement_version
+            self._known, self._known_at = (
+                self._balance.energies.incremental_potential(),
+                self._balance.displacement_version,
+            )
         return self._known
 
     def _norm_at(self, x: PETSc.Vec) -> float:

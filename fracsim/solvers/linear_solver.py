@@ -404,7 +404,7 @@ def _forcing(balance: Balance, chosen: PetscOptions) -> EisenstatWalkerForcing |
     """How exactly Newton's method solves; None: always as exactly. (Without inertia a piece hangs by next to nothing: a
     residual that is small leaves its place open.)"""
     rtol = float(chosen["ksp_rtol"])
-    if balance.limits_newton_steps:
+    if balance.contact.limits_newton_steps:
         return EisenstatWalkerForcing(rtol) if balance.conservative else None
     return ContractionForcing(rtol) if balance.scheme.inertia and chosen["snes_type"] == "newtonls" else None
 

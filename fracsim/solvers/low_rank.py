@@ -1,6 +1,6 @@
 """A tangent with what is kept beside it: K - sum of U C U^T + sum of C', applied only.
 
-The part of low rank is that of unknowns which terms have eliminated, C' the springs (mechanics.low_rank_springs).
+The part of low rank is that of unknowns which terms have eliminated, C' the springs (mechanics.extra_couplings).
 
 A preconditioner of a body that is held by a few stiff springs: that of the body, and the springs exactly.
 
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from ..mechanics.low_rank_springs import StiffCoupling
+from ..mechanics.extra_couplings import StiffCoupling
 from ..mesh.parallel import sum_over_ranks
 
 Values = npt.NDArray[np.float64]

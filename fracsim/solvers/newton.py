@@ -73,7 +73,7 @@ class NewtonSolver:
             raise
         self._take_tangent()
         snes.setConvergenceTest(weak_callback(self._converged))
-        if balance.limits_newton_steps:
+        if balance.contact.limits_newton_steps:
             snes.setLineSearchPreCheck(weak_callback(self._limit))
             if balance.conservative:
                 from .line_search import ModifiedNewton
@@ -160,7 +160,7 @@ class NewtonSolver:
         """Set x to what Newton's method may start from; returns Krylov iterations."""
         self._x.array_w[:] = guess
         extended = self.linear.extend(self._x) if self.balance.motion.max_deviation(guess) > LARGE_GAP else 0
-        if self.balance.limits_newton_steps:
+        if self.balance.contact.limits_newton_steps:
             self._x.array_w[:] = self.balance.feasible_guess(self._x.array_r.copy())
             self.balance.set_iterate(self._x)  # terms look there for what is held back
         return extended
@@ -171,7 +171,7 @@ class NewtonSolver:
         newton = krylov = 0
         left = 1.0
         for leg in range(LEGS):
-            before, left = left, self.balance.remaining_motion()
+            before, left = left, self.balance.contact.remaining_motion()
             if leg >= LEAST_LEGS and left > (LEGS - leg) * (before - left):
                 break
             self._rtol = ON_THE_WAY if left else self._own_rtol
@@ -186,7 +186,7 @@ class NewtonSolver:
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not left:
                 return newton, krylov, False
-            self.balance.continue_motion()
+            self.balance.contact.continue_motion()
         return newton, krylov, True
 
     def _solve_as_linear(self) -> SolveResult | None:
@@ -223,7 +223,7 @@ class NewtonSolver:
         if self._down is not None:
             self._down.merit.begin_line_search()
             self._down.clip_correction(y)
-        if not self.balance.limits_newton_steps:
+        if not self.balance.contact.limits_newton_steps:
             return
         share = self.balance.max_step_fraction(-y.array_r)
         if share < 1:
@@ -293,12 +293,12 @@ class NewtonSolver:
         """Whether that is so of |r| after so many iterations (collective)."""
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
-            self._first_norm = 0.0 if self.balance.limits_newton_steps else norm
+            self._first_norm = 0.0 if self.balance.contact.limits_newton_steps else norm
         return norm <= self._little(self._first_norm if its else 0.0)
 
     def _little(self, first: float) -> float:
         """|r| of a solution, N, where that of the guess is `first` (collective)."""
-        scale, floor = self.balance.force_scale()
+        scale, floor = self.balance.energies.force_scale()
         self._last_little = max(self._rtol * max(first, scale), floor)
         return self._last_little
 

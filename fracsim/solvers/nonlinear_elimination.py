@@ -36,6 +36,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
 from ..mechanics.tangent import adds_single_entries
 from ..mechanics.term import Term
+from ..mechanics.term_protocols import TieTerm
 from ..mesh.parallel import allgather, sum_over_ranks
 from .line_search import ROUND_OFF
 
@@ -99,7 +100,7 @@ def create_elimination(balance: Balance) -> NonlinearElimination | None:
     bent = any(type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in others)
     whole = balance.domain.order == 1 and balance.stress.rotation is None
     lumped = balance.mass.is_diagonal and balance.scheme.inertia
-    fit = whole and lumped and not bent and not balance.limits_newton_steps and balance.conservative
+    fit = whole and lumped and not bent and not balance.contact.limits_newton_steps and balance.conservative
     return NonlinearElimination(balance) if fit else None
 
 
@@ -171,7 +172,9 @@ class NonlinearElimination:
         """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
         balance, n = self._balance, len(names)
         K = coo_array((n, n)).tocsr()
-        for tied in filter(None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms)):
+        for tied in filter(
+            None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms if isinstance(term, TieTerm))
+        ):
             numbers = np.zeros(tied.K.shape[0], np.int64)
             numbers[tied.indices] = self._names[tied.nodes]
             at, each = _places(sum_over_ranks(balance.domain.comm, numbers), names), tied.K.tocoo()

@@ -227,7 +227,9 @@ class NonlinearSolver:
         result = newton.attempt(guess)
         if newton.crawls:
             result = self._attempt_downhill(None, (EXACT_TANGENTS,))
-        start = None if newton.goes_down and not self.balance.remaining_motion() else guess  # on the way down: goes on
+        start = (
+            None if newton.goes_down and not self.balance.contact.remaining_motion() else guess
+        )  # on the way down: goes on
         self._see_whether_astray(result)
         if self._misled(result):
             if self._sets_out_anew:
@@ -254,7 +256,11 @@ class NonlinearSolver:
         """Whether a step is tried from where it begins once its first guess has misled: what flies there may be turned
         inside out, and without a potential (a pressure has none) there is no going down from it. Where prescribed dofs
         or contact set the pace that place is no better."""
-        return self.balance.scheme.inertia and not self.balance.conservative and not self.balance.limits_newton_steps
+        return (
+            self.balance.scheme.inertia
+            and not self.balance.conservative
+            and not self.balance.contact.limits_newton_steps
+        )
 
     def _attempt_downhill(self, guess: Values | None, ways: tuple[TangentModification, ...]) -> SolveResult:
         """Down the incremental potential in ways that are tried in turn. (From the start of every attempt positive

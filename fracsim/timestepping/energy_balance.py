@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
+from ..mechanics.term_protocols import SurfaceSeparator
 from .state import State
 
 Values = npt.NDArray[np.float64]
@@ -34,11 +35,11 @@ def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values |
     Without the inertia of prescribed dofs where mass is `lumped` (`work_done`).
     """
     own = balance.motion.owned_dofs
-    forces = balance.applied_forces()
+    forces = balance.energies.applied_forces()
     forces[own] += balance.reactions[own]
     if lumped:
         forces[own] -= balance.mass.lumped[own] * balance.rates()[1][own]
-    return forces, balance.damping_forces()
+    return forces, balance.energies.damping_forces()
 
 
 def step_work(
@@ -92,7 +93,7 @@ def released_state(
         balance.set_displacement(solved)
         lost = balance.stress.assemble_released_forces(before)
         now = balance.stress.exchange_damage(before)
-        if any(term.separates_surface for term in balance.terms):
+        if any(isinstance(term, SurfaceSeparator) for term in balance.terms):
             balance.set_displacement(end.u)  # gaps are open at the step's end, and need not be where forces balance
         change = balance.c_a * response(np.where(free, lost, 0.0))
         balance.stress.exchange_damage(now)

@@ -130,7 +130,7 @@ class QuasiStaticStepper(ImplicitStepper):
             residual = balance.update_forces().copy()
             own, free = balance.motion.owned_dofs, balance.motion.free_dofs
             path.forces = path.forces.copy()
-            path.forces[own] = balance.applied_forces()[own] + residual[own]
+            path.forces[own] = balance.energies.applied_forces()[own] + residual[own]
             path.out_of_balance = np.where(free, residual, 0.0)
         self.phases[self.breaking.phase] += self.clock() - began
         return result

@@ -177,7 +177,7 @@ class BalanceStepper:
         """Loads, reactions, damping forces and accelerations that belong to the state's displacement and velocity."""
         balance, free = self.balance, self.balance.motion.free_dofs
         balance.evaluate_at(state.t, state.u, state.v)
-        applied, drag, a = balance.applied_forces(), balance.damping_forces(), state.a
+        applied, drag, a = balance.energies.applied_forces(), balance.energies.damping_forces(), state.a
         unbalanced = balance.stress.assemble_forces() - applied
         if drag is not None:
             unbalanced = unbalanced + drag
@@ -192,7 +192,7 @@ class BalanceStepper:
         self.breaking.damage_restored()
         balance.set_displacement(state.u)
         self._recalled()
-        balance.from_checkpoint(state.history.get("saved", {}))
+        balance.histories.from_checkpoint(state.history.get("saved", {}))
         return self.with_current_history(state)
 
     def discard_unsaved_data(self) -> None:
@@ -252,7 +252,11 @@ class BalanceStepper:
         return result
 
     def _memory(self) -> dict[str, object]:
-        return {"damage": self.breaking.snapshot(), "flow": self.flow.snapshot(), "terms": self.balance.snapshot()}
+        return {
+            "damage": self.breaking.snapshot(),
+            "flow": self.flow.snapshot(),
+            "terms": self.balance.histories.snapshot(),
+        }
 
     def _recall(self, state: State) -> None:
         if "damage" in state.history and self.breaking.restore(state.history["damage"]):
@@ -274,7 +278,7 @@ class BalanceStepper:
         if "flow" in state.history:
             self.flow.restore(state.history["flow"])
         if terms := state.history.get("terms"):
-            self.balance.restore(terms)
+            self.balance.histories.restore(terms)
 
     def _size(self, state: State) -> float:
         """The step to take: no further than the end or the next frame, and no sliver left over before it."""
@@ -343,10 +347,10 @@ class BalanceStepper:
         balance = self.balance
         self._check_finite(end, work + lost + elastic)
         elastic += sum(term.stored_energy() for term in balance.terms if term is not balance.stress)
-        worked, rubbed = balance.step_work()
-        stiffened = balance.stiffen_contact()
+        worked, rubbed = balance.energies.step_work()
+        stiffened = balance.contact.stiffen()
         work, lost, elastic = work + worked + stiffened, lost + rubbed, elastic + stiffened
-        kinetic = balance.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
+        kinetic = balance.energies.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
         work, lost, kinetic, every = map(float, sum_over_ranks(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(
             end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, history=self._memory()

@@ -160,7 +160,7 @@ def numbers(run: Run) -> Numbers:
     }
     found = {key: np.array(value) for key, value in every.items() if value is not None and key != "elastic"}
     found |= {"probes": scene.probes(), "figures": np.array(run.breaks.counts)}
-    found |= {f"term.{key}": np.array(value) for key, value in scene.balance.to_checkpoint().items()}
+    found |= {f"term.{key}": np.array(value) for key, value in scene.balance.histories.to_checkpoint().items()}
     if scene.balance.stress.chi is not None:
         found["chi"] = scene.balance.stress.chi.x.array.copy()
     if scene.fracture is not None:

@@ -24,7 +24,7 @@ def main(path: str) -> None:
     energies = []
     for _ in range(2):
         state.advance()
-        energies.append([scene.balance.kinetic_energy(state.v), state.elastic])
+        energies.append([scene.balance.energies.kinetic_energy(state.v), state.elastic])
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, energies=energies)
 

@@ -405,9 +405,9 @@ def squeezed() -> Found:
     next(steps), next(steps)
     break_across(scene, [0.3, 1.0], 0.4)
     state.remember()
-    at_once = scene.balance.to_checkpoint()
+    at_once = scene.balance.histories.to_checkpoint()
     next(steps), next(steps)
-    later, u = scene.balance.to_checkpoint(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
+    later, u = scene.balance.histories.to_checkpoint(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
     walls = {f"squeezed-{when}-{name.removeprefix('contact.')}": np.array(values)
              for when, saved in (("at-once", at_once), ("later", later)) for name, values in saved.items()}  # fmt: skip
     return walls | {"squeezed-u": u}

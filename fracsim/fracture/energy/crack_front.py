@@ -32,7 +32,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ...mesh.c_library import at, load_library
+from ...mesh.c_library import load_library
 from ...mesh.domain import Domain
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.parallel import allgather
@@ -113,7 +113,7 @@ def advance(polygons: Values, pairs: tuple[Ints, Ints], places: Values, radius: 
     """
     given = [np.ascontiguousarray(each) for each in (polygons, pairs[1], pairs[0], places, radius)]
     made: Values = np.zeros(places.shape)
-    load_library(SOURCE).advance(c_int64(len(pairs[0])), *map(at, given), at(made))
+    load_library(SOURCE).advance(c_int64(len(pairs[0])), *given, made)
     return made
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..c_library import at, load_library
+from ..c_library import load_library
 
 SOURCE = Path(__file__).with_suffix(".c")
 Ints = npt.NDArray[np.int64]
@@ -58,7 +58,7 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Polyhedro
     many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
     near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # each about a point of its own
     sums = load_library(SOURCE).sums
-    sums(*map(c_int64, (len(elements), d, count)), *map(at, (*given, many, near, volume, first, second)))
+    sums(*map(c_int64, (len(elements), d, count)), *(*given, many, near, volume, first, second))
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
     across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]
     about = second.reshape(-1, d, d) / ((d + 1) * (d + 2)) - across

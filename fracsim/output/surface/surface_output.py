@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...fracture.edge_history import EdgeRecord
 from ...mechanics.material_fields import PerCell
-from ...mechanics.term import Term
+from ...mechanics.term_protocols import OutputSurfaces
 from ...mesh.domain import Domain
 from ...timestepping.state import State
 from ..atomic_write import write_on_root
@@ -40,7 +40,7 @@ class SurfaceOutput:
         record: EdgeRecord | None,
         *,
         apart: Sequence[PointCorrection] = (),
-        beside: Sequence[Term] = (),
+        beside: Sequence[OutputSurfaces] = (),
         passing: InterpenetrationMonitor | None = None,
         smooth: bool = False,
         resume_at: float | None = None,

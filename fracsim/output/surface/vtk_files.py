@@ -24,7 +24,7 @@ from ..fields_file import EARLIER_TENSOR_COMPONENTS, TENSOR_COMPONENTS, pad_to_3
 from ..file_ownership import FRAME_FILE_PATTERN
 
 if TYPE_CHECKING:
-    from ...mechanics.surface_data import SurfaceData
+    from ...mechanics.term_protocols import SurfaceData
     from .body_surface import SurfaceFrame
     from .fragment_table import FragmentTable
 

@@ -18,7 +18,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 
-from ...mesh.c_library import FAST_FLAGS, at, compile_on_all_ranks, unchecked_function
+from ...mesh.c_library import FAST_FLAGS, array_pointer, compile_on_all_ranks, unchecked_function
 from .hierarchy import BlockCSRData
 
 Single = npt.NDArray[np.float32]
@@ -39,7 +39,7 @@ class GhostedVector:
         """`size`: numbers of a node; `kind`: of number."""
         self._vector = la.vector(nodes, size, kind)
         self.array: npt.NDArray[Any] = self._vector.array
-        self.pointer = at(self.array)
+        self.pointer = array_pointer(self.array)
         self._alone = nodes.comm.size == 1
 
     def update_ghosts(self) -> None:
@@ -64,23 +64,29 @@ class BlockCSR:
         """`made`: `code` for blocks of size x size; `starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
         self._code, numbers = made, np.zeros(int(starts[-1]) * size**2 + BEHIND, np.float32)
         self.blocks: Single = numbers[:-BEHIND].reshape(-1, size**2)
-        self._pattern = c_int64(len(starts) - 1), at(starts), at(columns)
-        self._all = *self._pattern, at(numbers)
+        self._pattern = c_int64(len(starts) - 1), array_pointer(starts), array_pointer(columns)
+        self._all = *self._pattern, array_pointer(numbers)
         self._residual, self._smooth, self._add = (
             unchecked_function(made, name, *self._all) for name in ("residual", "smooth", "add")
         )  # fmt: skip
 
     def assign_scaled(self, blocks: Values, left: Values, right: Values) -> None:
         """Be diag(left) A diag(right), of A's blocks (n, rows, columns)."""
-        self._code.scale(*self._pattern, at(blocks), at(left), at(right), self._all[-1])
+        self._code.scale(
+            *self._pattern, array_pointer(blocks), array_pointer(left), array_pointer(right), self._all[-1]
+        )
 
     def compute_rounding_loss(self, blocks: Values, left: Values, right: Values, lost: Single) -> None:
         """What rounding has taken from each row of A's blocks, where left and right are undone (C tells)."""
-        self._code.lose(*self._all, at(blocks), at(left), at(right), at(lost))
+        self._code.lose(
+            *self._all, array_pointer(blocks), array_pointer(left), array_pointer(right), array_pointer(lost)
+        )
 
     def multiply(self, lost: Single, left: Values, z: GhostedVector, x: Values, y: Values) -> None:
         """y = diag(left) A z + lost x in double precision, z of ghosts as well."""
-        self._code.multiply(*self._all, at(lost), at(left), z.pointer, at(x), at(y))
+        self._code.multiply(
+            *self._all, array_pointer(lost), array_pointer(left), z.pointer, array_pointer(x), array_pointer(y)
+        )
 
     def compute_residual(self, b: GhostedVector, x: GhostedVector, left: GhostedVector) -> None:
         """left = b - A x."""
@@ -116,12 +122,12 @@ class BlockDiagonal:
     def __init__(self, made: CDLL, size: int, rows: int) -> None:
         """`made`: `code` for blocks of size x size."""
         numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
-        self._code, self._rows, self.pointer = made, c_int64(rows), at(numbers)
+        self._code, self._rows, self.pointer = made, c_int64(rows), array_pointer(numbers)
         self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
 
     def assign_inverse(self, D: Single) -> None:
         """B = D^-1 of blocks as these; where D is not positive, of the size of its diagonal."""
-        self._code.invert(self._rows, at(D), self.pointer)
+        self._code.invert(self._rows, array_pointer(D), self.pointer)
 
     def first_step(self, take: float, b: GhostedVector, d: GhostedVector, x: GhostedVector) -> None:
         """d = x = take B b."""
@@ -140,9 +146,9 @@ class Prolongation:
     def __init__(self, made: CDLL, P: BlockCSRData, left: Values, right: Values) -> None:
         """`made`: `code` for blocks of that size."""
         numbers = np.empty(P.values.size, np.float32)
-        pattern = c_int64(len(P.starts) - 1), at(P.starts), at(P.columns)
-        made.scale(*pattern, at(P.values), at(left), at(right), at(numbers))
-        self._all = *pattern, at(numbers)
+        pattern = c_int64(len(P.starts) - 1), array_pointer(P.starts), array_pointer(P.columns)
+        made.scale(*pattern, array_pointer(P.values), array_pointer(left), array_pointer(right), array_pointer(numbers))
+        self._all = *pattern, array_pointer(numbers)
         self._add, self._add_transposed = (
             unchecked_function(made, name, *self._all) for name in ("add", "add_transposed")
         )

@@ -2,7 +2,7 @@
 
 A product takes half the time, for an index is read for d^2 values instead of for d, and CG with multigrid makes some
 six an iteration on the finest level. Where nothing but cells and their mass add to the tangent it is assembled in
-blocks; ties of a few nodes to others (mechanics.tie_matrix) stay beside these. Smoothed aggregation cannot set itself
+blocks; ties of a few nodes to others (mechanics.block_matrix) stay beside these. Smoothed aggregation cannot set itself
 up from blocks, so that there is a matrix of single entries, too, which is brought to where they are when multigrid is
 set up. Where terms add to single entries the blocks are a copy of them, which costs what two iterations gain. Small
 bodies have no use for it: their matrices stay in the cache, and each product is called from here.
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from petsc4py import PETSc
 
 if TYPE_CHECKING:
-    from ...mechanics.bcsr_matvec import BlockMatrix
+    from ...mechanics.block_matrix import BlockMatrix
     from .fine_level import FineLevel
 
 SMALL = 10_000  # dofs below which a product costs no more than calling it

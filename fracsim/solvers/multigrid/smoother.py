@@ -22,7 +22,7 @@ from .hierarchy import BlockCSRData, LevelData
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ...mechanics.tie_matrix import TieMatrix
+    from ...mechanics.block_matrix import TieMatrix
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

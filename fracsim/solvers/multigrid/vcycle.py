@@ -47,7 +47,7 @@ from .hierarchy import BlockCSRData, copy_levels
 from .smoother import SmoothedLevel, SmoothingParameters
 
 if TYPE_CHECKING:
-    from ...mechanics.bcsr_matvec import BlockMatrix
+    from ...mechanics.block_matrix import BlockMatrix
 
 Values = npt.NDArray[np.float64]
 # by the size of a level's blocks; by the sizes of the finer level's and the coarser's, for what is between them

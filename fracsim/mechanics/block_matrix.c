@@ -1,4 +1,4 @@
-/* Products with rows of blocks (mechanics.bcsr_matvec), one block of D x D numbers after another.    D: 2 or 3. */
+/* Products with rows of blocks (mechanics.block_matrix), one block of D x D numbers after another.    D: 2 or 3. */
 
 #include <stdint.h>
 

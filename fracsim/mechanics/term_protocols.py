@@ -1,0 +1,301 @@
+"""Protocols of terms that do more than add forces, and the terms of a balance that fulfil them.
+
+A term of contact limits the steps of Newton's method, keeps the surface for output free of overlaps, or moves rigid
+bodies. Terms with a history are restored when a step is repeated. Each protocol is one such ability: a class of a term
+fulfils those whose methods it has. `ContactTerms` and `TermHistories` run over the terms of a balance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..mesh.parallel import sum_over_ranks
+from .term import Flags, Ints, Term, Values
+
+if TYPE_CHECKING:
+    from ..mesh.split_surface.surface_map import SurfaceMap
+    from .block_matrix import TieMatrix
+
+# nodes (n, 2) of all broken edges, and positions (n, 1) of the cuts from the lower node, nan: in the middle; on rank 0.
+# None elsewhere (collective)
+type CutPositions = Callable[[], tuple[npt.NDArray[np.int64], Values] | None]
+
+
+@dataclass(frozen=True)
+class SurfaceData:
+    """Surface for output beside that of the body, such as an obstacle.
+
+    Attributes:
+        points: (n, d) positions, m.    triangles: (k, 3) indices of points.
+        segments: (m, 2) indices of points in 2D: the outline of the triangles.
+    """
+
+    points: Values
+    triangles: npt.NDArray[np.integer]
+    segments: npt.NDArray[np.integer]
+
+
+# --- what a term may be able to do ----------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class StepLimiter(Protocol):
+    """Term that limits the length of a Newton step."""
+
+    def max_step_fraction(self, change: Values) -> float:
+        """Largest fraction in (0, 1] of a change of u (owned dofs,), m, that is allowed on this rank (collective)."""
+
+
+@runtime_checkable
+class ContactTerm(StepLimiter, Protocol):
+    """Term whose forces act at the end of the step, with gaps that stay open."""
+
+    def contact_forces(self) -> Values | None:
+        """(owned dofs,) contact forces at the end of the step that belongs to the current u, N (collective).
+
+        None if nothing is in contact. r has them with the contact weight of the time level, and the acceleration that
+        a scheme carries into the next step excludes them.
+        """
+
+    def begin_solve(self) -> None:
+        """Begin an attempt of Newton's method at the step."""
+
+    def feasible_guess(self, u: Values) -> Values:
+        """(owned dofs,) an initial guess u, m, moved to where no gap is closed, as far as possible (collective)."""
+
+    def clear_search(self) -> None:
+        """Clear caches of the contact search and initial guesses: what a checkpoint does not have (collective)."""
+
+
+@runtime_checkable
+class PrescribedContact(Protocol):
+    """Contact with bodies in prescribed motion, which can be restricted to a part of it during a solve."""
+
+    def is_feasible(self, u: Values) -> bool:
+        """Whether all gaps are open at u (owned dofs,), m, so that Newton's method may start there (collective)."""
+
+    def restrict_motion(self) -> None:
+        """Restrict the prescribed motion to what the body at the start of the step allows (collective)."""
+
+    def remaining_motion(self) -> float:
+        """Fraction of the prescribed motion that is left, the same on all ranks; 0: none."""
+
+    def continue_motion(self) -> None:
+        """Continue a restricted motion as far as the body at the current u allows (collective)."""
+
+
+@runtime_checkable
+class CrackFaceContact(Protocol):
+    """Contact between crack faces."""
+
+    def set_cuts(self, cuts: CutPositions) -> None:
+        """Cut broken edges at the positions of `cuts`, asked after they broke; otherwise in the middle."""
+
+    def stiffen_contact(self) -> float:
+        """Raise the contact stiffness if gaps at the end of the step are too small (collective).
+
+        Returns:
+            Energy that this adds at the same u, part of this rank, J.
+        """
+
+
+@runtime_checkable
+class RigidMotionTerm(Protocol):
+    """Term that moves rigid bodies beside the deformable one."""
+
+    def kinetic_energy(self) -> float:
+        """Kinetic energy of these bodies, part of this rank, J."""
+
+
+@runtime_checkable
+class LowRankTerm(Protocol):
+    """Term with unknowns of its own, which it has eliminated from the equations."""
+
+    def low_rank_updates(self) -> list[tuple[Values, Values]]:
+        """Matrices U (owned dofs, k) and C (k, k), C summed over ranks: the tangent lacks - U C U^T (collective)."""
+
+
+@runtime_checkable
+class TieTerm(Protocol):
+    """Term that ties nodes which share no cell."""
+
+    def tie_matrix(self, free: Flags) -> TieMatrix | None:
+        """Same operator as `coupling_matrix`, beside a tangent in blocks; None if nothing is tied.
+
+        Args:
+            free: (owned dofs,) dofs whose displacement is not prescribed.
+        """
+
+
+@runtime_checkable
+class HistoryTerm(Protocol):
+    """Term with history variables beside u."""
+
+    def snapshot(self) -> object:
+        """History variables between two steps, never written to again."""
+
+    def restore(self, snapshot: object) -> None:
+        """Restore the history variables of `snapshot`, together with the damage of that time (collective)."""
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """History variables as arrays that are independent of the number of ranks, on rank 0 (collective)."""
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Restore `to_checkpoint`, given on all ranks, together with u and the damage of that time (collective)."""
+
+
+@runtime_checkable
+class HistoryColumns(Protocol):
+    """Term with columns in history.csv."""
+
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
+        """Columns that are summed over ranks: functions that return the part of this rank, (1,)."""
+
+    def minimum_columns(self) -> dict[str, Callable[[], float]]:
+        """Columns of a minimum over ranks (collective)."""
+
+    def work_columns(self) -> dict[str, Callable[[], float]]:
+        """Columns that are summed over steps: functions that return the part of this rank in the last step, J."""
+
+
+@runtime_checkable
+class SurfaceSeparator(Protocol):
+    """Term that keeps surfaces apart, in output as well."""
+
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+        """Split surface without overlaps (on rank 0, not collective).
+
+        Args:
+            at: split surface without regard to contact.
+            elements: (m, d) points of its segments or triangles.
+            u: (nodes, d) displacement, m.
+            t: time of the state, s.
+        """
+
+
+@runtime_checkable
+class OutputSurfaces(Protocol):
+    """Term with surfaces of its own in output."""
+
+    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
+        """Surfaces at the time t of the state, s, by name; the same on all ranks (not collective)."""
+
+
+# --- the terms of a balance -----------------------------------------------------------------------------------------
+
+
+class ContactTerms:
+    """Contact of a balance: the sum of contact forces, and the bounds of all terms on the steps of Newton's method.
+
+    Attributes:
+        limits_newton_steps: whether any term limits the length of a Newton step.
+    """
+
+    def __init__(self, comm: MPI.Comm, terms: Iterable[Term]) -> None:
+        terms = tuple(terms)
+        self._comm = comm
+        self._limiters = [term for term in terms if isinstance(term, StepLimiter)]
+        self._contacts = [term for term in terms if isinstance(term, ContactTerm)]
+        self._prescribed = [term for term in terms if isinstance(term, PrescribedContact)]
+        self._crack_faces = [term for term in terms if isinstance(term, CrackFaceContact)]
+        self.limits_newton_steps = bool(self._limiters)
+
+    def forces(self) -> Values | None:
+        """(owned dofs,) contact forces at the end of the step, N; None if nothing is in contact (collective)."""
+        forces = [force for term in self._contacts if (force := term.contact_forces()) is not None]
+        return sum(forces[1:], forces[0]) if forces else None
+
+    def is_active(self) -> bool:
+        """Whether a term that limits steps has a nonzero potential at the current u (collective)."""
+        potentials = (term.potential() for term in self._limiters if isinstance(term, Term))
+        return bool(sum_over_ranks(self._comm, sum(abs(potential or 0.0) for potential in potentials))[0] > 0)
+
+    def begin_solve(self) -> None:
+        """Begin an attempt of Newton's method at the step."""
+        for term in self._contacts:
+            term.begin_solve()
+
+    def max_step_fraction(self, change: Values) -> float:
+        """Largest fraction in (0, 1] of a change of u (owned dofs,), m, that all terms allow (collective)."""
+        fraction = min((term.max_step_fraction(change) for term in self._limiters), default=1.0)
+        return float(self._comm.allreduce(fraction, op=MPI.MIN))
+
+    def feasible_guess(self, u: Values, u_n: Values) -> Values:
+        """(owned dofs,) displacement, m, from which Newton's method may start (collective).
+
+        The start of the step if no other guess is feasible; prescribed motion is then restricted, until
+        `continue_motion` has completed it.
+
+        Args:
+            u: (owned dofs,) initial guess with prescribed dofs at their values, m.
+            u_n: (owned dofs,) displacement at the start of the step, m.
+        """
+        for term in self._contacts:
+            u = term.feasible_guess(u)
+        # all are asked, since the question is collective
+        if all([term.is_feasible(u) for term in self._prescribed]):
+            return u
+        for contact in self._prescribed:
+            contact.restrict_motion()
+        return u_n
+
+    def remaining_motion(self) -> float:
+        """Largest fraction of a prescribed motion that is left; 0: r = 0 was solved for the whole motion."""
+        return max((term.remaining_motion() for term in self._prescribed), default=0.0)
+
+    def continue_motion(self) -> None:
+        """Continue restricted motions (collective)."""
+        for term in self._prescribed:
+            term.continue_motion()
+
+    def stiffen(self) -> float:
+        """Raise contact stiffness where gaps are too small; energy that this adds on this rank, J (collective)."""
+        return sum(term.stiffen_contact() for term in self._crack_faces)
+
+    def set_cuts(self, cuts: CutPositions) -> None:
+        """Cut broken edges at the positions of `cuts`."""
+        for term in self._crack_faces:
+            term.set_cuts(cuts)
+
+    def clear_search(self) -> None:
+        """Clear caches of the contact search (collective)."""
+        for term in self._contacts:
+            term.clear_search()
+
+
+class TermHistories:
+    """History variables of all terms of a balance, by the names of the terms."""
+
+    def __init__(self, terms: Iterable[Term]) -> None:
+        self._terms = {term.name: term for term in terms if isinstance(term, HistoryTerm)}
+
+    def snapshot(self) -> dict[str, object]:
+        """History variables of the terms between two steps."""
+        return {name: term.snapshot() for name, term in self._terms.items()}
+
+    def restore(self, snapshot: object) -> None:
+        """Restore the history variables of `snapshot`, together with the damage of that time (collective)."""
+        assert isinstance(snapshot, dict)
+        for name, term in self._terms.items():
+            if name in snapshot:
+                term.restore(snapshot[name])
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Arrays of the terms by "term.array", whole on rank 0 (collective)."""
+        items = self._terms.items()
+        return {f"{name}.{array}": values for name, term in items for array, values in term.to_checkpoint().items()}
+
+    def from_checkpoint(self, saved: object) -> None:
+        """Restore the arrays of `to_checkpoint`, given on all ranks (collective)."""
+        assert isinstance(saved, dict)
+        for name, term in self._terms.items():
+            prefix = f"{name}."
+            arrays = {key.removeprefix(prefix): values for key, values in saved.items() if key.startswith(prefix)}
+            if arrays:
+                term.from_checkpoint(arrays)
