@@ -217,7 +217,7 @@ def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypat
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
     for stiffer in (1.0, 100.0):
         tethers.stiffness *= stiffer
-        tethers._be(tethers.ties)
+        tethers._set_ties(tethers.ties)
         linear.preconditioner.due = Due.NOTHING
         assert linear.solve()
         products = written_out(linear.operator.mult, scene.balance.work_vector)
@@ -268,7 +268,7 @@ def test_tied_nodes_go_with_the_body_and_nothing_is_gained() -> None:
 
         before, reports = figures(), march(scene, state)
         energy = np.array([each.kinetic + each.elastic for each in reports])
-        return float(np.linalg.norm(tethers._apart(), axis=1).max()), figures() / before - 1, energy / energy[0] - 1
+        return float(np.linalg.norm(tethers._elongations(), axis=1).max()), figures() / before - 1, energy / energy[0] - 1
 
     apart, change, gained = turned(1.0)
     assert np.abs(change[:2]).max() < 1e-9 and abs(change[2]) < 1e-2 and gained.max() < 1e-2  # Newmark's own errors

@@ -152,11 +152,11 @@ def test_what_is_no_number_is_told() -> None:
     np.testing.assert_array_equal(np.isnan(b.array_r), nowhere)
 
 
-def test_positive_moduli() -> None:
+def test_psd_form() -> None:
     """The same of the form that is added where moduli are made positive, of a body that is crushed at random."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
     balance.set_displacement(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned_dof_count))
-    assert_as_one_by_one(balance.tangent._positive_moduli(0.1), balance.motion.bcs)
+    assert_as_one_by_one(balance.tangent._psd_form(0.1), balance.motion.bcs)
 
 
 def test_what_dolfinx_goes_on_with() -> None:

@@ -29,7 +29,7 @@ def test_factors_are_made_anew_once_nodes_are_tied(dim: int) -> None:
     ties = tethers.ties
     force = np.random.default_rng(2).standard_normal(scene.balance.owned_dof_count)
     for each in (Ties.empty(dim), ties):
-        tethers._be(each)
+        tethers._set_ties(each)
         vector.array_w[:] = force
         assert linear.solve()
         vector.array_w[:] = force
